@@ -1,0 +1,75 @@
+"""Exceptions and warnings that carry their data.
+
+Three kinds of failure are kept apart: bad input raises an :class:`InputError` whose one-line message says where, what
+value and what to write instead; a numerical failure is a :class:`~bayesoleo.solvers.status.Status`, never an exception;
+inside a log density a failure becomes minus infinity and is counted by reason.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class BayesoleoError(Exception):
+    """Base of every exception that bayesoleo raises on purpose."""
+
+
+class InputError(BayesoleoError, ValueError):
+    """Something a user gave cannot be used.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong, as a short clause.
+    file, run, column, key : str, optional
+        Where it is wrong; those given are shown in this order.
+    value : object, optional
+        The offending value.
+    hint : str, optional
+        What to write instead.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: object = None,
+        run: str | None = None,
+        column: str | None = None,
+        key: str | None = None,
+        value: Any = None,
+        hint: str | None = None,
+    ) -> None:
+        self.problem, self.file, self.run = problem, file, run
+        self.column, self.key, self.value, self.hint = column, key, value, hint
+        super().__init__(self._message())
+
+    def _message(self) -> str:
+        places = (("file", self.file), ("run", self.run), ("column", self.column), ("key", self.key))
+        where = ", ".join(f"{name} {place!s}" for name, place in places if place is not None)
+        text = f"{where}: {self.problem}" if where else self.problem
+        if self.value is not None:
+            text += f" (got {self.value!r})"
+        if self.hint is not None:
+            text += f"; {self.hint}"
+        return " ".join(text.split())
+
+
+class CampaignError(InputError):
+    """A campaign folder, its ``campaign.toml`` or one of its run files cannot be used."""
+
+
+class ModelError(InputError):
+    """A model declaration, or a model asked to do what it cannot, is inconsistent."""
+
+
+class ResultsError(InputError):
+    """A stored result is missing, broken or of another kind than expected."""
+
+
+class NumericalWarning(UserWarning):
+    """A numerical result is usable but deserves a look."""
+
+
+class DataWarning(UserWarning):
+    """A record is usable but deserves a look."""
