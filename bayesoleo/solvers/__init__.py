@@ -1,0 +1,1 @@
+"""Periodic solutions of implicit differential equations; this layer knows no model."""

@@ -1,0 +1,87 @@
+"""The contract between whatever can be fitted and whatever fits it.
+
+Estimators and samplers see a :class:`Problem`: names, priors, and the residuals ``e = y - yhat(theta)`` of ``s`` output channels in
+``N`` runs. They never see a model, so that a closed formula and a campaign of measured runs are estimated by the same code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.model.priors import Prior
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residuals and sensitivities at one parameter vector.
+
+    Parameters
+    ----------
+    residual : tuple of ndarray, each shape (n_b,)
+        ``y - yhat`` of each output channel, runs one after the other, in the channel's SI unit.
+    sensitivity : tuple of ndarray, each shape (n_b, l)
+        Derivatives of the prediction ``yhat`` with respect to the ``l`` unknowns (so the residual's are its negative).
+    status : Status
+        Unless it is ``CONVERGED`` the arrays hold NaN.
+    """
+
+    residual: tuple[Array, ...]
+    sensitivity: tuple[Array, ...]
+    status: Status
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Sums of squared residuals at many parameter vectors.
+
+    Parameters
+    ----------
+    sum_of_squares : ndarray, shape (L, N, s)
+        By parameter vector, run and output; NaN where the vector failed.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers.status.Status`.
+    """
+
+    sum_of_squares: Array
+    status: NDArray[np.int64]
+
+
+class Problem(Protocol):
+    """Something with ``l`` unknowns, ``N`` runs and ``s`` outputs that can be fitted."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the unknowns; one that varies by run reads ``name[run]``."""
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """Prior of each unknown."""
+
+    @property
+    def start(self) -> Array:
+        """Where an estimate starts, shape (l,)."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the output channels."""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Labels of the runs."""
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Number of samples by run and output, shape (N, s)."""
+
+    def evaluate(self, theta: Array) -> Evaluation:
+        """Residuals and sensitivities at one vector, shape (l,)."""
+
+    def misfit(self, theta: Array) -> Misfit:
+        """Sums of squares at many vectors, shape (L, l); each depends on its own vector alone, bit for bit."""

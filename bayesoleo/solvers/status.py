@@ -1,0 +1,57 @@
+"""How a numerical solution ended: the member's message says it, its value counts it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class Status(IntEnum):
+    """Outcome of a solve, an estimate or one evaluation of a log density."""
+
+    CONVERGED = 0
+    INADMISSIBLE = 1
+    NO_CONVERGENCE = 2
+    SINGULAR = 3
+    NOT_FINITE = 4
+    OUT_OF_BOUNDS = 5
+
+    @property
+    def message(self) -> str:
+        """One sentence for a person."""
+        return _MESSAGES[self]
+
+    @property
+    def ok(self) -> bool:
+        """Whether the result may be used."""
+        return self is Status.CONVERGED
+
+
+_MESSAGES = {
+    Status.CONVERGED: "converged",
+    Status.INADMISSIBLE: "the solution leaves the model's admissible region",
+    Status.NO_CONVERGENCE: "the iteration did not converge",
+    Status.SINGULAR: "the linearised equations are singular",
+    Status.NOT_FINITE: "a residual or a derivative is not finite",
+    Status.OUT_OF_BOUNDS: "a parameter lies outside its prior's support",
+}
+
+
+def count(statuses: Iterable[int] | ArrayLike) -> dict[str, int]:
+    """Number of outcomes by name, only those that occur.
+
+    Parameters
+    ----------
+    statuses : array_like of int
+        Values of :class:`Status`.
+
+    Returns
+    -------
+    dict of str to int
+        Lower-case member name to number of occurrences.
+    """
+    values, numbers = np.unique(np.asarray(statuses, dtype=int), return_counts=True)
+    return {Status(v).name.lower(): int(n) for v, n in zip(values, numbers, strict=True)}
