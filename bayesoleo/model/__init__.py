@@ -1,0 +1,22 @@
+"""Declare a model as named terms, derive its partial derivatives, and generate kernels that evaluate them."""
+
+from bayesoleo.model.drive import driven_by, possible_drives
+from bayesoleo.model.model import Model
+from bayesoleo.model.parameter import Condition, Coordinate, Dof, Output, Parameter
+from bayesoleo.model.priors import LogNormal, Normal, Prior, TruncatedNormal, Uniform
+
+__all__ = [
+    "Condition",
+    "Coordinate",
+    "Dof",
+    "LogNormal",
+    "Model",
+    "Normal",
+    "Output",
+    "Parameter",
+    "Prior",
+    "TruncatedNormal",
+    "Uniform",
+    "driven_by",
+    "possible_drives",
+]

@@ -1,0 +1,184 @@
+"""Text to symbolic expressions: the small language in which equations are declared.
+
+Names are those that a model declares; ``dot(q)`` is a time derivative (``ddot(q)`` the second), also of an expression. Text is parsed
+against a closed list of names, so a misspelt one is an error rather than a new symbol.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from functools import cache
+
+import sympy as sp
+
+from bayesoleo.errors import ModelError
+
+#: Functions an expression may use. Those with kinks have their one-sided derivatives replaced by zero at the kink.
+FUNCTIONS: dict[str, object] = {
+    "abs": sp.Abs,
+    "sign": sp.sign,
+    "sqrt": sp.sqrt,
+    "exp": sp.exp,
+    "log": sp.log,
+    "sin": sp.sin,
+    "cos": sp.cos,
+    "tan": sp.tan,
+    "atan": sp.atan,
+    "arctan": sp.atan,
+    "tanh": sp.tanh,
+    "min": sp.Min,
+    "max": sp.Max,
+    "positive": lambda x: sp.Max(x, 0),
+    "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
+}
+
+#: Seconds since the first sample of the record; for outputs only, a periodic state cannot depend on it.
+TIME = sp.Symbol("time", real=True)
+
+_DERIVATIVE = re.compile(r"^(d+)ot\((.+)\)$")
+
+
+@cache
+def symbol(name: str) -> sp.Symbol:
+    """The symbol of a declared name; every quantity is real."""
+    return sp.Symbol(name, real=True)
+
+
+def derivative_symbol(name: str, order: int) -> sp.Symbol:
+    """The symbol of a time derivative: ``dot(q)``, ``ddot(q)``, ``dddot(q)`` …"""
+    return symbol(name) if order == 0 else symbol(f"{'d' * order}ot({name})")
+
+
+def split_derivative(item: sp.Symbol) -> tuple[str, int]:
+    """Name and order of derivative of a symbol: the inverse of :func:`derivative_symbol`."""
+    match = _DERIVATIVE.match(item.name)
+    return (match.group(2), len(match.group(1))) if match else (item.name, 0)
+
+
+def total_derivative(expression: sp.Expr, dynamic: Iterable[str]) -> sp.Expr:
+    """Time derivative along a trajectory, by the chain rule over the names that vary in time."""
+    varying = set(dynamic)
+    result = sp.Integer(0)
+    for item in expression.free_symbols:
+        name, order = split_derivative(item)
+        if name in varying:
+            result += sp.diff(expression, item) * derivative_symbol(name, order + 1)
+    return without_impulses(result)
+
+
+def without_impulses(expression: sp.Expr) -> sp.Expr:
+    """Drop the Dirac impulses that differentiating a kink or a step leaves: they act on a set of measure zero."""
+    return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+
+
+def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
+    """Partial derivative with impulses dropped."""
+    return without_impulses(sp.diff(expression, item))
+
+
+def parse(
+    text: str | float | sp.Expr,
+    known: Mapping[str, sp.Expr],
+    dynamic: Iterable[str],
+    where: str,
+) -> sp.Expr:
+    """Turn text into an expression over known names.
+
+    Parameters
+    ----------
+    text : str, number or sympy.Expr
+        An expression passes through unchanged.
+    known : mapping of str to sympy.Expr
+        Every name that may occur.
+    dynamic : iterable of str
+        The names that have time derivatives: dofs and inputs.
+    where : str
+        Shown in errors: ``equation 'stroke', term 'damping'``.
+
+    Raises
+    ------
+    ModelError
+        If the text is not an expression, or a name is unknown.
+    """
+    if isinstance(text, sp.Expr):
+        return text
+    if isinstance(text, int | float):
+        return sp.sympify(text)
+    try:
+        tree = ast.parse(text.strip(), mode="eval")
+    except SyntaxError as error:
+        raise ModelError(f"{where}: not an expression", value=text, hint="write it as in Python, e.g. k*q**3") from error
+    names = dict(known)
+    return sp.sympify(_Builder(names, tuple(dynamic), where, text).visit(tree.body))
+
+
+_OPERATORS = {
+    ast.Add: lambda a, b: a + b,
+    ast.Sub: lambda a, b: a - b,
+    ast.Mult: lambda a, b: a * b,
+    ast.Div: lambda a, b: a / b,
+    ast.Pow: lambda a, b: a**b,
+}
+
+
+class _Builder(ast.NodeVisitor):
+    """Builds an expression from a syntax tree; nothing is evaluated as Python."""
+
+    def __init__(self, known: Mapping[str, sp.Expr], dynamic: tuple[str, ...], where: str, text: str):
+        self.known, self.dynamic, self.where, self.text = known, dynamic, where, text
+
+    def generic_visit(self, node: ast.AST) -> sp.Expr:
+        raise ModelError(
+            f"{self.where}: {type(node).__name__} has no place in an expression",
+            value=self.text,
+            hint="use + - * / **, numbers, declared names and functions such as abs, exp, atan, dot",
+        )
+
+    def visit_Constant(self, node: ast.Constant) -> sp.Expr:
+        if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+            return self.generic_visit(node)
+        return sp.Integer(node.value) if isinstance(node.value, int) else sp.Float(node.value)
+
+    def visit_Name(self, node: ast.Name) -> sp.Expr:
+        if node.id in self.known:
+            return self.known[node.id]
+        if node.id == "pi":
+            return sp.pi
+        if node.id == "time":
+            return TIME
+        close = difflib.get_close_matches(node.id, self.known, 1)
+        hint = f"did you mean {close[0]}?" if close else f"declared: {', '.join(sorted(self.known))}"
+        raise ModelError(f"{self.where}: unknown name {node.id}", value=self.text, hint=hint)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> sp.Expr:
+        value = self.visit(node.operand)
+        if isinstance(node.op, ast.USub):
+            return -value
+        return value if isinstance(node.op, ast.UAdd) else self.generic_visit(node)
+
+    def visit_BinOp(self, node: ast.BinOp) -> sp.Expr:
+        operator = _OPERATORS.get(type(node.op))
+        if operator is None:
+            return self.generic_visit(node)
+        return operator(self.visit(node.left), self.visit(node.right))
+
+    def visit_Call(self, node: ast.Call) -> sp.Expr:
+        name = node.func.id if isinstance(node.func, ast.Name) else ""
+        arguments = [self.visit(argument) for argument in node.args]
+        if re.fullmatch("d+ot", name) and len(arguments) == 1:
+            return self._time_derivative(arguments[0], len(name) - 2)
+        function = FUNCTIONS.get(name)
+        if function is None or not callable(function) or node.keywords:
+            allowed = ", ".join(sorted(FUNCTIONS))
+            raise ModelError(
+                f"{self.where}: unknown function {name or '?'}", value=self.text, hint=f"there are dot, ddot, {allowed}"
+            )
+        return function(*arguments)
+
+    def _time_derivative(self, expression: sp.Expr, order: int) -> sp.Expr:
+        for _ in range(order):
+            expression = total_derivative(expression, self.dynamic)
+        return expression

@@ -1,0 +1,286 @@
+"""A model is declared, not programmed: named terms, definitions and parameters in one frozen value."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import sympy as sp
+
+from bayesoleo.errors import ModelError
+from bayesoleo.model.expressions import derivative_symbol, parse, split_derivative, symbol
+from bayesoleo.model.parameter import Condition, Coordinate, Dof, Output, Parameter
+
+Text = str | float | sp.Expr
+Terms = Mapping[str, sp.Expr]
+
+
+@dataclass(frozen=True)
+class Model:
+    """Equations of motion and outputs as sums of named terms.
+
+    Implements ``g(q, q', q'', x, theta) = 0`` with ``y = f(q, q', q'', x, theta)`` (Verbeek 1993, eqs. 2.1-2.3). Expressions are text over
+    declared names (see :mod:`bayesoleo.model.expressions`); ``dot(q)`` and ``ddot(q)`` are time derivatives of dofs *and* inputs.
+
+    Parameters
+    ----------
+    name : str
+        Short name, for reports.
+    outputs : mapping of str to Output, text or mapping
+        What is measured and predicted; the key is the channel's name.
+    inputs : mapping of str to str
+        Channels that drive the model, with their SI unit.
+    dofs : mapping of str to Dof or str
+        Degrees of freedom; text is the unit. The order of each follows from its equation.
+    equations : mapping of str to text or mapping of str to text
+        For each dof the terms whose sum is zero: named, or one expression whose summands are then numbered.
+    parameters : mapping of str to Parameter
+        Constants, estimated or fixed.
+    conditions : mapping of str to Condition or str
+        Known constants of a run; text is the unit.
+    definitions : mapping of str to text
+        Named intermediate expressions, each in terms of names declared before it.
+    admissible : sequence of text
+        Expressions that must stay positive, e.g. a gas volume.
+    description : str
+        One sentence.
+
+    Raises
+    ------
+    ModelError
+        If a name is unknown, declared twice or not usable, a dof lacks its equation, or nothing is measured.
+
+    Examples
+    --------
+    >>> model = Model(
+    ...     "linear oscillator",
+    ...     inputs={"force": "N"},
+    ...     dofs={"position": "m"},
+    ...     parameters={
+    ...         "mass": Parameter(1.0, "kg", fixed=True),
+    ...         "damping": Parameter(0.5, "N*s/m", sd=0.2),
+    ...         "stiffness": Parameter(100.0, "N/m", sd=30.0),
+    ...     },
+    ...     equations={"position": "mass*ddot(position) + damping*dot(position) + stiffness*position - force"},
+    ...     outputs={"displacement": Output("position", "m")},
+    ... )
+    >>> model.order("position")
+    2
+    """
+
+    name: str
+    outputs: Mapping[str, Output]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    dofs: Mapping[str, Dof] = field(default_factory=dict)
+    equations: Mapping[str, Terms] = field(default_factory=dict)
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    definitions: Mapping[str, sp.Expr] = field(default_factory=dict)
+    admissible: Sequence[sp.Expr] = ()
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "dofs", {k: v if isinstance(v, Dof) else Dof(v) for k, v in self.dofs.items()})
+        put(
+            self,
+            "conditions",
+            {k: v if isinstance(v, Condition) else Condition(v) for k, v in self.conditions.items()},
+        )
+        self._check_names()
+        put(self, "definitions", self._parse_definitions())
+        put(self, "equations", self._parse_equations())
+        put(self, "outputs", self._parse_outputs())
+        put(
+            self,
+            "admissible",
+            tuple(self._parse(text, "admissible region") for text in self.admissible),
+        )
+
+    # -- declaration ------------------------------------------------------------------------------------------------------
+
+    def _check_names(self) -> None:
+        seen: dict[str, str] = {}
+        kinds = {
+            "input": self.inputs,
+            "dof": self.dofs,
+            "parameter": self.parameters,
+            "condition": self.conditions,
+            "definition": self.definitions,
+        }
+        for kind, names in kinds.items():
+            for name in names:
+                if not name.isidentifier() or name in ("time", "pi", "dot", "ddot"):
+                    raise ModelError(f"{kind} {name!r} is not usable as a name", hint="write letters, digits and underscores")
+                if name in seen:
+                    raise ModelError(f"{name!r} is both {seen[name]} and {kind}", hint="rename one")
+                seen[name] = kind
+        for name, parameter in self.parameters.items():
+            if not isinstance(parameter, Parameter):
+                raise ModelError(
+                    f"parameter {name!r} is not a Parameter", value=parameter, hint='write Parameter(1.0, "kg", sd=0.1)'
+                )
+
+    @property
+    def _dynamic(self) -> tuple[str, ...]:
+        return (*self.dofs, *self.inputs)
+
+    def _known(self) -> dict[str, sp.Expr]:
+        names = (*self.inputs, *self.dofs, *self.parameters, *self.conditions)
+        return {name: symbol(name) for name in names}
+
+    def _parse(self, text: Text, where: str) -> sp.Expr:
+        known = self._known() | {name: symbol(name) for name in self.definitions}
+        if isinstance(text, str) and "dot(" in text:
+            # A derivative of a definition needs what stands behind its name.
+            known |= {name: self.expand(expression) for name, expression in self.definitions.items()}
+        return parse(text, known, self._dynamic, f"model {self.name!r}, {where}")
+
+    def _parse_definitions(self) -> dict[str, sp.Expr]:
+        known, parsed = self._known(), dict[str, sp.Expr]()
+        for name, text in self.definitions.items():
+            parsed[name] = parse(text, known, self._dynamic, f"model {self.name!r}, definition {name!r}")
+            known[name] = symbol(name)
+        return parsed
+
+    def _named(self, terms: Text | Mapping[str, Text], where: str) -> dict[str, sp.Expr]:
+        if isinstance(terms, Mapping):
+            return {name: self._parse(text, f"{where}, term {name!r}") for name, text in terms.items()}
+        summands = sp.Add.make_args(self._parse(terms, where))
+        return {f"term {number}": item for number, item in enumerate(summands, 1)}
+
+    def _parse_equations(self) -> dict[str, Terms]:
+        if set(self.equations) != set(self.dofs):
+            odd = sorted(set(self.equations) ^ set(self.dofs))
+            raise ModelError(
+                f"model {self.name!r}: dofs and equations do not match at {', '.join(odd)}",
+                hint="give every dof one equation under its name",
+            )
+        return {name: self._named(self.equations[name], f"equation {name!r}") for name in self.dofs}
+
+    def _parse_outputs(self) -> dict[str, Output]:
+        if not self.outputs:
+            raise ModelError(f"model {self.name!r}: no outputs", hint='write outputs={"channel": Output("q", "m")}')
+        parsed = {}
+        for name, output in self.outputs.items():
+            declared = output if isinstance(output, Output) else Output(output)
+            if name in self.inputs:
+                raise ModelError(f"model {self.name!r}: {name!r} is both input and output", hint="rename one")
+            parsed[name] = replace(declared, terms=self._named(declared.terms, f"output {name!r}"))
+        return parsed
+
+    # -- reading ----------------------------------------------------------------------------------------------------------
+
+    def expand(self, expression: sp.Expr) -> sp.Expr:
+        """Replace the names of definitions by what stands behind them."""
+        for name in reversed(list(self.definitions)):
+            item = symbol(name)
+            if expression.has(item):
+                expression = expression.xreplace({item: self.definitions[name]})
+        return expression
+
+    def equation(self, dof: str) -> sp.Expr:
+        """Left-hand side of a dof's equation, definitions expanded."""
+        return self.expand(sp.Add(*self.equations[dof].values()))
+
+    def output(self, name: str) -> sp.Expr:
+        """Expression of an output, definitions expanded."""
+        return self.expand(sp.Add(*self.output_terms(name).values()))
+
+    def output_terms(self, name: str) -> Terms:
+        """Named terms of an output."""
+        terms = self.outputs[name].terms
+        assert isinstance(terms, Mapping)  # made so on construction
+        return terms  # type: ignore[return-value]
+
+    def order(self, dof: str) -> int:
+        """Order of a dof: that of its highest derivative anywhere in equations and outputs, at least one."""
+        everything = [self.equation(name) for name in self.dofs] + [self.output(name) for name in self.outputs]
+        orders = [
+            split_derivative(item)[1]
+            for expression in everything
+            for item in expression.free_symbols
+            if split_derivative(item)[0] == dof
+        ]
+        return max([1, *orders])
+
+    def estimated(self) -> tuple[str, ...]:
+        """Names of the parameters that are not fixed."""
+        return tuple(name for name, parameter in self.parameters.items() if not parameter.fixed)
+
+    def nominal(self) -> dict[sp.Symbol, float]:
+        """Values of parameters and of conditions that have a default, for substitution."""
+        values = {symbol(name): parameter.value for name, parameter in self.parameters.items()}
+        defaults = {name: item.default for name, item in self.conditions.items() if item.default is not None}
+        return values | {symbol(name): value for name, value in defaults.items()}
+
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """Every place where a force-like effect can act.
+
+        These are the equations of dofs of second order, and the outputs that depend on an input (a force law), and - without
+        velocity - the equations of dofs of first order.
+        """
+        places = []
+        for dof in self.dofs:
+            top = derivative_symbol(dof, self.order(dof))
+            leading = sp.diff(self.equation(dof), top).subs(self.nominal())
+            sign = -1 if leading.is_number and leading < 0 else 1
+            velocity = derivative_symbol(dof, 1) if self.order(dof) == 2 else None
+            places.append(Coordinate(dof, symbol(dof), velocity, "equation", dof, sign))
+        for output in self.outputs:
+            names = {split_derivative(item)[0] for item in self.output(output).free_symbols}
+            for name in self.inputs:
+                if name in names:
+                    places.append(Coordinate(name, symbol(name), derivative_symbol(name, 1), "output", output, 1))
+        return tuple(places)
+
+    def digest(self) -> str:
+        """SHA-256 of what the model says; equal for models that predict the same in the same words."""
+        return hashlib.sha256(repr(self).encode()).hexdigest()
+
+    # -- changing: what effects are made of --------------------------------------------------------------------------------
+
+    def with_parameters(self, **parameters: Parameter) -> Model:
+        """Add parameters, or replace those of the same name."""
+        return replace(self, parameters={**self.parameters, **parameters})
+
+    def with_term(self, kind: str, target: str, name: str, expression: Text) -> Model:
+        """Add a named term to an equation or an output (``kind`` is ``equation`` or ``output``), or replace the one of that name."""
+        if kind == "equation":
+            terms = {**self.equations[target], name: expression}
+            return replace(self, equations={**self.equations, target: terms})
+        output = replace(self.outputs[target], terms={**self.output_terms(target), name: expression})
+        return replace(self, outputs={**self.outputs, target: output})
+
+    def with_output(self, name: str, expression: Text) -> Model:
+        """Replace an output's expression as a whole."""
+        return replace(self, outputs={**self.outputs, name: replace(self.outputs[name], terms=expression)})
+
+    def with_definition(self, name: str, expression: Text) -> Model:
+        """Add a definition, or redefine the one of that name in place."""
+        return replace(self, definitions={**self.definitions, name: expression})
+
+    def with_definition_before(self, before: str, name: str, expression: Text) -> Model:
+        """Insert a definition in front of another that is to use it."""
+        ordered: dict[str, Text] = {}
+        for existing, body in self.definitions.items():
+            if existing == before:
+                ordered[name] = expression
+            ordered[existing] = body
+        return replace(self, definitions=ordered)
+
+    def with_dof(self, name: str, dof: Dof, equation: Mapping[str, Text]) -> Model:
+        """Add a degree of freedom with its equation."""
+        return replace(
+            self, dofs={**self.dofs, name: dof}, equations={**self.equations, name: equation}
+        )
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """Set nominal values of parameters; priors stay."""
+        changed = {name: replace(self.parameters[name], value=value) for name, value in values.items()}
+        return self.with_parameters(**changed)
+
+    def fixing(self, *names: str) -> Model:
+        """Fix parameters at their nominal values."""
+        return self.with_parameters(**{name: replace(self.parameters[name], fixed=True) for name in names})
