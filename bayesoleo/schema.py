@@ -1,0 +1,233 @@
+"""Canonical names of everything that is stored, and the check of the summary.
+
+One DataTree goes from the closed loop to the disk, the plots and the report. Whoever writes or
+reads it takes the names of its groups, dims, variables and root attributes from here, so that a
+misspelt one is an ``AttributeError`` at once.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from bayesoleo.errors import ResultsError
+
+FORMAT: Final = 1
+"""Version of the layout; a reader refuses a later one."""
+
+# Groups
+OBSERVED_DATA: Final = "observed_data"
+CONSTANT_DATA: Final = "constant_data"
+NOISE: Final = "noise"
+POINT: Final = "point"
+PRIOR: Final = "prior"
+POSTERIOR: Final = "posterior"
+SAMPLE_STATS: Final = "sample_stats"
+LOG_LIKELIHOOD: Final = "log_likelihood"
+POSTERIOR_PREDICTIVE: Final = "posterior_predictive"
+RESIDUAL: Final = "residual"
+PREDICTION: Final = "prediction"
+DISCOVERY: Final = "discovery"
+
+GROUPS: Final = (
+    OBSERVED_DATA,
+    CONSTANT_DATA,
+    NOISE,
+    POINT,
+    PRIOR,
+    POSTERIOR,
+    SAMPLE_STATS,
+    LOG_LIKELIHOOD,
+    POSTERIOR_PREDICTIVE,
+    RESIDUAL,
+    PREDICTION,
+    DISCOVERY,
+)
+
+# Dims; each that is not just a counter has a coordinate of the same name
+CHAIN: Final = "chain"
+DRAW: Final = "draw"
+RUN: Final = "run"
+SAMPLE: Final = "sample"
+PHASE: Final = "phase"
+OUTPUT: Final = "output"
+PARAMETER: Final = "parameter"
+PARAMETER_COLUMN: Final = "parameter_column"
+ITERATION: Final = "iteration"
+ROUND: Final = "round"
+EFFECT: Final = "effect"
+
+# Variables and coordinates
+TIME: Final = "time"
+FREQUENCY: Final = "frequency"
+FREQUENCY_SD: Final = "frequency_sd"
+PERIODS: Final = "periods"
+ROLE: Final = "role"
+RUN_GROUP: Final = "group"
+START: Final = "start"
+MBE: Final = "mbe"
+ESTIMATE: Final = "estimate"
+SD: Final = "sd"
+UNIT: Final = "unit"
+COVARIANCE: Final = "covariance"
+VARIANCE: Final = "variance"
+HISTORY: Final = "history"
+OBJECTIVE: Final = "objective"
+ENSEMBLE: Final = "ensemble"
+LP: Final = "lp"
+RUNS: Final = "runs"
+STROKE: Final = "stroke"
+VELOCITY: Final = "velocity"
+GAIN: Final = "gain"
+P_VALUE: Final = "p_value"
+Z: Final = "z"
+CANDIDATE_FAMILY: Final = "candidate_family"
+EXPECTED: Final = "expected"
+INDISTINGUISHABLE: Final = "indistinguishable"
+RMS: Final = "rms"
+REPEATING: Final = "repeating"
+RATIO_TO_NOISE: Final = "ratio_to_noise"
+ACCEPTED: Final = "accepted"
+REASON: Final = "reason"
+
+# Values of ``role``
+FIT: Final = "fit"
+HOLD_OUT: Final = "hold-out"
+
+# Values of ``verdict``
+NOTHING_MISSING: Final = "nothing missing"
+EFFECT_ADDED: Final = "effect added"
+UNEXPLAINED: Final = "unexplained remainder"
+VERDICTS: Final = (NOTHING_MISSING, EFFECT_ADDED, UNEXPLAINED)
+
+# Root attributes
+FORMAT_ATTRIBUTE: Final = "bayesoleo_format"
+VERSION_ATTRIBUTE: Final = "bayesoleo_version"
+CREATED: Final = "created"
+SEED: Final = "seed"
+COMMAND: Final = "command"
+CAMPAIGN: Final = "campaign"
+CAMPAIGN_DESCRIPTION: Final = "campaign_description"
+CAMPAIGN_SHA256: Final = "campaign_sha256"
+MODEL: Final = "model"
+DRIVE: Final = "drive"
+EQUATIONS: Final = "equations"
+EQUATIONS_LATEX: Final = "equations_latex"
+EFFECTS: Final = "effects"
+VERDICT: Final = "verdict"
+SUMMARY: Final = "summary"
+
+# Attributes of every variable
+UNITS: Final = "units"
+LONG_NAME: Final = "long_name"
+
+
+def before(output: str) -> str:
+    """Name of what belongs to the model as declared: ``force_before``."""
+    return f"{output}_before"
+
+
+def after(output: str) -> str:
+    """Name of what belongs to the model as extended: ``force_after``."""
+    return f"{output}_after"
+
+
+def mean(name: str) -> str:
+    """Name of an average over periods: ``force_before_mean``."""
+    return f"{name}_mean"
+
+
+def noise(output: str) -> str:
+    """Name of the standard error of a residual averaged over periods: ``force_noise``."""
+    return f"{output}_noise"
+
+
+def log_variance(output: str) -> str:
+    """Name of the sampled logarithm of an output's variance."""
+    return f"log_variance_{output}"
+
+
+def by_run(parameter: str, run: str) -> str:
+    """Name of a parameter that varies by run: ``offset[run 3]``."""
+    return f"{parameter}[{run}]"
+
+
+def variable_name(name: str) -> str:
+    """A name as a variable can carry it: ``/`` separates groups, so it becomes ``∕`` (U+2215).
+
+    Parameters
+    ----------
+    name : str
+        For example the name of a parameter by run, whose label a user chose.
+    """
+    return name.replace("/", "∕")
+
+
+def validate_summary(summary: dict[str, Any]) -> None:
+    """Check a summary against the JSON Schema that ships with the package.
+
+    Parameters
+    ----------
+    summary : dict
+        What becomes ``summary.json``: plain dicts, lists, strings, numbers and None; SI units.
+
+    Raises
+    ------
+    ResultsError
+        Names the path of the first thing wrong, such as ``rounds[0].error.force.a.rms``.
+    """
+    import jsonschema
+
+    for path, value in _numbers(summary, ()):
+        if not math.isfinite(value):
+            raise ResultsError(
+                "a summary holds finite numbers only",
+                key=_spell(path),
+                value=value,
+                hint="write null (None) where there is no value",
+            )
+    validator = jsonschema.Draft202012Validator(summary_schema())
+    error = jsonschema.exceptions.best_match(validator.iter_errors(summary))
+    if error is not None:
+        raise ResultsError(
+            f"the summary does not follow its schema: {error.message}",
+            key=_spell(error.absolute_path),
+        )
+
+
+def summary_json(summary: dict[str, Any]) -> str:
+    """Text of ``summary.json``, checked by :func:`validate_summary` first."""
+    validate_summary(summary)
+    return json.dumps(summary, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+@cache
+def summary_schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of the summary; shared, so leave it unchanged."""
+    path = Path(__file__).with_name("summary.schema.json")
+    schema: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return schema
+
+
+def _numbers(
+    value: Any, path: tuple[str | int, ...]
+) -> Iterator[tuple[tuple[str | int, ...], float]]:
+    """Every float in a nested summary with the way to it."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _numbers(item, (*path, str(key)))
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _numbers(item, (*path, index))
+    elif isinstance(value, float):
+        yield path, value
+
+
+def _spell(path: Any) -> str:
+    """A path as a person writes it: ``rounds[0].reason``; the top is ``summary``."""
+    text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
+    return text.lstrip(".") or "summary"
