@@ -1,0 +1,281 @@
+"""Campaigns: a folder with ``campaign.toml`` and one file a run, loaded in SI and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.data.declaration import (
+    FILE,
+    Channel,
+    Declaration,
+    RunDeclaration,
+    choose,
+    read_declaration,
+)
+from bayesoleo.data.files import read_columns
+from bayesoleo.data.registry import dataset_folder
+from bayesoleo.data.sampling import uniform_time, window
+from bayesoleo.errors import CampaignError
+
+Array = NDArray[np.float64]
+
+_TIME_COLUMNS = ("time", "time_s")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run as loaded, in SI.
+
+    Parameters
+    ----------
+    label, file, group, role, kind : str
+        As declared; ``role`` is ``fit`` or ``hold-out``, ``kind`` is ``periodic`` or ``transient``.
+    frequency : float or None
+        Declared approximate frequency, Hz; None for a transient.
+    time : ndarray, shape (N,)
+        Equidistant sample times on the file's own clock, s.
+    samples : mapping of str to ndarray, shape (N,)
+        Each channel, SI.
+    conditions, condition_sd : mapping of str to float
+        Known constants and, where declared, their standard deviations, SI.
+    condition_units : mapping of str to str
+        SI unit of each condition.
+    """
+
+    label: str
+    file: str
+    group: str
+    role: str
+    kind: str
+    frequency: float | None
+    time: Array
+    samples: Mapping[str, Array]
+    conditions: Mapping[str, float] = field(default_factory=dict)
+    condition_units: Mapping[str, str] = field(default_factory=dict)
+    condition_sd: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def time_step(self) -> float:
+        """Sampling interval, s."""
+        return float((self.time[-1] - self.time[0]) / (self.time.size - 1))
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A loaded campaign.
+
+    Parameters
+    ----------
+    name, description : str
+        As declared.
+    controlled : str or None
+        The channel that the rig controls.
+    path : Path
+        Folder of ``campaign.toml``.
+    channels : mapping of str to Channel
+        Declared channels by name.
+    runs : tuple of Run
+        In the order declared.
+    sha256 : str
+        Of ``campaign.toml`` and all run files, in the order of the runs.
+    """
+
+    name: str
+    description: str
+    controlled: str | None
+    path: Path
+    channels: Mapping[str, Channel]
+    runs: tuple[Run, ...]
+    sha256: str
+
+    def run(self, label: str) -> Run:
+        """The run with this label.
+
+        Parameters
+        ----------
+        label : str
+            As declared.
+
+        Raises
+        ------
+        CampaignError
+            If there is none, with those there are.
+        """
+        for run in self.runs:
+            if run.label == label:
+                return run
+        raise CampaignError(
+            "no such run", run=label, hint=choose(label, [run.label for run in self.runs])
+        )
+
+
+def load_campaign(path: str | os.PathLike[str]) -> Campaign:
+    """Load a campaign and check it.
+
+    Parameters
+    ----------
+    path : path-like
+        The campaign's folder, or its ``campaign.toml``.
+
+    Returns
+    -------
+    Campaign
+        All runs, in SI.
+
+    Raises
+    ------
+    CampaignError
+        If anything in it cannot be used; one line that says where, what, and what to write instead.
+    """
+    given = Path(path)
+    toml = given if given.suffix == ".toml" else given / FILE
+    declaration = read_declaration(toml)
+    folder = _data_folder(declaration, toml.parent)
+    runs = tuple(_load_run(run, declaration.channels, folder) for run in declaration.runs)
+    return Campaign(
+        name=declaration.name,
+        description=declaration.description,
+        controlled=declaration.controlled,
+        path=toml.parent,
+        channels=MappingProxyType(dict(declaration.channels)),
+        runs=runs,
+        sha256=_checksum(toml, [folder / run.file for run in declaration.runs]),
+    )
+
+
+def _data_folder(declaration: Declaration, folder: Path) -> Path:
+    if declaration.dataset is None:
+        return folder
+    files = tuple(dict.fromkeys(run.file for run in declaration.runs))
+    return dataset_folder(declaration.dataset, files)
+
+
+def _checksum(toml: Path, files: list[Path]) -> str:
+    total = hashlib.sha256(toml.read_bytes())
+    for file in dict.fromkeys(files):
+        total.update(hashlib.sha256(file.read_bytes()).digest())
+    return total.hexdigest()
+
+
+def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder: Path) -> Run:
+    """Load one run; what goes wrong below is told with the run and its file."""
+    try:
+        columns = read_columns(
+            folder / declared.file, declared.delimiter, declared.header_delimiter
+        )
+        time = _time(declared, columns, channels)
+        part = window(time, declared.start, declared.stop)
+        time = _frozen(time[part])
+        samples = {
+            name: _samples(channel, columns, part, time) for name, channel in channels.items()
+        }
+        _check_periods(declared, time)
+    except CampaignError as error:
+        raise CampaignError(
+            error.problem,
+            file=error.file or declared.file,
+            run=declared.label,
+            column=error.column,
+            key=error.key,
+            value=error.value,
+            hint=error.hint,
+        ) from error
+    return Run(
+        label=declared.label,
+        file=declared.file,
+        group=declared.group,
+        role=declared.role,
+        kind=declared.kind,
+        frequency=declared.frequency,
+        time=time,
+        samples=MappingProxyType(samples),
+        conditions=MappingProxyType(dict(declared.conditions)),
+        condition_units=MappingProxyType(dict(declared.condition_units)),
+        condition_sd=MappingProxyType(dict(declared.condition_sd)),
+    )
+
+
+def _frozen(values: Array) -> Array:
+    values = np.ascontiguousarray(values, dtype=float)
+    values.setflags(write=False)
+    return values
+
+
+def _column(columns: Mapping[str, Array], name: str) -> Array:
+    if name not in columns:
+        raise CampaignError("no such column", column=name, hint=choose(name, columns))
+    return columns[name]
+
+
+def _time(
+    declared: RunDeclaration, columns: Mapping[str, Array], channels: Mapping[str, Channel]
+) -> Array:
+    if declared.sample_rate is not None:
+        first = _column(columns, next(iter(channels.values())).column)
+        return np.arange(first.size) / declared.sample_rate
+    if declared.time is not None:
+        return uniform_time(_column(columns, declared.time), declared.time)
+    for name in _TIME_COLUMNS:
+        if name in columns:
+            return uniform_time(columns[name], name)
+    raise CampaignError(
+        "no time column",
+        column=" or ".join(_TIME_COLUMNS),
+        hint=f"name it with time = '...', or give sample_rate; {choose('time', columns)}",
+    )
+
+
+def _samples(channel: Channel, columns: Mapping[str, Array], part: slice, time: Array) -> Array:
+    values = _column(columns, channel.column)[part]
+    if values.size != time.size:
+        raise CampaignError(
+            f"column has {values.size} samples and time {time.size}", column=channel.column
+        )
+    missing = np.flatnonzero(~np.isfinite(values))
+    if missing.size:
+        raise CampaignError(
+            f"{missing.size} missing value(s), the first at {time[missing[0]]:.6g} s",
+            column=channel.column,
+            value=float(values[missing[0]]),
+            hint="cut the run there with start or stop, or fill the gap",
+        )
+    if np.ptp(values) == 0:
+        raise CampaignError(
+            "channel is constant",
+            column=channel.column,
+            value=float(values[0]),
+            hint="make it a condition of the run, or check the sensor",
+        )
+    return _frozen(channel.to_si(values))
+
+
+def _check_periods(declared: RunDeclaration, time: Array) -> None:
+    if declared.frequency is None:
+        return
+    step = (time[-1] - time[0]) / (time.size - 1)
+    periods = declared.frequency * step * time.size
+    # One sample short of two periods is what a record from 0 to 2 T without its end point holds;
+    # the declared frequency is approximate, so a few per cent short of two may still be two of the
+    # true ones.
+    if periods < 1.9:
+        raise CampaignError(
+            f"fewer than two periods in {time[-1] - time[0]:.6g} s",
+            key="frequency",
+            value=declared.frequency,
+            hint="record two periods or more, or correct the frequency",
+        )
+    if declared.frequency * step > 0.25:
+        raise CampaignError(
+            f"fewer than four samples a period at {1 / step:.6g} Hz",
+            key="frequency",
+            value=declared.frequency,
+            hint="correct the frequency or the sample_rate",
+        )

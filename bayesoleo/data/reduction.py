@@ -1,0 +1,211 @@
+"""Campaigns to records: frequency, whole settled periods, significant harmonics, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.data.averaging import average_on
+from bayesoleo.data.campaign import Campaign, Run
+from bayesoleo.data.declaration import choose
+from bayesoleo.data.harmonics import significant_harmonics
+from bayesoleo.data.period import Frequency, find_frequency
+from bayesoleo.data.settling import sample_count, settled_start, whole_periods
+from bayesoleo.data.smoothing import innovation_noise
+from bayesoleo.data.transforms import HarmonicBasis
+from bayesoleo.errors import CampaignError
+from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.records import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReducedCampaign:
+    """A campaign with its runs reduced to records.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        What was loaded.
+    records : tuple of Record
+        One a run, in the campaign's order.
+    """
+
+    campaign: Campaign
+    records: tuple[Record, ...]
+
+    def record(self, label: str) -> Record:
+        """The record of a run.
+
+        Parameters
+        ----------
+        label : str
+            The run's label.
+
+        Raises
+        ------
+        CampaignError
+            If there is none, with those there are.
+        """
+        for record in self.records:
+            if record.label == label:
+                return record
+        raise CampaignError(
+            "no such run", run=label, hint=choose(label, [r.label for r in self.records])
+        )
+
+
+def reduce_campaign(
+    campaign: Campaign, jobs: int | None = None, progress: bool = False
+) -> ReducedCampaign:
+    """Reduce all runs of a campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        From :func:`load_campaign`.
+    jobs : int, optional
+        Threads; by default the cores this process may use.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    ReducedCampaign
+        One record a run.
+
+    Raises
+    ------
+    CampaignError
+        If a run does not repeat near its declared frequency, or holds fewer than two periods.
+    """
+    if not progress:
+        return ReducedCampaign(campaign, tuple(thread_map(reduce_run, campaign.runs, jobs)))
+    from tqdm.auto import tqdm
+
+    with tqdm(total=len(campaign.runs), desc="reduce", unit="run") as bar:
+
+        def reduce_and_count(run: Run) -> Record:
+            record = reduce_run(run)
+            bar.update()
+            return record
+
+        records = tuple(thread_map(reduce_and_count, campaign.runs, jobs))
+    return ReducedCampaign(campaign, records)
+
+
+def reduce_run(run: Run) -> Record:
+    """Reduce one run.
+
+    Periodic: the frequency is refined, leading periods that have not settled are left out, and the
+    last whole periods are kept.
+
+    Parameters
+    ----------
+    run : Run
+        From a loaded campaign.
+
+    Returns
+    -------
+    Record
+        Raw samples over whole periods with harmonics and noise, SI.
+
+    Raises
+    ------
+    CampaignError
+        If the run does not repeat near its declared frequency, or holds fewer than two periods.
+    """
+    if run.frequency is None:
+        return _transient(run)
+    names, values = list(run.samples), np.array(list(run.samples.values()))
+    try:
+        found, first, dropped = _settle(values, run.time_step, run.frequency)
+    except CampaignError as error:
+        raise CampaignError(
+            error.problem,
+            file=run.file,
+            run=run.label,
+            key=error.key,
+            value=error.value,
+            hint=error.hint,
+        ) from error
+    time = run.time[first:]
+    step = found.value * run.time_step
+    basis = HarmonicBasis(time.size, step)
+    kept = {name: _frozen(channel[first:]) for name, channel in zip(names, values, strict=True)}
+    return _record(
+        run,
+        time,
+        kept,
+        frequency=found.value,
+        frequency_sd=found.sd,
+        periods=int(np.floor(time.size * step + 0.5)),
+        harmonics=MappingProxyType(
+            {name: significant_harmonics(basis, channel) for name, channel in kept.items()}
+        ),
+        signal_noise=MappingProxyType(
+            {name: average_on(basis, channel).sigma for name, channel in kept.items()}
+        ),
+        dropped_periods=dropped,
+    )
+
+
+def _settle(values: Array, time_step: float, nominal: float) -> tuple[Frequency, int, int]:
+    """Frequency, first sample to keep, and number of unsettled periods left out before it."""
+    found = find_frequency(values, time_step, nominal)
+    samples = values.shape[1]
+    if whole_periods(samples, found.value * time_step) < 2:
+        raise CampaignError(
+            f"fewer than two periods of {1.0 / found.value:.6g} s in {samples * time_step:.6g} s",
+            key="frequency",
+            value=nominal,
+            hint="record two periods or more",
+        )
+    first, dropped = settled_start(values, found.value * time_step)
+    if dropped:
+        # The periods left out had pulled on the frequency.
+        found = find_frequency(values[:, first:], time_step, found.value)
+        periods = whole_periods(samples, found.value * time_step) - dropped
+        first = max(0, samples - sample_count(periods, found.value * time_step))
+    return found, first, dropped
+
+
+def _frozen(values: Array) -> Array:
+    values = np.ascontiguousarray(values)
+    values.setflags(write=False)
+    return values
+
+
+def _record(run: Run, time: Array, samples: Mapping[str, Array], **reduced: Any) -> Record:
+    return Record(
+        label=run.label,
+        group=run.group,
+        role=run.role,
+        kind=run.kind,
+        time=_frozen(time),
+        samples=MappingProxyType(dict(samples)),
+        conditions=run.conditions,
+        condition_sd=run.condition_sd,
+        **reduced,
+    )
+
+
+def _transient(run: Run) -> Record:
+    return _record(
+        run,
+        run.time,
+        run.samples,
+        frequency=float("nan"),
+        frequency_sd=float("nan"),
+        periods=0,
+        harmonics=MappingProxyType({}),
+        signal_noise=MappingProxyType(
+            {name: innovation_noise(values) for name, values in run.samples.items()}
+        ),
+    )

@@ -1,0 +1,211 @@
+"""Delimited text with a header: what spreadsheets and test machines write."""
+
+from __future__ import annotations
+
+import re
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import CampaignError
+
+Array = NDArray[np.float64]
+
+WHITESPACE = "whitespace"
+_NAMED = {"whitespace": WHITESPACE, " ": WHITESPACE, "tab": "\t", "comma": ",", "semicolon": ";"}
+_SNIFFED = (",", ";", "\t", "|", WHITESPACE)
+_DECIMAL_COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
+
+
+def read_text(
+    path: Path, delimiter: str | None = None, header_delimiter: str | None = None
+) -> dict[str, Array]:
+    """Read a delimited text file with one header line.
+
+    A leading ``#`` of the header is dropped. The delimiter is the one that splits the first lines
+    into the most columns, all lines alike; it is checked against the header and against columns
+    that come out empty.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    delimiter, header_delimiter : str, optional
+        Of the values and of the header; ``whitespace`` stands for any run of blanks. Sniffed by
+        default.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (N,)
+        Columns; empty cells are NaN.
+
+    Raises
+    ------
+    CampaignError
+        If no header is found, columns do not match it, or a cell is not a number.
+    """
+    header_line, skip, sample = _find_header(path)
+    separator = _NAMED.get(delimiter or "", delimiter) or sniff_delimiter(sample)
+    names = _header_names(
+        path, header_line, separator, header_delimiter, len(_split(sample[0], separator))
+    )
+    table = _read_cells(path, skip, separator, len(names))
+    columns = {name: _numbers(path, name, table[index]) for index, name in enumerate(names)}
+    _check_filled(path, columns, separator)
+    return columns
+
+
+def sniff_delimiter(lines: list[str]) -> str:
+    """The delimiter that splits all lines alike, into the most cells.
+
+    Parameters
+    ----------
+    lines : list of str
+        First lines of values.
+
+    Returns
+    -------
+    str
+        A character, or ``whitespace``.
+    """
+    best, most = ",", 1
+    for candidate in _SNIFFED:
+        counts = {len(_split(line, candidate)) for line in lines}
+        # A decimal comma also splits alike; a candidate that leaves cells numeric is the delimiter.
+        if len(counts) == 1 and max(counts) > most and _numeric_share(lines, candidate) > 0.5:
+            best, most = candidate, max(counts)
+    return best
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    cells = line.split() if delimiter == WHITESPACE else line.split(delimiter)
+    return [cell.strip().strip('"') for cell in cells]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _numeric_share(lines: list[str], delimiter: str) -> float:
+    cells = [cell for line in lines for cell in _split(line, delimiter)]
+    return sum(_is_number(cell) for cell in cells) / max(len(cells), 1)
+
+
+def _find_header(path: Path) -> tuple[str, int, list[str]]:
+    """The header line, the number of lines up to the values, and the first lines of values."""
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            lines = [line.rstrip("\r\n") for line in islice(stream, 200)]
+    except UnicodeDecodeError as error:
+        raise CampaignError(
+            "not a text file in UTF-8", file=path.name, value=path.suffix, hint="export it as CSV"
+        ) from error
+    header, start = None, 0
+    for number, line in enumerate(lines):
+        text = line.strip()
+        if not text:
+            continue
+        values = re.split(r"[,;|\s]+", text.strip(",;|"))
+        if not text.startswith("#") and all(map(_is_number, values)):
+            start = number
+            break
+        # The last comment line before the values, or the first line that is no comment, names the
+        # columns.
+        if header is not None and not header.startswith("#"):
+            start = number
+            break
+        header = text
+    sample = [line for line in lines[start : start + 50] if line.strip()]
+    if header is None:
+        raise CampaignError(
+            "file has no header",
+            file=path.name,
+            value=lines[0][:60],
+            hint="name the columns in line 1",
+        )
+    if start == 0 or not sample:
+        raise CampaignError("file has a header and no values", file=path.name, value=header[:60])
+    return header.lstrip("#").strip(), start, sample
+
+
+def _header_names(
+    path: Path, header: str, separator: str, header_delimiter: str | None, width: int
+) -> list[str]:
+    chosen = _NAMED.get(header_delimiter or "", header_delimiter)
+    names = _split(header, chosen or separator)
+    if chosen is None and len(names) != width:
+        names = next((n for c in _SNIFFED if len(n := _split(header, c)) == width), names)
+    if len(names) != width:
+        raise CampaignError(
+            f"header has {len(names)} columns and the values {width}, split by {separator!r}",
+            file=path.name,
+            key="delimiter",
+            value=header[:60],
+            hint="set delimiter and header_delimiter of this run",
+        )
+    repeated = sorted({name for name in names if names.count(name) > 1 and name})
+    if repeated:
+        raise CampaignError("two columns have this name", file=path.name, column=repeated[0])
+    return names
+
+
+def _read_cells(path: Path, skip: int, separator: str, width: int):
+    import pandas as pd
+
+    try:
+        return pd.read_csv(
+            path,
+            sep=r"\s+" if separator == WHITESPACE else separator,
+            header=None,
+            names=list(range(width)),
+            index_col=False,
+            skiprows=skip,
+            comment="#",
+            encoding="utf-8-sig",
+            skipinitialspace=True,
+            low_memory=False,
+        )
+    except pd.errors.ParserError as error:
+        raise CampaignError(
+            f"lines differ in their number of cells: {error}", file=path.name, key="delimiter"
+        ) from error
+
+
+def _numbers(path: Path, name: str, column) -> Array:
+    import pandas as pd
+
+    if column.dtype.kind in "biuf":
+        return column.to_numpy(dtype=float)
+    numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
+    wrong = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
+    if wrong.size:
+        cell = str(column.iloc[wrong[0]])
+        hint = (
+            "write decimal points" if _DECIMAL_COMMA.match(cell.strip()) else "write numbers only"
+        )
+        raise CampaignError(
+            f"not a number in row {wrong[0] + 1}",
+            file=path.name,
+            column=name,
+            value=cell,
+            hint=hint,
+        )
+    return numbers
+
+
+def _check_filled(path: Path, columns: dict[str, Array], separator: str) -> None:
+    for name, values in columns.items():
+        if np.mean(np.isnan(values)) > 0.5:
+            raise CampaignError(
+                f"column is more than half empty when split by {separator!r}",
+                file=path.name,
+                column=name,
+                key="delimiter",
+                hint="set the delimiter of this run, or leave that column out",
+            )

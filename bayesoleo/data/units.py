@@ -1,0 +1,149 @@
+"""Units: what a file is written in, and SI.
+
+Any unit that pint reads, and two that test rigs write and pint does not: ``psia`` (absolute) and
+``psig`` (above ambient). Both become pascal with no offset, because the ambient pressure is not in
+the unit: a gauge pressure stays one.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesoleo.errors import CampaignError
+
+#: Pint's base units, by the SI name that a reader expects.
+_SI_NAMES = {
+    "kilogram / meter / second ** 2": "Pa",
+    "kilogram * meter / second ** 2": "N",
+    "kilogram * meter ** 2 / second ** 2": "J",
+    "kilogram * meter ** 2 / second ** 3": "W",
+    "kilogram * meter ** 2 / ampere / second ** 3": "V",
+    "kilogram * meter ** 2 / ampere ** 2 / second ** 3": "ohm",
+    "ampere * second": "C",
+    "1 / second": "Hz",
+    "dimensionless": "1",
+    "kelvin": "K",
+    "meter": "m",
+    "meter / second": "m/s",
+    "meter / second ** 2": "m/s²",
+    "radian": "rad",
+    "radian / second": "rad/s",
+    "second": "s",
+    "ampere": "A",
+    "kilogram": "kg",
+}
+
+#: Words at the end of a channel's or a condition's name that fix its SI unit.
+_EXPECTED = {
+    "pressure": ("Pa", "bar"),
+    "force": ("N", "kN (a pound of force is lbf)"),
+    "temperature": ("K", "degC"),
+}
+
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit as an affine map to SI: ``si = factor * value + shift``.
+
+    Parameters
+    ----------
+    name, si_name : str
+        As written, and its SI unit.
+    factor, shift : float
+        SI units a unit; SI value at zero (only temperatures have one).
+    """
+
+    name: str
+    si_name: str
+    factor: float
+    shift: float = 0.0
+
+    def to_si(self, value: ArrayLike) -> NDArray[np.float64]:
+        """SI values of ``value``, any shape."""
+        return np.asarray(value, dtype=float) * self.factor + self.shift
+
+    def from_si(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Inverse of :meth:`to_si`."""
+        return (np.asarray(value, dtype=float) - self.shift) / self.factor
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry.define("psia = psi")
+    registry.define("psig = psi")
+    return registry
+
+
+@cache
+def parse_unit(name: str) -> Unit:
+    """Read a unit.
+
+    Parameters
+    ----------
+    name : str
+        ``mm``, ``kN``, ``bar``, ``psig``, ``m/s**2``, ``degC``, ``1`` ...
+
+    Returns
+    -------
+    Unit
+        Its map to SI.
+
+    Raises
+    ------
+    CampaignError
+        If pint does not know it.
+    """
+    with _lock:  # pint fills its caches on reading; threads must not do so together
+        try:
+            registry = _registry()
+            unit = registry.Unit("dimensionless" if name.strip() in ("", "1", "-") else name)
+            zero = registry.Quantity(0.0, unit).to_base_units()
+            one = registry.Quantity(1.0, unit).to_base_units()
+        except Exception as error:  # pint raises half a dozen unrelated types on bad input
+            raise CampaignError(
+                "unknown unit",
+                value=name,
+                hint="write one that pint reads, such as mm, kN, bar, psig",
+            ) from error
+    base = str(one.units)
+    shift = float(zero.magnitude)
+    # kN is 1000 N exactly; pint's base units go through grams and may miss it by one rounding.
+    factor = float(f"{float(one.magnitude) - shift:.15g}")
+    return Unit(
+        name, _SI_NAMES.get(base, base.replace(" ** ", "^").replace(" ", "")), factor, shift
+    )
+
+
+def check_kind(name: str, unit: Unit) -> None:
+    """Raise if a channel or condition is named after a quantity that its unit does not measure.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``initial_pressure``.
+    unit : Unit
+        What it is said to be in.
+
+    Raises
+    ------
+    CampaignError
+        With a unit that would do.
+    """
+    for word, (si_name, example) in _EXPECTED.items():
+        if name.endswith(word) and unit.si_name != si_name:
+            raise CampaignError(
+                f"unit does not measure {word}",
+                value=unit.name,
+                hint=f"write one such as {example}, or rename {name!r}",
+            )
