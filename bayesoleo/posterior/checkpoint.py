@@ -1,0 +1,292 @@
+"""Where segments go: files that are never changed, or memory.
+
+A segment is written under another name, synchronised and renamed, so that a file with a segment's name is whole; a checksum inside
+tells if it is not after all. The generator's state lies in the same file, so that a killed run continues to the same draws.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import ResultsError
+from bayesoleo.posterior.mixture import Mixture
+from bayesoleo.posterior.segment import Phase, Segment
+
+_NAME = "segment-{:06d}.npz"
+_COUNTERS = ("failures", "proposed", "accepted")
+
+
+class Store(Protocol):
+    """Where a run finds the segments it has and puts the next one."""
+
+    @property
+    def segments(self) -> list[Segment]:
+        """All segments so far."""
+
+    def append(self, segment: Segment) -> None:
+        """Add one."""
+
+
+class MemoryStore:
+    """Segments of a run that is not saved."""
+
+    def __init__(self) -> None:
+        self.segments: list[Segment] = []
+
+    def append(self, segment: Segment) -> None:
+        """Add one."""
+        self.segments.append(segment)
+
+
+class FolderStore:
+    """Segments in a folder; use :func:`open_store`, which holds the lock.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing folder.
+    fingerprint : str
+        Identifies the run: problem, priors, seed, settings.
+
+    Raises
+    ------
+    ResultsError
+        If the folder holds segments of another run.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str) -> None:
+        self.folder, self.fingerprint = folder, fingerprint
+        self.segments: list[Segment] = []
+        for leftover in folder.glob(_NAME.format(0).split("0")[0] + "*.tmp"):
+            leftover.unlink()
+        self._load_good_prefix()
+
+    def append(self, segment: Segment) -> None:
+        """Write one durably.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written (a full disk); what was written before is untouched.
+        """
+        path = self.folder / _NAME.format(len(self.segments))
+        write_durably(path, encode(segment, self.fingerprint, len(self.segments)))
+        self.segments.append(segment)
+
+    def _load_good_prefix(self) -> None:
+        """Load up to the first segment that is missing or broken; what comes after it is set aside."""
+        for index in range(len(list(self.folder.glob("segment-*.npz")))):
+            path = self.folder / _NAME.format(index)
+            try:
+                segment, fingerprint = decode(path.read_bytes(), index)
+            except _BROKEN:
+                break
+            if fingerprint != self.fingerprint:
+                raise ResultsError(
+                    "this folder holds draws of another problem, seed or setting",
+                    file=self.folder,
+                    hint="give another folder, or remove this one to sample anew",
+                )
+            self.segments.append(segment)
+        for path in sorted(self.folder.glob("segment-*.npz")):
+            if int(path.stem.split("-")[1]) >= len(self.segments):
+                set_aside(path)
+
+
+class _BrokenSegmentError(Exception):
+    """The file is not a whole segment."""
+
+
+#: What reading a truncated or altered archive can raise.
+_BROKEN = (
+    _BrokenSegmentError,
+    OSError,
+    EOFError,
+    KeyError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def set_aside(path: Path) -> None:
+    """Rename a broken file so that it is neither read nor overwritten."""
+    number = 0
+    while (aside := path.with_suffix(f".broken-{number}")).exists():
+        number += 1
+    path.rename(aside)
+
+
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a file that is either absent or whole, whatever happens meanwhile.
+
+    Parameters
+    ----------
+    path : Path
+        Where it will be.
+    content : bytes
+        What it will hold.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; no file of that name exists then.
+    """
+    temporary = path.with_suffix(path.suffix + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    _synchronise_folder(path.parent)
+
+
+def _synchronise_folder(folder: Path) -> None:
+    if os.name == "nt":  # Windows cannot open a folder; its rename is durable with the file
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
+    """Bytes of an ``npz`` archive that holds a segment and its checksum."""
+    name, keys, position, has_gauss, cached = segment.random_state
+    counters = {key: dict(getattr(segment, key)) for key in _COUNTERS}
+    about = {
+        "index": index,
+        "fingerprint": fingerprint,
+        "phase": segment.phase,
+        "evaluations": segment.evaluations,
+        "generator": [name, int(position), int(has_gauss)],
+        "degrees": segment.mixture.degrees,
+        **counters,
+    }
+    arrays = {
+        "coords": segment.coords,
+        "log_density": segment.log_density,
+        "by_run": segment.by_run,
+        "generator_keys": np.asarray(keys, dtype=np.uint32),
+        "generator_cached": np.array(cached, dtype=float),
+        "centres": segment.mixture.centres,
+        "covariances": segment.mixture.covariances,
+        "log_weights": segment.mixture.log_weights,
+        "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), dtype=np.uint8),
+    }
+    arrays["checksum"] = _checksum(arrays)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **cast("dict[str, Any]", arrays))
+    return buffer.getvalue()
+
+
+def decode(content: bytes, index: int) -> tuple[Segment, str]:
+    """Segment and fingerprint out of an archive's bytes; raises one of many errors when it is not whole."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    checksum = arrays.pop("checksum")
+    about = json.loads(bytes(arrays["about"]).decode())
+    if not np.array_equal(checksum, _checksum(arrays)) or about["index"] != index:
+        raise _BrokenSegmentError
+    name, position, has_gauss = about["generator"]
+    mixture = Mixture(
+        arrays["centres"], arrays["covariances"], arrays["log_weights"], about["degrees"]
+    )
+    segment = Segment(
+        phase=cast("Phase", about["phase"]),
+        coords=arrays["coords"],
+        log_density=arrays["log_density"],
+        by_run=arrays["by_run"],
+        random_state=(
+            name,
+            arrays["generator_keys"],
+            position,
+            has_gauss,
+            float(arrays["generator_cached"]),
+        ),
+        mixture=mixture,
+        evaluations=about["evaluations"],
+        failures=Counter(about["failures"]),
+        proposed=Counter(about["proposed"]),
+        accepted=Counter(about["accepted"]),
+    )
+    return segment, about["fingerprint"]
+
+
+def _checksum(arrays: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    digest = hashlib.sha256()
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        digest.update(f"{key}{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return np.frombuffer(digest.digest(), dtype=np.uint8)
+
+
+@contextmanager
+def open_store(folder: Path | None, fingerprint: str) -> Iterator[Store]:
+    """Open the place for a run's segments and keep other processes out.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Made if it does not exist; None keeps the segments in memory.
+    fingerprint : str
+        Identifies the run.
+
+    Yields
+    ------
+    Store
+        With the segments that are there.
+
+    Raises
+    ------
+    ResultsError
+        If another process writes there, or the folder holds another run.
+    """
+    if folder is None:
+        yield MemoryStore()
+        return
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "lock", "a+b") as file:
+        if not _lock(file):
+            raise ResultsError(
+                "another process is writing draws here",
+                file=folder,
+                hint="wait for it, or give another folder",
+            )
+        # Closing the file releases the lock, and so does the end of the process, however it comes.
+        yield FolderStore(folder, fingerprint)
+
+
+def _lock(file: IO[bytes]) -> bool:
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,330 @@
+"""Laplace approximations at the modes of a log density, and the mixture that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import InputError
+from bayesoleo.posterior.density import LogDensity
+from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM, Mixture
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding and solver noise.
+STEP = 0.25
+#: A mode is found when the Newton step is shorter than this many standard deviations.
+TOLERANCE = 1e-3
+#: Longest Newton step, in standard deviations; a quadratic model is not trusted further.
+RADIUS = 3.0
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a log density with its normal approximation.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (d,)
+        Where the density is highest, in coordinates without bounds.
+    covariance : ndarray, shape (d, d)
+        Inverse of the negative Hessian there.
+    log_weight : float
+        Logarithm of the Laplace approximation of the density's integral around the mode.
+    status : Status
+        ``CONVERGED``; ``NO_CONVERGENCE`` when the polishing ran out of iterations; ``SINGULAR`` when the Hessian is not negative
+        definite and the covariance is the Gauss-Newton one instead; a failure of the density otherwise.
+
+    References
+    ----------
+    Tierney and Kadane (1986), "Accurate approximations for posterior moments and marginal densities", *JASA* 81, eq. 2.2.
+    """
+
+    centre: Array
+    covariance: Array
+    log_weight: float
+    status: Status
+
+
+def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
+    """Block-diagonal approximation of the covariance at a point.
+
+    Parameters
+    ----------
+    log_density : LogDensity
+        Over ``l + s`` coordinates.
+    phi : ndarray, shape (l + s,)
+        The point.
+
+    Returns
+    -------
+    ndarray, shape (l + s, l + s)
+        Inverse of ``A + w^-1`` at fixed ``v`` for the parameters (in coordinates without bounds, ``w`` the curvature of prior and
+        Jacobian there) and ``2 / n_b`` for ``ln v_b``. Where the sensitivities cannot be computed, ``A`` is left out.
+
+    References
+    ----------
+    Verbeek (1993), eq. 3.19 (the matrix) and Appendix A (``H_vv`` at ``v = M / n``).
+    """
+    problem, unknowns = log_density.problem, len(log_density.problem.names)
+    u, log_variance = phi[:unknowns], phi[unknowns:]
+    precision = np.diag(_prior_precision(log_density, u))
+    theta = log_density.transforms.natural(u[None])[0]
+    evaluation = problem.evaluate(theta)
+    if evaluation.status.ok:
+        chain = log_density.transforms.derivative(u[None])[0]
+        for jacobian, log_v in zip(evaluation.sensitivity, log_variance, strict=True):
+            scaled = jacobian * chain
+            precision += scaled.T @ scaled * np.exp(-log_v)
+    covariance = np.zeros((len(phi), len(phi)))
+    covariance[:unknowns, :unknowns] = np.linalg.inv(precision)
+    counts = np.asarray(problem.counts).sum(axis=0)
+    covariance[unknowns:, unknowns:] = np.diag(2.0 / counts)
+    return covariance
+
+
+def _prior_precision(log_density: LogDensity, u: Array) -> Array:
+    """Negative second derivatives of log prior plus log Jacobian; priors are independent, so each has its own."""
+    precision = np.empty(len(u))
+    for a, (prior, transform) in enumerate(
+        zip(log_density.problem.priors, log_density.transforms.each, strict=True)
+    ):
+        step = STEP * prior.sd / abs(float(transform.derivative(u[a : a + 1])[0]))
+        # A quarter of the prior's width in u; at most 1/4 where u is a logarithm, whose unit is a factor e.
+        step = step if transform.low == -np.inf and transform.high == np.inf else min(step, STEP)
+        points = u[a] + step * np.array([-1.0, 0.0, 1.0])
+        values = prior.log_density(transform.natural(points)) + transform.log_jacobian(points)
+        curvature = -(values[0] - 2 * values[1] + values[2]) / step**2
+        floor = 1e-3 / step**2  # flat or convex: wide, but not improper
+        precision[a] = max(curvature, floor) if np.isfinite(curvature) else floor
+    return precision
+
+
+def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) -> Mode:
+    """Climb to the mode next to a point and approximate the density there.
+
+    Newton's method in coordinates whitened by the Gauss-Newton covariance; gradient and Hessian come from one batch of
+    ``d^2 + d + 1`` rows, the step length from a second one.
+
+    Parameters
+    ----------
+    log_density : LogDensity
+        Over ``d`` coordinates.
+    start : ndarray, shape (d,)
+        Where to begin, for example the estimate.
+    iterations : int
+        Most Newton iterations.
+
+    Returns
+    -------
+    Mode
+        With a status; nothing is raised for a numerical failure.
+
+    References
+    ----------
+    Verbeek (1993), Appendix A (full Newton), here by finite differences.
+    """
+    phi = np.array(start, dtype=float)
+    status, height = Status.NO_CONVERGENCE, -np.inf
+    for _ in range(iterations):
+        covariance = gauss_newton_covariance(log_density, phi)
+        factor = np.linalg.cholesky(covariance)
+        height, gradient, hessian = _derivatives(log_density, phi, factor)
+        if not np.isfinite(height):
+            return Mode(phi, covariance, -np.inf, Status.NOT_FINITE)
+        step = _newton_step(gradient, hessian)
+        if np.linalg.norm(step) < TOLERANCE:
+            status = Status.CONVERGED
+            break
+        phi, moved = _line_search(log_density, phi, factor @ step, height)
+        if (
+            not moved
+        ):  # no height to gain along an ascent direction: the top, as far as rounding shows
+            status = Status.CONVERGED
+            break
+    covariance, positive = _covariance(factor, hessian)
+    if not positive:
+        status = Status.SINGULAR
+    half_log_det = float(np.sum(np.log(np.diagonal(np.linalg.cholesky(covariance)))))
+    weight = height + half_log_det + 0.5 * len(phi) * np.log(2 * np.pi)
+    return Mode(phi, covariance, float(weight), status)
+
+
+def _derivatives(log_density: LogDensity, phi: Array, factor: Array) -> tuple[float, Array, Array]:
+    """Height, gradient and Hessian in whitened coordinates ``phi + factor @ z`` at ``z = 0``, by central differences."""
+    d, h = len(phi), STEP
+    unit = h * np.eye(d)
+    pairs = [(i, j) for i in range(d) for j in range(i)]
+    both = np.array([unit[i] + unit[j] for i, j in pairs]).reshape(-1, d)
+    rows = np.concatenate([np.zeros((1, d)), unit, -unit, both, -both])
+    values, _ = log_density(phi + rows @ factor.T)
+    centre, up, down = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
+    with np.errstate(invalid="ignore"):
+        gradient = (up - down) / (2 * h)
+        hessian = np.diag((up - 2 * centre + down) / h**2)
+        diagonal = up + down - 2 * centre
+        twice = values[2 * d + 1 : 2 * d + 1 + len(pairs)] + values[2 * d + 1 + len(pairs) :]
+        for (i, j), sum_of_two in zip(pairs, twice, strict=True):
+            mixed = (sum_of_two - 2 * centre - diagonal[i] - diagonal[j]) / (2 * h**2)
+            hessian[i, j] = hessian[j, i] = mixed
+    return float(centre), gradient, hessian
+
+
+def _newton_step(gradient: Array, hessian: Array) -> Array:
+    gradient = np.nan_to_num(gradient, nan=0.0, posinf=RADIUS, neginf=-RADIUS)
+    try:
+        if not np.all(np.isfinite(hessian)):
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(-hessian)
+        step = np.linalg.solve(-hessian, gradient)
+    except np.linalg.LinAlgError:
+        step = gradient  # whitened by Gauss-Newton: its Hessian is minus the identity
+    length = np.linalg.norm(step)
+    return step if length <= RADIUS else step * (RADIUS / length)
+
+
+def _line_search(
+    log_density: LogDensity, phi: Array, step: Array, height: float
+) -> tuple[Array, bool]:
+    """Best of the full step and its halves, all in one call, and whether it is higher."""
+    lengths = 0.5 ** np.arange(12)
+    trials = phi + lengths[:, None] * step
+    values, _ = log_density(trials)
+    best = int(np.argmax(values))
+    return (trials[best], True) if values[best] > height else (phi, False)
+
+
+def _covariance(factor: Array, hessian: Array) -> tuple[Array, bool]:
+    """Covariance from the whitened Hessian, or Gauss-Newton's where that is not negative definite."""
+    try:
+        if not np.all(np.isfinite(hessian)):
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(-hessian)
+    except np.linalg.LinAlgError:
+        return factor @ factor.T, False
+    covariance = factor @ np.linalg.inv(-hessian) @ factor.T
+    return 0.5 * (covariance + covariance.T), True
+
+
+def start_coordinates(log_density: LogDensity, theta: Array) -> Array:
+    """Coordinates of a parameter vector with every variance at its most likely value.
+
+    Parameters
+    ----------
+    log_density : LogDensity
+        Over ``l + s`` coordinates.
+    theta : ndarray, shape (l,)
+        Parameters in their units, inside their supports.
+
+    Returns
+    -------
+    ndarray, shape (l + s,)
+
+    Raises
+    ------
+    InputError
+        If the misfit at ``theta`` cannot be computed.
+
+    References
+    ----------
+    Verbeek (1993), eq. 3.17.
+    """
+    problem = log_density.problem
+    misfit = problem.misfit(np.asarray(theta, dtype=float)[None])
+    status = Status(int(misfit.status[0]))
+    if not status.ok:
+        raise InputError(
+            f"a start cannot be evaluated: {status.message}", value=np.asarray(theta).tolist()
+        )
+    counts = np.asarray(problem.counts).sum(axis=0)
+    variance = misfit.sum_of_squares[0].sum(axis=0) / counts
+    tiny = np.finfo(float).tiny
+    log_variance = np.log(np.maximum(variance, tiny))
+    return log_density.coordinates(np.concatenate([theta, log_variance])[None])[0]
+
+
+def laplace_mixture(
+    log_density: LogDensity, starts: Array, *, degrees: float = DEGREES_OF_FREEDOM
+) -> Mixture:
+    """Find the modes next to some parameter vectors and make a mixture of them.
+
+    Parameters
+    ----------
+    log_density : LogDensity
+        Over ``l + s`` coordinates.
+    starts : ndarray, shape (K, l)
+        Parameter vectors in their units: point estimates from several starts.
+    degrees : float
+        Degrees of freedom of the components' tails.
+
+    Returns
+    -------
+    Mixture
+        One component for each distinct mode.
+
+    Raises
+    ------
+    InputError
+        If no start can be evaluated.
+    """
+    modes: list[Mode] = []
+    problems: list[InputError] = []
+    for theta in np.atleast_2d(np.asarray(starts, dtype=float)):
+        try:
+            modes.append(find_mode(log_density, start_coordinates(log_density, theta)))
+        except InputError as error:
+            problems.append(error)
+    if not any(np.isfinite(mode.log_weight) for mode in modes):
+        raise problems[0] if problems else InputError("no start has a finite log density")
+    return mixture_of(modes, degrees=degrees)
+
+
+def mixture_of(modes: list[Mode], *, degrees: float = DEGREES_OF_FREEDOM) -> Mixture:
+    """Mixture of the distinct modes, weighted by their Laplace integrals.
+
+    Parameters
+    ----------
+    modes : list of Mode
+        Those that lie within half a standard deviation of a heavier one are taken for the same; those that are lighter by a
+        factor of 3e6 or not finite are dropped.
+    degrees : float
+        Degrees of freedom of the components' tails.
+
+    Returns
+    -------
+    Mixture
+        Weights are at least 0.05 each before normalisation, because a Laplace integral can be wrong and the sampler corrects a
+        weight that is too large but cannot find a mode that is never proposed.
+
+    Raises
+    ------
+    InputError
+        If no mode has a finite weight.
+    """
+    finite = sorted(
+        (mode for mode in modes if np.isfinite(mode.log_weight)), key=lambda m: -m.log_weight
+    )
+    if not finite:
+        raise InputError("no mode has a finite log density")
+    kept: list[Mode] = []
+    for mode in finite:
+        known = any(_distance(mode, other) < 0.5 for other in kept)
+        if not known and mode.log_weight > finite[0].log_weight - 15.0:
+            kept.append(mode)
+    log_weights = np.array([mode.log_weight for mode in kept])
+    weights = np.exp(log_weights - log_weights.max())
+    weights = np.maximum(weights / weights.sum(), 0.05)
+    return Mixture(
+        np.array([mode.centre for mode in kept]),
+        np.array([mode.covariance for mode in kept]),
+        np.log(weights / weights.sum()),
+        degrees,
+    )
+
+
+def _distance(one: Mode, other: Mode) -> float:
+    away = one.centre - other.centre
+    return float(np.sqrt(away @ np.linalg.solve(other.covariance, away)))

@@ -1,0 +1,155 @@
+"""Mixtures of multivariate Student-t densities: where walkers start and what the independence move proposes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+from bayesoleo.errors import InputError
+
+Array = NDArray[np.float64]
+
+#: Tails heavy enough that the ratio target / proposal stays bounded where a normal approximation would let it grow.
+DEGREES_OF_FREEDOM = 6.0
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Mixture of ``K`` Student-t densities in ``d`` coordinates.
+
+    Parameters
+    ----------
+    centres : ndarray, shape (K, d)
+        Modes of the components.
+    covariances : ndarray, shape (K, d, d)
+        Scale matrices: the covariance of the normal density that the component has at its centre.
+    log_weights : ndarray, shape (K,)
+        Logarithms of the weights, up to a constant.
+    degrees : float
+        Degrees of freedom of the tails.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, or a scale matrix is not positive definite.
+    """
+
+    centres: Array
+    covariances: Array
+    log_weights: Array
+    degrees: float = DEGREES_OF_FREEDOM
+
+    def __post_init__(self) -> None:
+        components, dimension = np.shape(self.centres)
+        shapes = np.shape(self.covariances), np.shape(self.log_weights)
+        if shapes != ((components, dimension, dimension), (components,)):
+            raise InputError(
+                "a mixture needs centres (K, d), covariances (K, d, d) and log weights (K,)",
+                value=(np.shape(self.centres), *shapes),
+            )
+        try:
+            _ = self._factors
+        except np.linalg.LinAlgError:
+            raise InputError("a component's covariance is not positive definite") from None
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return self.centres.shape[1]
+
+    @cached_property
+    def weights(self) -> Array:
+        """Normalised weights, shape (K,)."""
+        return np.exp(self.log_weights - logsumexp(self.log_weights))
+
+    @cached_property
+    def _factors(self) -> Array:
+        return np.linalg.cholesky(self.covariances)
+
+    @cached_property
+    def _whitening(self) -> Array:
+        return np.linalg.inv(self._factors)
+
+    def distances(self, phi: Array) -> Array:
+        """Squared Mahalanobis distances to every component, shape (W, K), of rows of shape (W, d)."""
+        columns = []
+        for centre, whiten in zip(self.centres, self._whitening, strict=True):
+            columns.append(np.sum(((phi - centre) @ whiten.T) ** 2, axis=1))
+        return np.stack(columns, axis=1)
+
+    def log_components(self, phi: Array) -> Array:
+        """Log of weight times density of every component, shape (W, K), at rows of shape (W, d)."""
+        d, nu = self.dimension, self.degrees
+        log_det = np.sum(np.log(np.diagonal(self._factors, axis1=1, axis2=2)), axis=1)
+        constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * np.log(nu * np.pi)
+        kernel = -0.5 * (nu + d) * np.log1p(self.distances(phi) / nu)
+        with np.errstate(divide="ignore"):
+            return np.log(self.weights) + constant - log_det + kernel
+
+    def log_density(self, phi: Array) -> Array:
+        """Normalised log density, shape (W,), at rows of shape (W, d).
+
+        References
+        ----------
+        Kotz and Nadarajah (2004), *Multivariate t Distributions*, eq. 1.1.
+        """
+        return logsumexp(self.log_components(phi), axis=1)
+
+    def sample(self, random: np.random.Generator | np.random.RandomState, size: int) -> Array:
+        """Independent draws, shape (size, d)."""
+        edges = np.cumsum(self.weights)
+        picks = np.searchsorted(edges[:-1], random.uniform(size=size), side="right")
+        normal = random.standard_normal((size, self.dimension))
+        stretch = np.sqrt(self.degrees / random.chisquare(self.degrees, size=size))
+        # einsum over each row's own factor: no product whose rounding depends on the other rows
+        steps = np.einsum("wij,wj->wi", self._factors[picks], normal)
+        return self.centres[picks] + stretch[:, None] * steps
+
+    def refitted(self, phi: Array, *, floor: float = 0.02, rounds: int = 20) -> Mixture:
+        """Adapt weights, centres and covariances to draws by expectation-maximisation.
+
+        Parameters
+        ----------
+        phi : ndarray, shape (M, d)
+            Draws.
+        floor : float
+            Least weight of a component, so that none becomes unreachable.
+        rounds : int
+            Number of iterations.
+
+        Returns
+        -------
+        Mixture
+            With the same number of components and degrees of freedom.
+
+        References
+        ----------
+        Peel and McLachlan (2000), "Robust mixture modelling using the t distribution", *Statistics and Computing* 10, eq. 22-31.
+        """
+        fitted = self
+        # Each component keeps so many pseudo-draws of its former shape: it stays positive definite when few draws reach it.
+        memory = 2.0 * (self.dimension + 1)
+        for _ in range(rounds):
+            log_parts = fitted.log_components(phi)
+            share = np.exp(log_parts - logsumexp(log_parts, axis=1)[:, None])
+            pull = share * (self.degrees + self.dimension) / (self.degrees + fitted.distances(phi))
+            fitted = self._updated(phi, share, pull, memory, floor)
+        return fitted
+
+    def _updated(
+        self, phi: Array, share: Array, pull: Array, memory: float, floor: float
+    ) -> Mixture:
+        centres, covariances = np.empty_like(self.centres), np.empty_like(self.covariances)
+        mass = share.sum(axis=0)
+        for k in range(len(centres)):
+            pulled = pull[:, k].sum() + memory
+            centres[k] = (pull[:, k] @ phi + memory * self.centres[k]) / pulled
+            away, moved = phi - centres[k], self.centres[k] - centres[k]
+            scatter = (pull[:, k, None] * away).T @ away + memory * np.outer(moved, moved)
+            covariances[k] = (scatter + memory * self.covariances[k]) / (mass[k] + memory)
+        weights = np.maximum(mass / mass.sum(), floor)
+        return Mixture(centres, covariances, np.log(weights / weights.sum()), self.degrees)

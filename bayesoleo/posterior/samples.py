@@ -1,0 +1,82 @@
+"""What sampling returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.posterior.density import LOG_VARIANCE
+from bayesoleo.posterior.mixture import Mixture
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Draws of the posterior and how good they are.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the ``d`` quantities: parameters, then ``log_variance_<output>``.
+    runs : tuple of str
+        Labels of the ``N`` runs.
+    draws : ndarray, shape (chains, draws, d)
+        In natural units (``ln v`` for the variances).
+    log_density : ndarray, shape (chains, draws)
+        Log posterior density over the coordinates without bounds, Jacobian included, not normalised.
+    log_likelihood : ndarray, shape (chains, draws, N)
+        Normalised log-likelihood by run.
+    ensemble : ndarray of int, shape (chains,)
+        Which ensemble a chain (a walker) belongs to.
+    start : ndarray, shape (chains, d)
+        Where the walkers started, in natural units.
+    mixture : Mixture
+        What the independence move proposed from, in coordinates without bounds.
+    autocorrelation_time, effective_size, rhat_nested : ndarray, shape (d,)
+        Diagnostics of :mod:`bayesoleo.posterior.diagnostics`.
+    acceptance : dict of str to float
+        Accepted part of the proposals by kind of move, and ``"all"``, among the kept draws.
+    evaluations : int
+        Rows of the log density, warm-up included.
+    failures : dict of str to int
+        Rows of density zero by reason.
+    reached : bool
+        Whether the effective size asked for was reached and the ensembles agree.
+    warning : str
+        What was not reached; empty otherwise.
+    """
+
+    names: tuple[str, ...]
+    runs: tuple[str, ...]
+    draws: Array
+    log_density: Array
+    log_likelihood: Array
+    ensemble: NDArray[np.int64]
+    start: Array
+    mixture: Mixture
+    autocorrelation_time: Array
+    effective_size: Array
+    rhat_nested: Array
+    acceptance: dict[str, float]
+    evaluations: int
+    failures: dict[str, int]
+    reached: bool
+    warning: str
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the ``l`` model parameters."""
+        return tuple(name for name in self.names if not name.startswith(LOG_VARIANCE))
+
+    @property
+    def theta(self) -> Array:
+        """Draws of the parameters in their units, shape (chains, draws, l)."""
+        return self.draws[:, :, : len(self.parameters)]
+
+    @property
+    def log_variance(self) -> Array:
+        """Draws of the logarithms of the error variances, shape (chains, draws, s)."""
+        return self.draws[:, :, len(self.parameters) :]
