@@ -1,0 +1,55 @@
+"""The linear equations of one iteration, with the variances held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesoleo.estimation.bounded import bounded_step
+from bayesoleo.estimation.linearise import inverse_gram
+from bayesoleo.estimation.problem import Array
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Whitened least squares in scaled unknowns (the prior's standard deviation is one).
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (k, l)
+        Rows ``J`` with ``A = J'J``.
+    residual : ndarray, shape (k,)
+        Rows ``e`` with ``b = -J'e``.
+    slope : ndarray, shape (l,)
+        Derivative of the log prior where the prior is fixed at its centre, zero otherwise.
+    room : tuple of ndarray, each shape (l,)
+        Distances to the limits of the support.
+    """
+
+    jacobian: Array
+    residual: Array
+    slope: Array
+    room: tuple[Array, Array]
+
+    @property
+    def gradient(self) -> Array:
+        """Slope of the merit function, shape (l,)."""
+        return self.jacobian.T @ self.residual + self.slope
+
+    def solve(self, rows: Array) -> Array:
+        """Step, shape (l,), with the weight ``rows' rows`` added to ``A``."""
+        # only the fixed prior pulls, and its rows are the identity
+        pull = self.slope if len(rows) == len(self.slope) else np.zeros(len(rows))
+        target = np.concatenate((self.residual, pull))
+        return bounded_step(np.vstack((self.jacobian, rows)), target, self.room)
+
+    def distance(self) -> float:
+        """Newton decrement: the way to the fixed point in linearised standard deviations."""
+        step = self.solve(np.eye(len(self.slope)))
+        return float(np.sqrt(max(0.0, float(step @ self.gradient))))
+
+    def sd(self) -> Array:
+        """Linearised standard deviations ``[A + 1]^-1/2``, shape (l,)."""
+        weighted = np.vstack((self.jacobian, np.eye(len(self.slope))))
+        return np.sqrt(np.diag(inverse_gram(weighted)))

@@ -1,0 +1,94 @@
+"""A point estimate: where, how sure, and how it was reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.estimation.problem import Array
+from bayesoleo.solvers.status import Status
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True, eq=False)
+class PointEstimate:
+    """Result of an estimator.
+
+    Parameters
+    ----------
+    names : tuple of str, length l
+    outputs : tuple of str, length s
+    theta : ndarray, shape (l,)
+        The estimate, in the parameters' units.
+    variance : ndarray, shape (s,)
+        Error variances staged at the estimate (Verbeek 1993, eq. 3.17 or 3.18).
+    covariance : ndarray, shape (l, l)
+        Linearised with the prior's variances, ``[A + diag(w)^-1]^-1``; NaN after a failed start.
+    covariance_likelihood : ndarray, shape (l, l)
+        Linearised without the prior, ``A^-1``; NaN where ``A`` is singular.
+    method : str
+    status : Status
+        ``NO_CONVERGENCE`` also where the steps became small away from the fixed point.
+    iterations : int
+        Steps taken, with the last, small one.
+    halvings : int
+        Over all iterations.
+    evaluations : int
+        Calls of ``problem.evaluate``.
+    objective : float
+        The method's own objective at the estimate: eq. 2.29 for BE, 2.31 for the others.
+    distance : float
+        To the method's fixed point by linearisation, in standard deviations; NaN if the steps
+        never became small.
+    start : ndarray, shape (l,)
+    history : ndarray, shape (iterations + 1, l)
+    history_variance : ndarray, shape (iterations + 1, s)
+    history_objective : ndarray, shape (iterations + 1,)
+    history_halvings : ndarray of int, shape (iterations + 1,)
+    on_limit : tuple of str
+        Unknowns that lie on a limit of their prior's support.
+    """
+
+    names: tuple[str, ...]
+    outputs: tuple[str, ...]
+    theta: Array
+    variance: Array
+    covariance: Array
+    covariance_likelihood: Array
+    method: str
+    status: Status
+    iterations: int
+    halvings: int
+    evaluations: int
+    objective: float
+    distance: float
+    start: Array
+    history: Array = field(repr=False)
+    history_variance: Array = field(repr=False)
+    history_objective: Array = field(repr=False)
+    history_halvings: NDArray[np.int64] = field(repr=False)
+    on_limit: tuple[str, ...] = ()
+
+    @property
+    def sd(self) -> Array:
+        """Linearised standard deviations, shape (l,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.theta[self.names.index(name)])
+
+    def __str__(self) -> str:
+        from bayesoleo.estimation.table import as_text
+
+        return as_text(self)
+
+    def to_dataset(self, **options: object) -> xr.Dataset:
+        """Labelled arrays; see :func:`bayesoleo.estimation.to_dataset`."""
+        from bayesoleo.estimation.table import to_dataset
+
+        return to_dataset(self, **options)  # type: ignore[arg-type]

@@ -1,0 +1,174 @@
+"""The estimators' steps: each says only how the prior enters the linear equations.
+
+In scaled unknowns (``w = 1``) every step solves ``min |J d - e|^2 + |P d - r|^2``, with whitened
+sensitivities ``J`` and residuals ``e``. An estimator is the choice of the rows ``P``, of how they
+are carried on, and of whether the prior pulls: ``r`` is its slope for BE and zero for the others.
+
+References
+----------
+Verbeek (1993), eqs. 3.19-3.23; Hendriks for the MMVE; Marquardt (1963) for the damping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.problem import Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """What an estimator adds to the least-squares equations; the base adds the prior's weight.
+
+    The state is whatever a step carries from one iteration to the next.
+    """
+
+    #: how a user asks for it
+    name: ClassVar[str] = ""
+    #: whether the prior stays where it was declared, and so belongs to the merit function
+    fixed_prior: ClassVar[bool] = False
+    #: whether steps may shrink before the optimum is reached
+    locks: ClassVar[bool] = False
+
+    def begin(self, unknowns: int) -> Array:
+        """State before the first iteration."""
+        return np.eye(unknowns)
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        """Rows ``P``, shape (l, l), for whitened sensitivities of shape (k, l)."""
+        return state
+
+    def accept(self, state: Array, jacobian: Array) -> Array:
+        """State after a step was taken with these sensitivities."""
+        return state
+
+    def refuse(self, state: Array) -> Array | None:
+        """State with which to try a shorter step, or None to halve the step instead."""
+        return None
+
+
+@dataclass(frozen=True)
+class BayesianStep(Step):
+    """Bayesian estimator, BE: the prior stays at its centre (Verbeek 1993, eq. 3.19)."""
+
+    name: ClassVar[str] = "be"
+    fixed_prior: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class ModifiedBayesianStep(Step):
+    """Modified Bayesian estimator, MBE: the prior is re-centred on the current estimate.
+
+    It acts as a trust region; the fixed point is the maximum-likelihood point whatever the prior's
+    width (Verbeek 1993, eq. 3.23).
+    """
+
+    name: ClassVar[str] = "mbe"
+
+
+@dataclass(frozen=True)
+class MinimumVarianceStep(Step):
+    """Minimum-variance estimator, MVE: the weight grows by ``A`` in every iteration.
+
+    ``V <- (A + V^-1)^-1`` from ``V = diag(w)`` shrinks like 1/i, and so do the steps: the estimator
+    locks up (Verbeek 1993, eqs. 3.20-3.22).
+    """
+
+    name: ClassVar[str] = "mve"
+    locks: ClassVar[bool] = True
+
+    def accept(self, state: Array, jacobian: Array) -> Array:
+        return np.linalg.qr(np.vstack((jacobian, state)), mode="r")
+
+
+@dataclass(frozen=True)
+class ModifiedMinimumVarianceStep(Step):
+    """Modified MVE: the prior variance is added again in every iteration, so nothing locks up.
+
+    The state is ``V``, zero at the start; the weight is ``(V + diag(w))^-1`` (Verbeek 1993,
+    eq. 3.22, after Hendriks).
+    """
+
+    name: ClassVar[str] = "mmve"
+
+    def begin(self, unknowns: int) -> Array:
+        return np.zeros((unknowns, unknowns))
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        # S = L L' gives S^-1 = P'P with P = L^-1
+        identity = np.eye(len(state))
+        return solve_triangular(cholesky(state + identity, lower=True), identity, lower=True)
+
+    def accept(self, state: Array, jacobian: Array) -> Array:
+        triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")
+        root = solve_triangular(triangle, np.eye(len(state)))
+        return root @ root.T
+
+
+@dataclass(frozen=True)
+class GaussNewtonStep(Step):
+    """Gauss-Newton with a pseudo-inverse: the prior does not enter at all."""
+
+    name: ClassVar[str] = "gauss-newton"
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        return np.zeros((0, jacobian.shape[1]))
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardtStep(Step):
+    """Levenberg-Marquardt: like MBE, but the weight follows success instead of the prior.
+
+    The state is the damping, relative to the sensitivities' squared column lengths, shape (1,).
+    """
+
+    name: ClassVar[str] = "levenberg-marquardt"
+    smallest: ClassVar[float] = 1e-14
+
+    def begin(self, unknowns: int) -> Array:
+        return np.array([1e-3])
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        length = np.linalg.norm(jacobian, axis=0)
+        return np.sqrt(state[0]) * np.diag(np.maximum(length, np.finfo(float).tiny))
+
+    def accept(self, state: Array, jacobian: Array) -> Array:
+        return np.maximum(state / 10, self.smallest)
+
+    def refuse(self, state: Array) -> Array | None:
+        return 4 * state
+
+
+METHODS: dict[str, Step] = {
+    step.name: step
+    for step in (
+        BayesianStep(),
+        MinimumVarianceStep(),
+        ModifiedMinimumVarianceStep(),
+        ModifiedBayesianStep(),
+        GaussNewtonStep(),
+        LevenbergMarquardtStep(),
+    )
+}
+
+
+def method(name: str | Step) -> Step:
+    """Estimator of this name, or the step itself.
+
+    Raises
+    ------
+    InputError
+        If there is no estimator of that name.
+    """
+    if isinstance(name, Step):
+        return name
+    if name not in METHODS:
+        raise InputError(
+            "there is no such estimator", key="method", value=name, hint=f"use {', '.join(METHODS)}"
+        )
+    return METHODS[name]

@@ -1,0 +1,50 @@
+"""Problems with known answers, and where certified data are found."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesoleo.estimation import FunctionProblem
+from bayesoleo.model.priors import Normal
+
+
+@pytest.fixture(scope="session")
+def gas_spring():
+    """Make the ideal gas spring of Verbeek (1993), section 3.4.2, for a seed and a relative sd.
+
+    The fitted model's factor 0.95 is the undeclared error in the initial pressure.
+    """
+    position = np.linspace(0.0, 0.9, 100)
+    noise = 0.005 * 10**1.2  # two standard deviations are 1 % of full scale
+
+    def assumed(x, theta):
+        return 0.95 * (1 / (1 - x)) ** theta[0]
+
+    def make(seed, relative_sd, centre=1.0, start=None):
+        rng = np.random.default_rng(seed)
+        force = (1 / (1 - position)) ** 1.2 + rng.normal(0.0, noise, position.size)
+        prior = Normal(centre, relative_sd * centre)
+        return FunctionProblem(assumed, position, force, [prior], ["exponent"], start=start)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def data_folder():
+    """Find a folder below ``BAYESOLEO_DATA``; without it skip, or fail in continuous integration."""
+
+    def find(name):
+        root = os.environ.get("BAYESOLEO_DATA")
+        folder = Path(root) / name if root else None
+        if folder is not None and folder.is_dir():
+            return folder
+        reason = f"needs the data set {name!r} below the folder that BAYESOLEO_DATA names"
+        if os.environ.get("CI", "").lower() == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+    return find
