@@ -16,3 +16,5 @@ from bayesoleo.data.reduction import reduce_campaign as reduce_campaign
 from bayesoleo.data.reduction import reduce_run as reduce_run
 from bayesoleo.data.registry import dataset_folder as dataset_folder
 from bayesoleo.data.transforms import HarmonicBasis as HarmonicBasis
+from bayesoleo.data.writing import SimulatedRun as SimulatedRun
+from bayesoleo.data.writing import write_campaign as write_campaign

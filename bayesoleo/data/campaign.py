@@ -168,9 +168,10 @@ def _checksum(toml: Path, files: list[Path]) -> str:
 def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder: Path) -> Run:
     """Load one run; what goes wrong below is told with the run and its file."""
     try:
-        columns = read_columns(
-            folder / declared.file, declared.delimiter, declared.header_delimiter
-        )
+        wanted = {channel.column for channel in channels.values()}
+        wanted |= {declared.time} if declared.time else set(_TIME_COLUMNS)
+        file = folder / declared.file
+        columns = read_columns(file, declared.delimiter, declared.header_delimiter, wanted)
         time = _time(declared, columns, channels)
         part = window(time, declared.start, declared.stop)
         time = _frozen(time[part])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,10 @@ Array = NDArray[np.float64]
 
 
 def read_columns(
-    path: Path, delimiter: str | None = None, header_delimiter: str | None = None
+    path: Path,
+    delimiter: str | None = None,
+    header_delimiter: str | None = None,
+    wanted: Collection[str] | None = None,
 ) -> Mapping[str, Array]:
     """Read all numeric columns of a run file.
 
@@ -26,6 +29,8 @@ def read_columns(
         header.
     delimiter, header_delimiter : str, optional
         Of text files; sniffed by default. ``whitespace`` stands for any run of blanks.
+    wanted : collection of str, optional
+        Columns that must be numbers; text in others does not matter. All, by default.
 
     Returns
     -------
@@ -43,7 +48,7 @@ def read_columns(
         raise CampaignError("file is empty", file=path.name, hint="record the run again")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        return read_text(path, delimiter, header_delimiter)
+        return read_text(path, delimiter, header_delimiter, wanted)
     try:
         columns = reader(path)
     except CampaignError:

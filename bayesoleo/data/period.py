@@ -220,7 +220,9 @@ def _gauss_newton(values: Array, step: float) -> tuple[float, float, int]:
     """Refine cycles per sample; stops at a thousandth of the standard deviation."""
     highest = HarmonicBasis(values.shape[1], step).highest
     state = _State(values, step, highest)
-    for iterations in range(30):
+    iterations = 0
+    while iterations < 30:
+        iterations += 1
         change = state.newton
         trial = _State(values, state.step + change, highest)
         for _ in range(6):

@@ -55,8 +55,7 @@ def uniform_time(time: Array, column: str) -> Array:
     _check_gaps(time, spacing, resolution, column)
     index = np.arange(time.size) - 0.5 * (time.size - 1)
     step = float(np.dot(index, time) / np.dot(index, index))
-    # A step that the stamps cannot tell from a rounder one is that one: 0.025 s, not 0.0250000003
-    # s.
+    # A step that the stamps cannot tell from a rounder one is that one: 0.025, not 0.0250000003.
     step = _roundest(step, 0.5 * resolution / time.size)
     first = _roundest(float(np.mean(time)) + step * float(index[0]), 0.5 * resolution)
     return first + step * np.arange(time.size, dtype=float)
@@ -71,7 +70,7 @@ def _check_gaps(time: Array, spacing: Array, resolution: float, column: str) -> 
         return
     if spacing[row] > 1.49 * usual:
         raise CampaignError(
-            f"gap of {spacing[row]:.6g} s ({spacing[row] / usual:.3g} samples) at {time[row]:.6g} s",
+            f"gap of {spacing[row] / usual:.3g} samples at {time[row]:.6g} s",
             column=column,
             hint="cut the run there with start or stop",
         )

@@ -13,6 +13,10 @@ Array = NDArray[np.float64]
 #: Chance of dropping the first period of a settled channel whose noise is stationary.
 FALSE_ALARM = 1e-4
 
+#: Least excess of a first period's mean square over the noise's. Less than this, half a standard
+#: deviation of the noise, costs less than the period is worth.
+LEAST_EXCESS = 0.25
+
 
 def whole_periods(samples: int, step: float) -> int:
     """Number of whole periods in a record.
@@ -89,19 +93,20 @@ def _differs(values: Array, length: int, step: float, level: float) -> bool:
     share = basis.size / basis.samples
     first = np.mean((values[:, :length] - predicted) ** 2, axis=1) / (1.0 + share)
     return any(
-        _exceeds(power, rest / np.sqrt(1.0 - share), length, level)
+        _exceeds(power, rest / np.sqrt(1.0 - share), length, share, level)
         for power, rest in zip(first, residual, strict=True)
     )
 
 
-def _exceeds(power: float, rest: Array, length: int, level: float) -> bool:
+def _exceeds(power: float, rest: Array, length: int, share: float, level: float) -> bool:
     """One-sided F-test, degrees of freedom cut by the noise's memory; no later period as bad."""
     usual = float(np.mean(rest**2))
     memory = _memory(rest)
-    bound = stats.f.isf(level, max(length / memory, 1.0), max(rest.size / memory, 1.0))
+    free = rest.size * (1.0 - share)
+    bound = stats.f.isf(level, max(length / memory, 1.0), max(free / memory, 1.0))
     others = rest[: rest.size // length * length].reshape(-1, length)
     worst = float(np.max(np.mean(others**2, axis=1)))
-    return power > bound * usual and power > worst
+    return power > max(bound, 1.0 + LEAST_EXCESS) * usual and power > worst
 
 
 def _memory(rest: Array) -> float:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import re
+import warnings
+from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
@@ -20,7 +24,10 @@ _DECIMAL_COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
 
 
 def read_text(
-    path: Path, delimiter: str | None = None, header_delimiter: str | None = None
+    path: Path,
+    delimiter: str | None = None,
+    header_delimiter: str | None = None,
+    wanted: Collection[str] | None = None,
 ) -> dict[str, Array]:
     """Read a delimited text file with one header line.
 
@@ -35,6 +42,8 @@ def read_text(
     delimiter, header_delimiter : str, optional
         Of the values and of the header; ``whitespace`` stands for any run of blanks. Sniffed by
         default.
+    wanted : collection of str, optional
+        Columns that must be numbers; others are left out where they are not. All, by default.
 
     Returns
     -------
@@ -52,7 +61,11 @@ def read_text(
         path, header_line, separator, header_delimiter, len(_split(sample[0], separator))
     )
     table = _read_cells(path, skip, separator, len(names))
-    columns = {name: _numbers(path, name, table[index]) for index, name in enumerate(names)}
+    columns = {
+        name: _numbers(path, name, table[index])
+        for index, name in enumerate(names)
+        if wanted is None or name in wanted or table[index].dtype.kind in "biuf"
+    }
     _check_filled(path, columns, separator)
     return columns
 
@@ -80,8 +93,9 @@ def sniff_delimiter(lines: list[str]) -> str:
 
 
 def _split(line: str, delimiter: str) -> list[str]:
-    cells = line.split() if delimiter == WHITESPACE else line.split(delimiter)
-    return [cell.strip().strip('"') for cell in cells]
+    if delimiter == WHITESPACE:
+        return [cell.strip('"') for cell in line.split()]
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [""])]
 
 
 def _is_number(cell: str) -> bool:
@@ -155,31 +169,30 @@ def _header_names(
     return names
 
 
-def _read_cells(path: Path, skip: int, separator: str, width: int):
-    import pandas as pd
-
+def _read_cells(path: Path, skip: int, separator: str, width: int) -> pd.DataFrame:
     try:
-        return pd.read_csv(
-            path,
-            sep=r"\s+" if separator == WHITESPACE else separator,
-            header=None,
-            names=list(range(width)),
-            index_col=False,
-            skiprows=skip,
-            comment="#",
-            encoding="utf-8-sig",
-            skipinitialspace=True,
-            low_memory=False,
-        )
-    except pd.errors.ParserError as error:
+        with warnings.catch_warnings():
+            # A line longer than the others is no more than a warning to pandas.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                path,
+                sep=r"\s+" if separator == WHITESPACE else separator,
+                header=None,
+                names=list(range(width)),
+                index_col=False,
+                skiprows=skip,
+                comment="#",
+                encoding="utf-8-sig",
+                skipinitialspace=True,
+                low_memory=False,
+            )
+    except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         raise CampaignError(
             f"lines differ in their number of cells: {error}", file=path.name, key="delimiter"
         ) from error
 
 
-def _numbers(path: Path, name: str, column) -> Array:
-    import pandas as pd
-
+def _numbers(path: Path, name: str, column: pd.Series) -> Array:
     if column.dtype.kind in "biuf":
         return column.to_numpy(dtype=float)
     numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
