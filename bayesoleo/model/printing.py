@@ -1,0 +1,108 @@
+"""Print shared-subexpression code that runs on NumPy arrays and, inside a loop, on Numba scalars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import sympy as sp
+from sympy.printing.pycode import PythonCodePrinter
+
+
+class _Printer(PythonCodePrinter):
+    """Prints NumPy functions, which Numba compiles for scalars too, and turns small powers into products."""
+
+    def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
+        base, exponent = expr.as_base_exp()
+        text = self._parenthesised(base)
+        if exponent == sp.Rational(1, 2):
+            return f"np.sqrt({self._print(base)})"
+        if exponent.is_Integer and 1 <= abs(int(exponent)) <= 4:
+            product = "*".join([text] * abs(int(exponent)))
+            return f"(1.0/({product}))" if exponent < 0 else f"({product})"
+        return f"({text}**{self._parenthesised(exponent)})"
+
+    def _parenthesised(self, expr: sp.Expr) -> str:
+        text = self._print(expr)
+        return text if expr.is_Symbol else f"({text})"
+
+    def _print_Rational(self, expr: sp.Rational) -> str:
+        return repr(float(expr))
+
+    def _print_Integer(self, expr: sp.Integer) -> str:
+        return f"{int(expr)}.0"
+
+    def _print_Float(self, expr: sp.Float) -> str:
+        return repr(float(expr))
+
+    def _print_NumberSymbol(self, expr: sp.NumberSymbol) -> str:
+        return repr(float(expr))
+
+    def _print_Heaviside(self, expr: sp.Heaviside) -> str:
+        return f"(0.5 + 0.5*np.sign({self._print(expr.args[0])}))"
+
+    def _print_sign(self, expr: sp.Expr) -> str:
+        return f"np.sign({self._print(expr.args[0])})"
+
+    def _print_Abs(self, expr: sp.Abs) -> str:
+        return f"np.abs({self._print(expr.args[0])})"
+
+    def _extremum(self, name: str, arguments: Sequence[sp.Expr]) -> str:
+        text = self._print(arguments[0])
+        for argument in arguments[1:]:
+            text = f"np.{name}({text}, {self._print(argument)})"
+        return text
+
+    def _print_Max(self, expr: sp.Max) -> str:
+        return self._extremum("maximum", expr.args)
+
+    def _print_Min(self, expr: sp.Min) -> str:
+        return self._extremum("minimum", expr.args)
+
+
+for _name, _target in {
+    "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tan": "tan", "atan": "arctan", "tanh": "tanh"
+}.items():  # fmt: skip
+
+    def _print_function(self: _Printer, expr: sp.Expr, target: str = _target) -> str:
+        return f"np.{target}({self._print(expr.args[0])})"
+
+    setattr(_Printer, f"_print_{_name}", _print_function)
+
+
+def code(
+    expressions: Sequence[sp.Expr],
+    names: Mapping[sp.Symbol, str],
+    constant: set[sp.Symbol],
+) -> tuple[list[str], list[str], list[str]]:
+    """Statements that evaluate expressions with common subexpressions shared.
+
+    Parameters
+    ----------
+    expressions : sequence of sympy.Expr
+        What to evaluate.
+    names : mapping of sympy.Symbol to str
+        What each symbol is called in the code.
+    constant : set of sympy.Symbol
+        Symbols that do not vary from node to node: what depends on them alone is computed once.
+
+    Returns
+    -------
+    outside, inside : list of str
+        Assignments for before and inside the loop over nodes.
+    results : list of str
+        One Python expression for each entry of ``expressions``.
+    """
+    renamed = [expression.xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()}) for expression in expressions]
+    fixed = {sp.Symbol(names[item], real=True) for item in constant}
+    counter = sp.numbered_symbols("w", real=True)
+    shared, reduced = sp.cse(renamed, symbols=counter, order="none")
+    printer = _Printer({"fully_qualified_modules": False})
+    outside, inside = [], []
+    for name, body in shared:
+        line = f"{name} = {printer.doprint(body)}"
+        if body.free_symbols <= fixed:
+            fixed.add(name)
+            outside.append(line)
+        else:
+            inside.append(line)
+    return outside, inside, [printer.doprint(expression) for expression in reduced]

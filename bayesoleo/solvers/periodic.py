@@ -1,0 +1,275 @@
+"""Periodic solutions by Newton's method on all unknowns of a period at once, for many parameter vectors.
+
+Lanes (parameter vectors) never see each other: each has its own step length, its own end and its own status, so that a solution depends
+on its own parameters and start alone, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+Lanes = NDArray[np.int64]
+
+
+class Equations(Protocol):
+    """What a solver needs of a system of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
+
+    residual: Callable[..., Any]
+    jacobian: Callable[..., Any]
+    parameters: Callable[..., Any]
+    admissible: Callable[..., Any]
+
+
+class Scheme(Protocol):
+    """A discretisation of a period as linear maps (see :class:`~bayesoleo.solvers.collocation.Collocation`)."""
+
+    orders: tuple[int, ...]
+
+    @property
+    def state_size(self) -> int: ...
+    def phases(self, n: int) -> Array: ...
+    def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array: ...
+    def rows(self, x: Array, lanes: Lanes, step: float, z: Array) -> None: ...
+    def sample(self, x: Array, phase: Array, step: float) -> Array: ...
+    def linear(
+        self, gz: Array, right: Array, x: Array | None, lanes: Lanes, step: float, *, initial: bool = False
+    ) -> tuple[Array, Array, NDArray[np.bool_]]: ...
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """A discretised periodic boundary-value problem.
+
+    Parameters
+    ----------
+    equations : Equations
+        Residuals and partial derivatives.
+    scheme : Scheme
+        Discretisation.
+    period : float
+        Seconds.
+    inputs : ndarray, shape (nu, N)
+        Inputs and their derivatives at the scheme's points.
+    conditions : int
+        Number of conditions on the admissible region.
+    active : int
+        Number of parameters with derivatives.
+    """
+
+    equations: Equations
+    scheme: Scheme
+    period: float
+    inputs: Array
+    conditions: int
+    active: int
+
+    def step(self, n: int) -> float:
+        """Length of one of ``n`` steps, s."""
+        return self.period / n
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Periodic solutions of ``L`` parameter vectors.
+
+    Parameters
+    ----------
+    x : ndarray, shape (L, n, w)
+        The scheme's unknowns.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers.status.Status`.
+    iterations : ndarray of int, shape (L,)
+        Newton iterations.
+    """
+
+    x: Array
+    status: NDArray[np.int64]
+    iterations: NDArray[np.int64]
+
+
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still contracting leaves 1e-14.
+LAST_STEP = 1e-7
+#: Without quadratic contraction (at a kink) a step this small is taken as converged.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+
+
+def solve_periodic(
+    problem: Boundary, p: Array, start: Array, *, max_iterations: int = 40, monotone: bool = True
+) -> Solution:
+    """Solve the discretised periodic problem by Newton's method with step halving.
+
+    Parameters
+    ----------
+    problem : Boundary
+        Equations, scheme, inputs.
+    p : ndarray, shape (L, np)
+        Constants of each lane.
+    start : ndarray, shape (L, n, w)
+        Where each lane starts.
+    max_iterations : int
+        After which a lane's status is ``NO_CONVERGENCE``.
+    monotone : bool
+        Halve steps until the residual falls. Otherwise only until it is finite and admissible: plain Newton wanders, but out of
+        the hollows of the residual's norm in which the monotone iteration gets stuck.
+
+    Returns
+    -------
+    Solution
+
+    References
+    ----------
+    Verbeek (1993), section 4.3.1.
+    """
+    return _Newton(problem, p, start.copy(), max_iterations, monotone).run()
+
+
+class _Newton:
+    """State of one batched iteration; arrays are allocated once."""
+
+    def __init__(self, problem: Boundary, p: Array, x: Array, max_iterations: int, monotone: bool):
+        self.problem, self.p, self.x = problem, p, x
+        self.max_iterations, self.monotone = max_iterations, monotone
+        lanes, n, _ = x.shape
+        scheme = problem.scheme
+        d, points = len(scheme.orders), problem.inputs.shape[1]
+        nz = scheme.state_size + d
+        self.step = problem.step(n)
+        self.z = np.zeros((lanes, nz, points))
+        self.g = np.zeros((lanes, d, points))
+        self.gz = np.zeros((lanes, d, nz, points))
+        self.a = np.ones((lanes, problem.conditions, points))
+        self.status = np.full(lanes, Status.NO_CONVERGENCE.value, dtype=np.int64)
+        self.iterations = np.zeros(lanes, dtype=np.int64)
+        self.merit = np.full(lanes, np.inf)
+        self.last = np.full(lanes, np.inf)
+
+    def run(self) -> Solution:
+        lanes = np.arange(self.x.shape[0])
+        lanes = self._drop(lanes, self._evaluate(lanes), None)
+        for _ in range(self.max_iterations):
+            if lanes.size == 0:
+                break
+            self.iterations[lanes] += 1
+            dx, _, ok = self.problem.scheme.linear(self.gz, self.g[:, :, None], self.x, lanes, self.step)
+            ok = ok[lanes] & np.isfinite(dx[lanes]).all(axis=(1, 2, 3))
+            lanes = self._drop(lanes, ok, Status.SINGULAR)
+            size = self._relative_step(dx[..., 0], lanes)
+            lanes, kept = self._advance(lanes, dx[..., 0], size)
+            lanes = self._finish(lanes, size[kept])
+        return Solution(self.x, self.status, self.iterations)
+
+    def _drop(self, lanes: Lanes, good: NDArray[np.bool_], reason: Status | None) -> Lanes:
+        if reason is None:
+            inadmissible = (self.a[lanes] <= 0).any(axis=(1, 2)) & ~good
+            self.status[lanes[~good]] = Status.NOT_FINITE.value
+            self.status[lanes[inadmissible]] = Status.INADMISSIBLE.value
+        else:
+            self.status[lanes[~good]] = reason.value
+        return lanes[good]
+
+    def _evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
+        """Equations at the present unknowns; true where they are finite and admissible."""
+        equations, u = self.problem.equations, self.problem.inputs
+        self.problem.scheme.rows(self.x, lanes, self.step, self.z)
+        with np.errstate(all="ignore"):
+            equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
+            equations.admissible(self.z, u, self.p, lanes, self.a)
+        finite = np.isfinite(self.g[lanes]).all(axis=(1, 2)) & np.isfinite(self.gz[lanes]).all(axis=(1, 2, 3))
+        return finite & (self.a[lanes] > 0).all(axis=(1, 2))
+
+    def _term_size(self, lanes: Lanes) -> Array:
+        """Size of the equations' terms at the present unknowns, the unit of residuals; shape (lanes, d)."""
+        g, gz, z = self.g[lanes], self.gz[lanes], self.z[lanes]
+        terms = np.sum((gz * z[:, None]) ** 2, axis=2) + g**2
+        return np.sqrt(np.mean(terms, axis=2)) + 1e-300
+
+    def _merit(self, lanes: Lanes, size: Array) -> Array:
+        """Residual in a given unit; Newton's direction reduces it if the unit is kept during a step."""
+        return np.sqrt(np.sum(np.mean(self.g[lanes] ** 2, axis=2) / size**2, axis=1))
+
+    def _relative_step(self, dx: Array, lanes: Lanes) -> Array:
+        D = self.problem.scheme.state_size
+        scale = np.max(np.abs(self.x[lanes, :, :D]), axis=1) + 1e-300
+        return np.max(np.max(np.abs(dx[lanes, :, :D]), axis=1) / scale, axis=1, initial=0.0)
+
+    def _advance(self, lanes: Lanes, dx: Array, size: Array) -> tuple[Lanes, NDArray[np.bool_]]:
+        """Take the steps, halving those that leave the admissible region or do not reduce the residual."""
+        base, fraction = self.x[lanes].copy(), np.ones(lanes.size)
+        unit = self._term_size(lanes)
+        before = self._merit(lanes, unit)
+        pending = np.arange(lanes.size)
+        for _ in range(MAXIMUM_HALVINGS):
+            chosen = lanes[pending]
+            self.x[chosen] = base[pending] + fraction[pending, None, None] * dx[chosen]
+            good = self._evaluate(chosen)
+            merit = self._merit(chosen, unit[pending])
+            # Close to the solution round-off keeps the residual from falling; the step's own size then decides.
+            good &= (merit < before[pending]) | (size[pending] < 1e-5) | (not self.monotone)
+            self.merit[chosen[good]] = merit[good]
+            pending = pending[~good]
+            if pending.size == 0:
+                break
+            fraction[pending] *= 0.5
+        kept = np.ones(lanes.size, dtype=bool)
+        kept[pending] = False
+        self.x[lanes[pending]] = base[pending]
+        stuck = lanes[pending]
+        inadmissible = (self.a[stuck] <= 0).any(axis=(1, 2))
+        self.status[stuck] = np.where(inadmissible, Status.INADMISSIBLE.value, Status.NO_CONVERGENCE.value)
+        size[fraction < 1.0] = np.maximum(size[fraction < 1.0], 1.0)
+        return lanes[kept], kept
+
+    def _finish(self, lanes: Lanes, size: Array) -> Lanes:
+        contracting = size < 0.1 * self.last[lanes]
+        done = ((size < LAST_STEP) & contracting) | (size < SMALL_STEP)
+        # A linear problem is solved by its first step.
+        done |= (self.merit[lanes] < 1e-14) & (self.iterations[lanes] > 1)
+        self.last[lanes] = size
+        self.status[lanes[done]] = Status.CONVERGED.value
+        return lanes[~done]
+
+
+def sensitivities(problem: Boundary, p: Array, solution: Solution) -> tuple[Solution, Array, Array]:
+    """Derivatives of converged solutions with respect to the active parameters.
+
+    Parameters
+    ----------
+    problem : Boundary
+        As solved.
+    p : ndarray, shape (L, np)
+        Constants.
+    solution : Solution
+        Of :func:`solve_periodic`.
+
+    Returns
+    -------
+    solution : Solution
+        With the status ``SINGULAR`` where the linear problem has no solution.
+    x_theta : ndarray, shape (L, n, w, na)
+        ``-G^-1 dg/dtheta`` (Verbeek 1993, eq. 4.28).
+    monodromy : ndarray, shape (L, D, D)
+        Its eigenvalues are the Floquet multipliers of the discretised time map.
+    """
+    lanes = np.flatnonzero(solution.status == Status.CONVERGED.value)
+    count, n, _ = solution.x.shape
+    d, points = len(problem.scheme.orders), problem.inputs.shape[1]
+    nz = problem.scheme.state_size + d
+    z = np.zeros((count, nz, points))
+    g, gz = np.zeros((count, d, points)), np.zeros((count, d, nz, points))
+    gp = np.zeros((count, d, problem.active, points))
+    problem.scheme.rows(solution.x, lanes, problem.step(n), z)
+    problem.equations.jacobian(z, problem.inputs, p, lanes, g, gz)
+    problem.equations.parameters(z, problem.inputs, p, lanes, gp)
+    x_theta, monodromy, ok = problem.scheme.linear(gz, gp, None, lanes, problem.step(n))
+    status = solution.status.copy()
+    status[lanes[~ok[lanes]]] = Status.SINGULAR.value
+    return replace(solution, status=status), x_theta, monodromy

@@ -1,0 +1,110 @@
+"""Collocation methods: their nodes, weights and interpolation polynomials, computed rather than tabulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import Polynomial, legendre
+from numpy.typing import NDArray
+
+from bayesoleo.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tableau:
+    """A one-step collocation method with ``s`` stages on the unit step.
+
+    Parameters
+    ----------
+    name : str
+        ``radau3``, for instance.
+    order : int
+        Order of the error at the nodes.
+    c : ndarray, shape (s,)
+        Stage positions.
+    a : ndarray, shape (s, s)
+        Integrals of the Lagrange polynomials from 0 to ``c[i]``.
+    b : ndarray, shape (s,)
+        Their integrals over the step.
+    """
+
+    name: str
+    order: int
+    c: Array
+    a: Array
+    b: Array
+
+    @property
+    def stages(self) -> int:
+        """Number of stages."""
+        return self.c.size
+
+    def weights(self, position: Array) -> tuple[Array, Array, Array]:
+        """Lagrange polynomials of the stages and their first and second integrals from 0.
+
+        Parameters
+        ----------
+        position : ndarray, shape (N,)
+            Positions in the unit step.
+
+        Returns
+        -------
+        tuple of three ndarray, each shape (N, s)
+            They turn stage values of the highest derivative into that derivative, the one below and the one below that.
+        """
+        polynomials = _lagrange(self.c)
+        tables = [
+            np.stack([p.integ(k)(position) if k else p(position) for p in polynomials], axis=-1)
+            for k in range(3)
+        ]
+        return tables[0], tables[1], tables[2]
+
+
+def _lagrange(c: Array) -> list[Polynomial]:
+    polynomials = []
+    for i, own in enumerate(c):
+        others = np.delete(c, i)
+        polynomials.append(Polynomial.fromroots(others) / float(np.prod(own - others)))
+    return polynomials
+
+
+def _from_nodes(name: str, order: int, c: Array) -> Tableau:
+    integrals = [p.integ() for p in _lagrange(c)]
+    a = np.array([[integral(ci) for integral in integrals] for ci in c])
+    b = np.array([integral(1.0) for integral in integrals])
+    return Tableau(name, order, c, a, b)
+
+
+def _radau_nodes(stages: int) -> Array:
+    """Zeros of P_s(x) - P_{s-1}(x) on [-1, 1], which include 1; Hairer and Wanner (1996), section IV.5."""
+    coefficients = np.zeros(stages + 1)
+    coefficients[stages], coefficients[stages - 1] = 1.0, -1.0
+    nodes = np.sort((np.real(legendre.legroots(coefficients)) + 1.0) / 2.0)
+    nodes[-1] = 1.0 # exact by construction; the root finder leaves 1e-16
+    return nodes
+
+
+@cache
+def tableau(name: str) -> Tableau:
+    """A collocation method by name: ``radau2``, ``radau3``, ``gauss2`` or ``gauss3``.
+
+    Raises
+    ------
+    InputError
+        If there is no such method.
+
+    References
+    ----------
+    Hairer, E. and Wanner, G. (1996). Solving Ordinary Differential Equations II, 2nd ed., section IV.5.
+    """
+    family, stages = name[:-1], name[-1:]
+    if stages not in ("2", "3") or family not in ("radau", "gauss"):
+        raise InputError("unknown scheme", value=name, hint="use radau2, radau3, gauss2, gauss3 or thesis")
+    s = int(stages)
+    if family == "radau":
+        return _from_nodes(name, 2 * s - 1, _radau_nodes(s))
+    return _from_nodes(name, 2 * s, (legendre.leggauss(s)[0] + 1.0) / 2.0)
