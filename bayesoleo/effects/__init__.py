@@ -1,0 +1,38 @@
+"""Which physical effects can be missing in a model, and how each is added to it.
+
+Examples
+--------
+A catalogue effect, and one of your own:
+
+>>> from bayesoleo.effects import force_effect
+>>> mine = force_effect("drag", "damping", "k*velocity**3", {"k": "force/(position/s)**3"})
+>>> mine.id
+'drag'
+"""
+
+from bayesoleo.effects.catalogue import candidates, catalogue, find_effect
+from bayesoleo.effects.effect import (
+    FAMILIES,
+    Amplitude,
+    Candidate,
+    Constant,
+    Effect,
+    Scales,
+    Shape,
+)
+from bayesoleo.effects.force_effect import State, force_effect
+
+__all__ = [
+    "FAMILIES",
+    "Amplitude",
+    "Candidate",
+    "Constant",
+    "Effect",
+    "Scales",
+    "Shape",
+    "State",
+    "candidates",
+    "catalogue",
+    "find_effect",
+    "force_effect",
+]

@@ -1,0 +1,70 @@
+"""The effects that come with the package, and every candidate they make of a model."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterable
+from functools import cache
+
+from bayesoleo.effects import contact, damping, force, friction, memory, stiffness
+from bayesoleo.effects.effect import Candidate, Effect, Scales
+from bayesoleo.errors import InputError
+from bayesoleo.model import Model
+
+_MODULES = (damping, friction, memory, stiffness, contact, force)
+
+
+@cache
+def catalogue() -> tuple[Effect, ...]:
+    """Every built-in effect, by family."""
+    return tuple(effect for module in _MODULES for effect in module.EFFECTS)
+
+
+def find_effect(id: str) -> Effect:  # noqa: A002 - the word that users of a catalogue know
+    """The built-in effect of a canonical id.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message names the closest ids.
+    """
+    known = {effect.id: effect for effect in catalogue()}
+    if id not in known:
+        close = difflib.get_close_matches(id, known, 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(known)}"
+        raise InputError("unknown effect", value=id, hint=hint)
+    return known[id]
+
+
+def candidates(
+    model: Model,
+    scales: Scales,
+    effects: Iterable[Effect] | None = None,
+    exclude: Collection[str] = (),
+) -> list[Candidate]:
+    """Every effect at every place of a model where it applies and is not in yet.
+
+    Parameters
+    ----------
+    model : Model
+        In its own drive.
+    scales : Scales
+        Sizes of the estimated motion.
+    effects : iterable of Effect, optional
+        Instead of the catalogue; add to it with ``[*catalogue(), my_effect]``.
+    exclude : collection of str
+        Ids of effects to leave out; ``"effect at target"`` leaves out one place.
+
+    Returns
+    -------
+    list of Candidate
+        In the order of the effects, then of their places.
+    """
+    chosen = catalogue() if effects is None else tuple(effects)
+    return [
+        effect.extend(model, target, scales)
+        for effect in chosen
+        if effect.id not in exclude
+        for target in effect.places(model)
+        if f"{effect.id} at {target}" not in exclude and not effect.is_in(model, target)
+    ]

@@ -1,0 +1,339 @@
+"""What an effect is: a small change of a model, with its parameters, its null and its formula.
+
+An effect is a frozen value that says where in a model it can sit (:attr:`Effect.places`) and what
+it changes there (:attr:`Effect.change`). :meth:`Effect.extend` makes the extended model, at the
+null: with the new amplitudes at their null value it predicts what the old model predicts, so that
+a score test needs no refit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import sympy as sp
+
+from bayesoleo.effects.units import target_units
+from bayesoleo.errors import InputError, ModelError
+from bayesoleo.model import LogNormal, Model, Parameter
+from bayesoleo.model.expressions import symbol
+
+#: Kinds of effects, in the order in which they are listed.
+FAMILIES = (
+    "damping",
+    "friction",
+    "stiffness",
+    "contact",
+    "force",
+    "gas",
+    "thermal",
+    "compliance",
+    "sensor",
+    "run-to-run",
+    "unnamed",
+)
+
+#: Standard deviation of the placeholder prior of a new amplitude, in its unit. It says nothing:
+#: whoever fits the extended model rescales it to the size that the data suggest.
+PLACEHOLDER_SD = 1.0
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Typical sizes along the estimated motion; they place the scan grids of shape parameters.
+
+    Parameters
+    ----------
+    position : mapping of str to (float, float)
+        Lowest and highest position over all runs, by coordinate, in the coordinate's unit.
+    velocity : mapping of str to float
+        Largest absolute velocity, by coordinate, in the coordinate's unit per second.
+    output : mapping of str to float
+        Peak-to-peak value by output, in the output's unit.
+    shortest_period, longest_period : float
+        Of all runs, in seconds.
+    """
+
+    position: Mapping[str, tuple[float, float]]
+    velocity: Mapping[str, float]
+    output: Mapping[str, float]
+    shortest_period: float
+    longest_period: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place of one model.
+
+    Parameters
+    ----------
+    effect, family : str
+        Canonical id of the effect, and its family.
+    target : str
+        What it sits on: an equation's dof, a channel, a definition or a parameter.
+    model : Model
+        The extended model, at the null, in the drive of the model it was made from.
+    parameters : tuple of str
+        The new amplitudes. At their ``value`` (the null) the extended model equals the old one.
+        Their priors are placeholders with standard deviation :data:`PLACEHOLDER_SD`.
+    sign : mapping of str to int
+        By amplitude: +1 or -1 where only one side of the null is physical, else 0.
+    shapes : mapping of str to tuple of float
+        By shape parameter the values to scan, ascending, neighbours at most a factor of two apart.
+        The null leaves shapes undefined; they are estimated (log-normal prior) once the effect is
+        in. A grid of one value is not worth a scan.
+    """
+
+    effect: str
+    family: str
+    target: str
+    model: Model
+    parameters: tuple[str, ...]
+    sign: Mapping[str, int] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """A new parameter that switches an effect on.
+
+    Parameters
+    ----------
+    name : str
+        As the effect's expression calls it.
+    unit : str
+        May use the words ``force`` (of the balance), ``position`` and ``channel`` for the units of
+        the place, e.g.
+        ``force/position**3``.
+    latex, description : str
+        For reports.
+    sign : int
+        +1 or -1 where only that side of zero is physical.
+    by_run : bool
+        One value for every run.
+    """
+
+    name: str
+    unit: str
+    latex: str
+    description: str
+    sign: int = 0
+    by_run: bool = False
+
+
+#: Computes a number, or a grid of them, from the model, the target and the scales.
+Grid = Callable[[Model, str, Scales], tuple[float, ...]]
+
+
+def always(_: Model) -> bool:
+    """The default of conditions on a model."""
+    return True
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A new parameter that the null leaves undefined: a velocity, a length, a time constant.
+
+    ``grid`` gives the values to scan; ``needed`` says whether a model needs this shape at all.
+    """
+
+    name: str
+    unit: str
+    latex: str
+    description: str
+    grid: Grid
+    needed: Callable[[Model], bool] = always
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A new fixed parameter: a reference velocity, a property of nitrogen."""
+
+    name: str
+    unit: str
+    description: str
+    value: Callable[[Model, str, Scales], float]
+
+
+#: Symbols of the new parameters under their names in the effect.
+Names = Mapping[str, sp.Symbol]
+
+
+@dataclass(frozen=True)
+class Effect:
+    r"""A physical effect that a model may lack.
+
+    Parameters
+    ----------
+    id : str
+        Canonical name, an identifier.
+    family : str
+        One of :data:`FAMILIES`.
+    title : str
+        A few words.
+    formula : str
+        LaTeX.
+    amplitudes : tuple of Amplitude
+        At least one; all are zero at the null.
+    places : callable (model) -> sequence of str
+        Targets where it applies; empty where it does not.
+    change : callable (model, target, names) -> Model
+        Extends the model, to which the new parameters have been added already; ``names`` maps the
+        effect's own names of them to their symbols.
+    shapes : tuple of Shape
+        Usually none or one, at most two.
+    constants : tuple of Constant
+        Fixed numbers with a unit.
+    source : str
+        Reference.
+    applies_to : str
+        In words, for listings.
+    own_name_per_target : bool
+        Name parameters after the target even where only one target exists.
+
+    Raises
+    ------
+    InputError
+        If the id, the family or the formula cannot be used.
+
+    See Also
+    --------
+    bayesoleo.effects.force_effect : a force-like effect in a few lines.
+    """
+
+    id: str
+    family: str
+    title: str
+    formula: str
+    amplitudes: tuple[Amplitude, ...]
+    places: Callable[[Model], Sequence[str]]
+    change: Callable[[Model, str, Names], Model]
+    shapes: tuple[Shape, ...] = ()
+    constants: tuple[Constant, ...] = ()
+    source: str = ""
+    applies_to: str = "every model"
+    own_name_per_target: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.id.isidentifier():
+            raise InputError("effect id is not an identifier", value=self.id, hint="e.g. play_2")
+        if self.family not in FAMILIES:
+            allowed = f"choose one of {', '.join(FAMILIES)}"
+            raise InputError(f"effect {self.id}: unknown family", value=self.family, hint=allowed)
+        if not self.amplitudes:
+            raise InputError(f"effect {self.id}: no parameters", hint="state at least one")
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of all new parameters, in words of the place."""
+        parts = (*self.amplitudes, *self.shapes, *self.constants)
+        return {part.name: part.unit for part in parts}
+
+    def names(self, model: Model, target: str) -> dict[str, str]:
+        """Parameter names in the model by names in the effect, before collisions are resolved."""
+        many = self.own_name_per_target or len(self.places(model)) > 1
+        suffix = "_" + re.sub(r"\W+", "_", target) if many else ""
+        parts = (*self.amplitudes, *self.shapes, *self.constants)
+        return {part.name: _with_prefix(self.id, part.name) + suffix for part in parts}
+
+    def is_in(self, model: Model, target: str) -> bool:
+        """Whether this effect has been added at this target before."""
+        present = model.parameters.get(self.names(model, target)[self.amplitudes[0].name])
+        return present is not None and present.description == self.amplitudes[0].description
+
+    def extend(self, model: Model, target: str, scales: Scales) -> Candidate:
+        """The candidate that this effect makes at one target.
+
+        Parameters
+        ----------
+        model : Model
+            In its own drive.
+        target : str
+            One of ``places(model)``.
+        scales : Scales
+            For the grids of shape parameters.
+
+        Raises
+        ------
+        ModelError
+            If the effect does not apply there.
+        """
+        if target not in self.places(model):
+            where = ", ".join(self.places(model)) or "nowhere in this model"
+            raise ModelError(f"effect {self.id} does not apply to {target!r}", hint=where)
+        names = {own: _free(name, model) for own, name in self.names(model, target).items()}
+        shapes = [shape for shape in self.shapes if shape.needed(model)]
+        grids = {shape.name: shape.grid(model, target, scales) for shape in shapes}
+        new = self._parameters(model, target, scales, grids)
+        bare = model.with_parameters(**{names[own]: value for own, value in new.items()})
+        extended = self.change(bare, target, {own: symbol(names[own]) for own in new})
+        return Candidate(
+            effect=self.id,
+            family=self.family,
+            target=target,
+            model=extended,
+            parameters=tuple(names[item.name] for item in self.amplitudes),
+            sign={names[item.name]: item.sign for item in self.amplitudes},
+            shapes={names[own]: grid for own, grid in grids.items()},
+        )
+
+    def _parameters(
+        self, model: Model, target: str, scales: Scales, grids: Mapping[str, tuple[float, ...]]
+    ) -> dict[str, Parameter]:
+        units = target_units(model, target)
+        new = {}
+        for item in self.amplitudes:
+            new[item.name] = Parameter(
+                0.0,
+                units.resolve(item.unit),
+                sd=PLACEHOLDER_SD,
+                by_run=item.by_run,
+                latex=item.latex,
+                description=item.description,
+            )
+        for shape in self.shapes:
+            if shape.name in grids:
+                prior = _shape_prior(grids[shape.name])
+                unit = units.resolve(shape.unit)
+                new[shape.name] = Parameter(
+                    prior.median,
+                    unit,
+                    prior=prior,
+                    latex=shape.latex,
+                    description=shape.description,
+                )
+        for constant in self.constants:
+            value, unit = constant.value(model, target, scales), units.resolve(constant.unit)
+            new[constant.name] = Parameter(
+                value, unit, fixed=True, description=constant.description
+            )
+        return new
+
+
+def _shape_prior(grid: tuple[float, ...]) -> LogNormal:
+    """Centred on the grid's geometric middle, its ends one standard deviation away."""
+    middle = float(np.sqrt(grid[0] * grid[-1]))
+    # A single value still leaves a factor of two either way.
+    return LogNormal(middle, max(0.5 * float(np.log(grid[-1] / grid[0])), float(np.log(2.0))))
+
+
+def _with_prefix(effect: str, name: str) -> str:
+    return name if name.startswith(effect) else f"{effect}_{name}"
+
+
+def _free(name: str, model: Model) -> str:
+    """The name, or the first of ``name_2, name_3, …`` that the model does not use yet."""
+    taken = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
+    if name not in taken:
+        return name
+    number = 2
+    while f"{name}_{number}" in taken:
+        number += 1
+    return f"{name}_{number}"
+
+
+def free_name(name: str, model: Model) -> str:
+    """A name for a new dof or definition that collides with nothing in the model."""
+    return _free(name, model)

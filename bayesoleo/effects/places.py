@@ -1,0 +1,121 @@
+"""Where force-like effects can act, and which terms of a balance already resist motion."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import sympy as sp
+
+from bayesoleo.model import Coordinate, Model
+from bayesoleo.model.expressions import derivative_symbol, split_derivative, symbol
+
+
+def force_places(model: Model) -> dict[str, Coordinate]:
+    """Places of a force-like effect by target.
+
+    A target is the name of a second-order dof's equation, or of an output that follows an input (a
+    force law). Where an output follows several inputs the target is ``output/input``.
+    """
+    coordinates = model.coordinates()
+    second = [item for item in coordinates if item.kind == "equation" and item.velocity is not None]
+    laws = [item for item in coordinates if item.kind == "output"]
+    # Where a balance of forces exists the forces act there: an output that shows an input as well
+    # (a compliant frame) is no second place, nor is the state of a memory or a temperature.
+    chosen = second or laws or list(coordinates)
+    shared = Counter((item.kind, item.target) for item in chosen)
+    places = {}
+    for item in chosen:
+        alone = shared[item.kind, item.target] == 1
+        places[item.target if alone else f"{item.target}/{item.name}"] = item
+    return places
+
+
+def moving_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` that have a velocity."""
+    return {k: item for k, item in force_places(model).items() if item.velocity is not None}
+
+
+def balance_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
+    """Named terms of the balance at a place."""
+    if place.kind == "equation":
+        return dict(model.equations[place.target])
+    return dict(model.output_terms(place.target))
+
+
+def acceleration(place: Coordinate) -> sp.Expr:
+    """Symbol of the second derivative of the position."""
+    return derivative_symbol(place.name, 2)
+
+
+def damping_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
+    """Terms of a balance that grow with velocity and vanish without it.
+
+    Friction saturates and so is none: the test is whether doubling a large velocity raises the term
+    by half or more.
+    """
+    found = {}
+    for name, term in balance_terms(model, place).items():
+        whole = model.expand(term)
+        if place.velocity is not None and whole.has(place.velocity):
+            at_rest = whole.subs(place.velocity, 0)
+            if at_rest == 0 and _grows(whole, place.velocity, model):
+                found[name] = term
+    return found
+
+
+def _grows(term: sp.Expr, velocity: sp.Expr, model: Model) -> bool:
+    """Whether the term at twice a velocity is at least 1.5 times itself, at a mid-range state."""
+    numbers = model.nominal()
+    # Any state will do that is off every zero; one half is inside a volume ratio of zero to one.
+    others = {item: 0.5 for item in term.free_symbols if item not in numbers and item != velocity}
+    shape = term.subs(numbers).subs(others)
+    once, twice = (abs(complex(shape.subs(velocity, value))) for value in (1.0, 2.0))
+    return twice >= 1.5 * once > 0
+
+
+def spring_force(model: Model, place: Coordinate) -> sp.Expr:
+    """Sum of the terms of a balance that follow the position and neither velocity nor an input."""
+    total = sp.Integer(0)
+    for term in balance_terms(model, place).values():
+        whole = model.expand(term)
+        inputs = {name for name in model.inputs if name != place.name}
+        free = {split_derivative(item) for item in whole.free_symbols}
+        moving = any(order > 0 or name in inputs for name, order in free)
+        if whole.has(place.position) and not moving:
+            total += term
+    return total
+
+
+def is_quantity(model: Model, *names: str) -> bool:
+    """Whether all names are declared in the model."""
+    known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
+    return known.issuperset(names)
+
+
+def substitute(model: Model, table: dict[sp.Symbol, sp.Expr]) -> Model:
+    """Replace symbols everywhere in a model: definitions, equations, outputs, admissible region."""
+    from dataclasses import replace
+
+    def swap(expression: sp.Expr) -> sp.Expr:
+        return expression.xreplace(table)
+
+    return replace(
+        model,
+        definitions={name: swap(e) for name, e in model.definitions.items()},
+        equations={
+            name: {term: swap(e) for term, e in terms.items()}
+            for name, terms in model.equations.items()
+        },
+        outputs={
+            name: replace(
+                output, terms={term: swap(e) for term, e in model.output_terms(name).items()}
+            )
+            for name, output in model.outputs.items()
+        },
+        admissible=[swap(e) for e in model.admissible],
+    )
+
+
+def quantity(name: str) -> sp.Symbol:
+    """Symbol of a declared name."""
+    return symbol(name)
