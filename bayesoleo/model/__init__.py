@@ -1,4 +1,4 @@
-"""Declare a model as named terms, derive its partial derivatives, and generate kernels that evaluate them."""
+"""Declare a model as named terms, derive its partials, and generate kernels that evaluate them."""
 
 from bayesoleo.model.drive import driven_by, possible_drives
 from bayesoleo.model.model import Model

@@ -1,8 +1,12 @@
 """Drive a model by any of its channels.
 
-A rig may control the displacement although the equation of motion is written for a force: then the displacement is the clean input,
-and the force is what the system answers. If the controlled channel's output map is a dof itself, the dof is replaced by the input
-with its exact derivatives; otherwise - an effect sits on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
+A rig may control the displacement although the equation of motion is written for a force: then the
+displacement is the clean input, and the force is what the system answers. If the controlled
+channel's output map is a dof itself, the dof is replaced by the input with its exact derivatives;
+otherwise - an effect sits on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
+
+Where the given-up input enters with its rate as well (a lagging sensor shows ``F + tau dot(F)``),
+what is solved for is a state: the answer ``F`` becomes a dof of first order.
 """
 
 from __future__ import annotations
@@ -13,9 +17,15 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.errors import ModelError
-from bayesoleo.model.expressions import derivative_symbol, partial, split_derivative, symbol
+from bayesoleo.model.expressions import (
+    TIME,
+    derivative_symbol,
+    partial,
+    split_derivative,
+    symbol,
+)
 from bayesoleo.model.model import Model
-from bayesoleo.model.parameter import Output
+from bayesoleo.model.parameter import Dof, Output
 
 #: An input has exact derivatives of any order; equations need at most this many.
 MAXIMUM_DERIVATIVE = 6
@@ -59,15 +69,21 @@ def driven_by(model: Model, channel: str) -> Model:
             hint=f"drive it by one of: {', '.join(possible_drives(model))}",
         )
     dof, freed = found
-    expression = model.output(channel)
-    answer = _solve_for_input(model, dof, freed)
-    driven = _exchange(model, channel, dof, freed, answer)
-    measured = model.expand(expression.xreplace({symbol(freed): sp.Add(*answer.values())}))
+    if _orders(model.equation(dof), freed) == {0, 1}:
+        driven = _exchange_lagging(model, channel, dof, freed)
+        measured = model.output(channel)
+    else:
+        answer = _solve_for_input(model, dof, freed)
+        driven = _exchange(model, channel, dof, freed, answer)
+        table = {symbol(freed): sp.Add(*answer.values())}
+        measured = model.expand(model.output(channel).xreplace(table))
     inverse = _explicit_inverse(model, measured, dof, channel)
     if inverse is not None:
         return _replace_dof(driven, dof, inverse)
     equation = {"measured": measured, "drive": -symbol(channel)}
-    return replace(driven, equations={**driven.equations, dof: equation})
+    # The dof stays close to what is measured: a far better first guess than a static value.
+    dofs = {**driven.dofs, dof: replace(driven.dofs[dof], guess=channel)}
+    return replace(driven, dofs=dofs, equations={**driven.equations, dof: equation})
 
 
 def _freed_input(model: Model, channel: str) -> tuple[str, str] | None:
@@ -79,18 +95,32 @@ def _freed_input(model: Model, channel: str) -> tuple[str, str] | None:
         equation = model.equation(dof)
         for name in model.inputs:
             slope = partial(equation, symbol(name))
-            if slope != 0 and not slope.has(symbol(name)) and _appears_once(model, name, dof, channel):
+            linear = slope != 0 and not slope.has(symbol(name))
+            if linear and not expression.has(TIME) and _appears_once(model, name, dof, channel):
                 return dof, name
     return None
 
 
 def _appears_once(model: Model, name: str, dof: str, channel: str) -> bool:
-    """Whether an input enters the dof's equation without derivatives, and nothing else but the channel itself."""
-    own = [item for item in model.equation(dof).free_symbols if split_derivative(item)[0] == name]
+    """Whether an input enters the dof's equation only, and the channel itself.
+
+    It may enter the equation with its rate, if linearly and not the channel as well.
+    """
+    own = _orders(model.equation(dof), name)
     others = [model.equation(other) for other in model.dofs if other != dof]
     others += [model.output(other) for other in model.outputs if other != channel]
-    entangled = any(split_derivative(i)[0] == name for expression in others for i in expression.free_symbols)
-    return own == [symbol(name)] and not entangled
+    if any(_orders(expression, name) for expression in others):
+        return False
+    if own == {0, 1}:
+        rate = partial(model.equation(dof), derivative_symbol(name, 1))
+        return not _orders(rate, name) and not _orders(model.output(channel), name)
+    return own == {0}
+
+
+def _orders(expression: sp.Expr, name: str) -> set[int]:
+    """Orders of the derivatives of a quantity that an expression contains."""
+    found = (split_derivative(item) for item in expression.free_symbols)
+    return {order for other, order in found if other == name}
 
 
 def _solve_for_input(model: Model, dof: str, freed: str) -> dict[str, sp.Expr]:
@@ -105,22 +135,40 @@ def _solve_for_input(model: Model, dof: str, freed: str) -> dict[str, sp.Expr]:
     return terms
 
 
-def _exchange(model: Model, channel: str, dof: str, freed: str, answer: Mapping[str, sp.Expr]) -> Model:
+def _exchange(
+    model: Model, channel: str, dof: str, freed: str, answer: Mapping[str, sp.Expr]
+) -> Model:
     """Swap the roles of the two channels; the dof still stands, with its equation given up."""
     unit = model.outputs[channel].unit
-    inputs = {name: value for name, value in model.inputs.items() if name != freed} | {channel: unit}
+    inputs = {name: value for name, value in model.inputs.items() if name != freed} | {
+        channel: unit
+    }
     outputs = {freed: Output(dict(answer), model.inputs[freed])}
     outputs |= {name: output for name, output in model.outputs.items() if name != channel}
     equations = {**model.equations, dof: {"drive": symbol(dof) - symbol(channel)}}
     return replace(model, inputs=inputs, outputs=outputs, equations=equations)
 
 
+def _exchange_lagging(model: Model, channel: str, dof: str, freed: str) -> Model:
+    """The same where the freed input enters with its rate: the equation rules a new dof."""
+    taken = {*model.dofs, *model.inputs, *model.parameters, *model.conditions, *model.definitions}
+    state = f"{freed}_answer"
+    while state in taken:
+        state += "_"
+    table = {symbol(freed): symbol(state)}
+    table[derivative_symbol(freed, 1)] = derivative_symbol(state, 1)
+    terms = {name: term.xreplace(table) for name, term in model.equations[dof].items()}
+    driven = _exchange(model, channel, dof, freed, {"answer": symbol(state)})
+    return driven.with_dof(state, Dof(model.inputs[freed]), terms)
+
+
 def _explicit_inverse(model: Model, measured: sp.Expr, dof: str, channel: str) -> sp.Expr | None:
-    """The dof as a function of the channel where the map is linear in the dof alone, else ``None``."""
+    """The dof as a function of the channel where the map is linear in the dof, else ``None``."""
     slope = sp.diff(measured, symbol(dof))
     rest = sp.expand(measured - slope * symbol(dof))
-    moving = {*model.dofs, *model.inputs}
-    if slope == 0 or any(split_derivative(item)[0] in moving for item in (slope + rest).free_symbols):
+    moving = {*model.dofs, *model.inputs, TIME.name}
+    involved = slope.free_symbols | rest.free_symbols
+    if slope == 0 or any(split_derivative(item)[0] in moving for item in involved):
         return None
     return (symbol(channel) - rest) / slope
 
@@ -145,7 +193,9 @@ def _replace_dof(model: Model, dof: str, inverse: sp.Expr) -> Model:
             if name != dof
         },
         outputs={
-            name: replace(output, terms={term: swap(e) for term, e in model.output_terms(name).items()})
+            name: replace(
+                output, terms={term: swap(e) for term, e in model.output_terms(name).items()}
+            )
             for name, output in model.outputs.items()
         },
         definitions={name: swap(e) for name, e in model.definitions.items()},

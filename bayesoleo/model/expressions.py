@@ -1,7 +1,8 @@
 """Text to symbolic expressions: the small language in which equations are declared.
 
-Names are those that a model declares; ``dot(q)`` is a time derivative (``ddot(q)`` the second), also of an expression. Text is parsed
-against a closed list of names, so a misspelt one is an error rather than a new symbol.
+Names are those that a model declares; ``dot(q)`` is a time derivative (``ddot(q)`` the second), of
+an expression as well. Text is parsed against a closed list of names, so a misspelt one is an error
+rather than a new symbol.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import sympy as sp
 
 from bayesoleo.errors import ModelError
 
-#: Functions an expression may use. Those with kinks have their one-sided derivatives replaced by zero at the kink.
+#: Functions an expression may use. The derivative at a kink is the mean of those on its two sides.
 FUNCTIONS: dict[str, object] = {
     "abs": sp.Abs,
     "sign": sp.sign,
@@ -35,7 +36,7 @@ FUNCTIONS: dict[str, object] = {
     "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
 }
 
-#: Seconds since the first sample of the record; for outputs only, a periodic state cannot depend on it.
+#: Seconds since the first sample; for outputs only, a periodic state cannot depend on it.
 TIME = sp.Symbol("time", real=True)
 
 _DERIVATIVE = re.compile(r"^(d+)ot\((.+)\)$")
@@ -70,7 +71,7 @@ def total_derivative(expression: sp.Expr, dynamic: Iterable[str]) -> sp.Expr:
 
 
 def without_impulses(expression: sp.Expr) -> sp.Expr:
-    """Drop the Dirac impulses that differentiating a kink or a step leaves: they act on a set of measure zero."""
+    """Drop the Dirac impulses that differentiating a kink leaves: they act for no time at all."""
     return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
 
 
@@ -105,14 +106,19 @@ def parse(
     """
     if isinstance(text, sp.Expr):
         return text
-    if isinstance(text, int | float):
+    hint = "write it as in Python, e.g. k*q**3"
+    if isinstance(text, int | float) and not isinstance(text, bool):
         return sp.sympify(text)
+    if not isinstance(text, str):
+        raise ModelError(f"{where}: not an expression", value=text, hint=hint)
     try:
         tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
-        raise ModelError(f"{where}: not an expression", value=text, hint="write it as in Python, e.g. k*q**3") from error
-    names = dict(known)
-    return sp.sympify(_Builder(names, tuple(dynamic), where, text).visit(tree.body))
+        raise ModelError(f"{where}: not an expression", value=text, hint=hint) from error
+    built = sp.sympify(_Builder(dict(known), tuple(dynamic), where, text).visit(tree.body))
+    if built.has(sp.nan, sp.zoo, sp.oo, -sp.oo, sp.I):
+        raise ModelError(f"{where}: not a finite real number", value=text, hint="mind 1/0 and 0/0")
+    return built
 
 
 _OPERATORS = {
@@ -127,14 +133,16 @@ _OPERATORS = {
 class _Builder(ast.NodeVisitor):
     """Builds an expression from a syntax tree; nothing is evaluated as Python."""
 
-    def __init__(self, known: Mapping[str, sp.Expr], dynamic: tuple[str, ...], where: str, text: str):
+    def __init__(
+        self, known: Mapping[str, sp.Expr], dynamic: tuple[str, ...], where: str, text: str
+    ):
         self.known, self.dynamic, self.where, self.text = known, dynamic, where, text
 
     def generic_visit(self, node: ast.AST) -> sp.Expr:
         raise ModelError(
             f"{self.where}: {type(node).__name__} has no place in an expression",
             value=self.text,
-            hint="use + - * / **, numbers, declared names and functions such as abs, exp, atan, dot",
+            hint="use + - * / **, numbers, declared names, and functions such as abs or dot",
         )
 
     def visit_Constant(self, node: ast.Constant) -> sp.Expr:
@@ -150,7 +158,9 @@ class _Builder(ast.NodeVisitor):
         if node.id == "time":
             return TIME
         close = difflib.get_close_matches(node.id, self.known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"declared: {', '.join(sorted(self.known))}"
+        hint = (
+            f"did you mean {close[0]}?" if close else f"declared: {', '.join(sorted(self.known))}"
+        )
         raise ModelError(f"{self.where}: unknown name {node.id}", value=self.text, hint=hint)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> sp.Expr:
@@ -167,15 +177,21 @@ class _Builder(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> sp.Expr:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
-        arguments = [self.visit(argument) for argument in node.args]
+        arguments = [sp.sympify(self.visit(argument)) for argument in node.args]
         if re.fullmatch("d+ot", name) and len(arguments) == 1:
             return self._time_derivative(arguments[0], len(name) - 2)
         function = FUNCTIONS.get(name)
         if function is None or not callable(function) or node.keywords:
             allowed = ", ".join(sorted(FUNCTIONS))
             raise ModelError(
-                f"{self.where}: unknown function {name or '?'}", value=self.text, hint=f"there are dot, ddot, {allowed}"
+                f"{self.where}: unknown function {name or '?'}",
+                value=self.text,
+                hint=f"there are dot, ddot, {allowed}",
             )
+        least = 2 if name in ("min", "max") else 1
+        if len(arguments) < least or (least == 1 and len(arguments) > 1):
+            wanted = "two arguments or more" if least == 2 else "one argument"
+            raise ModelError(f"{self.where}: {name} takes {wanted}", value=self.text)
         return function(*arguments)
 
     def _time_derivative(self, expression: sp.Expr, order: int) -> sp.Expr:

@@ -1,8 +1,9 @@
-"""A model is declared, not programmed: named terms, definitions and parameters in one frozen value."""
+"""A model is declared, not programmed: named terms and definitions in one frozen value."""
 
 from __future__ import annotations
 
 import hashlib
+import keyword
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -12,16 +13,18 @@ from bayesoleo.errors import ModelError
 from bayesoleo.model.expressions import derivative_symbol, parse, split_derivative, symbol
 from bayesoleo.model.parameter import Condition, Coordinate, Dof, Output, Parameter
 
-Text = str | float | sp.Expr
-Terms = Mapping[str, sp.Expr]
+type Text = str | float | sp.Expr
+type Terms = Mapping[str, sp.Expr]
 
 
 @dataclass(frozen=True)
 class Model:
     """Equations of motion and outputs as sums of named terms.
 
-    Implements ``g(q, q', q'', x, theta) = 0`` with ``y = f(q, q', q'', x, theta)`` (Verbeek 1993, eqs. 2.1-2.3). Expressions are text over
-    declared names (see :mod:`bayesoleo.model.expressions`); ``dot(q)`` and ``ddot(q)`` are time derivatives of dofs *and* inputs.
+    Implements ``g(q, q', q'', x, theta) = 0`` with ``y = f(q, q', q'', x, theta)`` (Verbeek 1993,
+    eqs. 2.1-2.3). Expressions are text over declared names (see
+    :mod:`bayesoleo.model.expressions`); ``dot(q)`` and ``ddot(q)`` are time derivatives of dofs
+    *and* inputs.
 
     Parameters
     ----------
@@ -34,7 +37,8 @@ class Model:
     dofs : mapping of str to Dof or str
         Degrees of freedom; text is the unit. The order of each follows from its equation.
     equations : mapping of str to text or mapping of str to text
-        For each dof the terms whose sum is zero: named, or one expression whose summands are then numbered.
+        For each dof the terms whose sum is zero: named, or one expression whose summands are then
+        numbered.
     parameters : mapping of str to Parameter
         Constants, estimated or fixed.
     conditions : mapping of str to Condition or str
@@ -49,7 +53,8 @@ class Model:
     Raises
     ------
     ModelError
-        If a name is unknown, declared twice or not usable, a dof lacks its equation, or nothing is measured.
+        If a name is unknown, declared twice or not usable, a dof lacks its equation, or nothing is
+        measured.
 
     Examples
     --------
@@ -62,7 +67,10 @@ class Model:
     ...         "damping": Parameter(0.5, "N*s/m", sd=0.2),
     ...         "stiffness": Parameter(100.0, "N/m", sd=30.0),
     ...     },
-    ...     equations={"position": "mass*ddot(position) + damping*dot(position) + stiffness*position - force"},
+    ...     equations={
+    ...         "position": "mass*ddot(position) + damping*dot(position)"
+    ...         " + stiffness*position - force"
+    ...     },
     ...     outputs={"displacement": Output("position", "m")},
     ... )
     >>> model.order("position")
@@ -86,7 +94,10 @@ class Model:
         put(
             self,
             "conditions",
-            {k: v if isinstance(v, Condition) else Condition(v) for k, v in self.conditions.items()},
+            {
+                k: v if isinstance(v, Condition) else Condition(v)
+                for k, v in self.conditions.items()
+            },
         )
         self._check_names()
         put(self, "definitions", self._parse_definitions())
@@ -98,7 +109,7 @@ class Model:
             tuple(self._parse(text, "admissible region") for text in self.admissible),
         )
 
-    # -- declaration ------------------------------------------------------------------------------------------------------
+    # -- declaration ----------------------------------------------------------------------
 
     def _check_names(self) -> None:
         seen: dict[str, str] = {}
@@ -111,15 +122,23 @@ class Model:
         }
         for kind, names in kinds.items():
             for name in names:
-                if not name.isidentifier() or name in ("time", "pi", "dot", "ddot"):
-                    raise ModelError(f"{kind} {name!r} is not usable as a name", hint="write letters, digits and underscores")
+                reserved = keyword.iskeyword(name) or name in ("time", "pi", "dot", "ddot")
+                if reserved or not name.isidentifier():
+                    raise ModelError(
+                        f"{kind} {name!r} is not usable as a name",
+                        hint="reserved; add a letter or an underscore"
+                        if reserved
+                        else "write letters, digits and underscores",
+                    )
                 if name in seen:
                     raise ModelError(f"{name!r} is both {seen[name]} and {kind}", hint="rename one")
                 seen[name] = kind
         for name, parameter in self.parameters.items():
             if not isinstance(parameter, Parameter):
                 raise ModelError(
-                    f"parameter {name!r} is not a Parameter", value=parameter, hint='write Parameter(1.0, "kg", sd=0.1)'
+                    f"parameter {name!r} is not a Parameter",
+                    value=parameter,
+                    hint='write Parameter(1.0, "kg", sd=0.1)',
                 )
 
     @property
@@ -134,19 +153,26 @@ class Model:
         known = self._known() | {name: symbol(name) for name in self.definitions}
         if isinstance(text, str) and "dot(" in text:
             # A derivative of a definition needs what stands behind its name.
-            known |= {name: self.expand(expression) for name, expression in self.definitions.items()}
+            known |= {name: self.expand(body) for name, body in self.definitions.items()}
         return parse(text, known, self._dynamic, f"model {self.name!r}, {where}")
 
     def _parse_definitions(self) -> dict[str, sp.Expr]:
         known, parsed = self._known(), dict[str, sp.Expr]()
+        whole = dict(known)
         for name, text in self.definitions.items():
-            parsed[name] = parse(text, known, self._dynamic, f"model {self.name!r}, definition {name!r}")
+            # A derivative of a definition needs what stands behind its name.
+            names = whole if isinstance(text, str) and "dot(" in text else known
+            where = f"model {self.name!r}, definition {name!r}"
+            parsed[name] = parse(text, names, self._dynamic, where)
+            whole[name] = parsed[name].xreplace({symbol(k): whole[k] for k in parsed if k != name})
             known[name] = symbol(name)
         return parsed
 
     def _named(self, terms: Text | Mapping[str, Text], where: str) -> dict[str, sp.Expr]:
         if isinstance(terms, Mapping):
-            return {name: self._parse(text, f"{where}, term {name!r}") for name, text in terms.items()}
+            return {
+                name: self._parse(text, f"{where}, term {name!r}") for name, text in terms.items()
+            }
         summands = sp.Add.make_args(self._parse(terms, where))
         return {f"term {number}": item for number, item in enumerate(summands, 1)}
 
@@ -161,16 +187,21 @@ class Model:
 
     def _parse_outputs(self) -> dict[str, Output]:
         if not self.outputs:
-            raise ModelError(f"model {self.name!r}: no outputs", hint='write outputs={"channel": Output("q", "m")}')
+            raise ModelError(
+                f"model {self.name!r}: no outputs",
+                hint='write outputs={"channel": Output("q", "m")}',
+            )
         parsed = {}
         for name, output in self.outputs.items():
             declared = output if isinstance(output, Output) else Output(output)
             if name in self.inputs:
-                raise ModelError(f"model {self.name!r}: {name!r} is both input and output", hint="rename one")
+                raise ModelError(
+                    f"model {self.name!r}: {name!r} is both input and output", hint="rename one"
+                )
             parsed[name] = replace(declared, terms=self._named(declared.terms, f"output {name!r}"))
         return parsed
 
-    # -- reading ----------------------------------------------------------------------------------------------------------
+    # -- reading --------------------------------------------------------------------------
 
     def expand(self, expression: sp.Expr) -> sp.Expr:
         """Replace the names of definitions by what stands behind them."""
@@ -195,8 +226,9 @@ class Model:
         return terms  # type: ignore[return-value]
 
     def order(self, dof: str) -> int:
-        """Order of a dof: that of its highest derivative anywhere in equations and outputs, at least one."""
-        everything = [self.equation(name) for name in self.dofs] + [self.output(name) for name in self.outputs]
+        """Order of a dof: of its highest derivative in equations and outputs, at least one."""
+        everything = [self.equation(name) for name in self.dofs]
+        everything += [self.output(name) for name in self.outputs]
         orders = [
             split_derivative(item)[1]
             for expression in everything
@@ -212,14 +244,16 @@ class Model:
     def nominal(self) -> dict[sp.Symbol, float]:
         """Values of parameters and of conditions that have a default, for substitution."""
         values = {symbol(name): parameter.value for name, parameter in self.parameters.items()}
-        defaults = {name: item.default for name, item in self.conditions.items() if item.default is not None}
+        defaults = {
+            name: item.default for name, item in self.conditions.items() if item.default is not None
+        }
         return values | {symbol(name): value for name, value in defaults.items()}
 
     def coordinates(self) -> tuple[Coordinate, ...]:
         """Every place where a force-like effect can act.
 
-        These are the equations of dofs of second order, and the outputs that depend on an input (a force law), and - without
-        velocity - the equations of dofs of first order.
+        These are the equations of dofs of second order, and the outputs that depend on an input (a
+        force law), and - without velocity - the equations of dofs of first order.
         """
         places = []
         for dof in self.dofs:
@@ -232,30 +266,41 @@ class Model:
             names = {split_derivative(item)[0] for item in self.output(output).free_symbols}
             for name in self.inputs:
                 if name in names:
-                    places.append(Coordinate(name, symbol(name), derivative_symbol(name, 1), "output", output, 1))
+                    places.append(
+                        Coordinate(
+                            name, symbol(name), derivative_symbol(name, 1), "output", output, 1
+                        )
+                    )
         return tuple(places)
 
     def digest(self) -> str:
-        """SHA-256 of what the model says; equal for models that predict the same in the same words."""
+        """SHA-256 of what the model says; equal for models that say the same in the same words."""
         return hashlib.sha256(repr(self).encode()).hexdigest()
 
-    # -- changing: what effects are made of --------------------------------------------------------------------------------
+    # -- changing: what effects are made of -----------------------------------------------
 
     def with_parameters(self, **parameters: Parameter) -> Model:
         """Add parameters, or replace those of the same name."""
         return replace(self, parameters={**self.parameters, **parameters})
 
     def with_term(self, kind: str, target: str, name: str, expression: Text) -> Model:
-        """Add a named term to an equation or an output (``kind`` is ``equation`` or ``output``), or replace the one of that name."""
+        """Add a named term to a balance, or replace the one of that name.
+
+        ``kind`` says where the balance stands: ``equation`` or ``output``.
+        """
         if kind == "equation":
             terms = {**self.equations[target], name: expression}
             return replace(self, equations={**self.equations, target: terms})
-        output = replace(self.outputs[target], terms={**self.output_terms(target), name: expression})
+        output = replace(
+            self.outputs[target], terms={**self.output_terms(target), name: expression}
+        )
         return replace(self, outputs={**self.outputs, target: output})
 
     def with_output(self, name: str, expression: Text) -> Model:
         """Replace an output's expression as a whole."""
-        return replace(self, outputs={**self.outputs, name: replace(self.outputs[name], terms=expression)})
+        return replace(
+            self, outputs={**self.outputs, name: replace(self.outputs[name], terms=expression)}
+        )
 
     def with_definition(self, name: str, expression: Text) -> Model:
         """Add a definition, or redefine the one of that name in place."""
@@ -278,9 +323,13 @@ class Model:
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Set nominal values of parameters; priors stay."""
-        changed = {name: replace(self.parameters[name], value=value) for name, value in values.items()}
+        changed = {
+            name: replace(self.parameters[name], value=value) for name, value in values.items()
+        }
         return self.with_parameters(**changed)
 
     def fixing(self, *names: str) -> Model:
         """Fix parameters at their nominal values."""
-        return self.with_parameters(**{name: replace(self.parameters[name], fixed=True) for name in names})
+        return self.with_parameters(
+            **{name: replace(self.parameters[name], fixed=True) for name in names}
+        )

@@ -23,9 +23,9 @@ class Parameter:
     unit : str
         SI unit, as pint reads it; empty for a number.
     sd : float, optional
-        Standard deviation of a normal prior about ``value``; with ``bounds``, of a truncated normal.
+        Standard deviation of a normal prior about ``value``; with ``bounds``, a truncated normal.
     relative_sd : float, optional
-        The same as a fraction of ``value``: the thesis's "sigma = 0.1 theta" is ``relative_sd=0.1``.
+        The same over ``value``: the thesis's "sigma = 0.1 theta" is ``relative_sd=0.1``.
     bounds : tuple of float, optional
         Lowest and highest admissible value; alone it means a uniform prior.
     prior : Prior, optional
@@ -78,10 +78,16 @@ class Parameter:
         if self.relative_sd is not None:
             spread = self.relative_sd * abs(self.value)
             if spread == 0:
-                raise ModelError("relative_sd of a value of zero is no prior", hint="write sd=… instead")
+                raise ModelError(
+                    "relative_sd of a value of zero is no prior", hint="write sd=… instead"
+                )
         if spread is None:
             return None if self.bounds is None else Uniform(*self.bounds)
-        return Normal(self.value, spread) if self.bounds is None else TruncatedNormal(self.value, spread, *self.bounds)
+        return (
+            Normal(self.value, spread)
+            if self.bounds is None
+            else TruncatedNormal(self.value, spread, *self.bounds)
+        )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Prior densities of single parameters.
 
-The kinds are those of Verbeek (1993), section 2.2.4 - uniform within absolute bounds, normal, and normal read as a 99 % band - and
-the log-normal and truncated normal that positive physical quantities ask for.
+The kinds are those of Verbeek (1993), section 2.2.4 - uniform within absolute bounds, normal, and
+normal read as a 99 % band - and the log-normal and truncated normal that positive physical quantities ask for.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from scipy import stats
 
 from bayesoleo.errors import ModelError
 
-#: chi-square quantile with one degree of freedom at 99 %: "theta +- delta at 99 %" means variance delta**2 / 6.635.
+#: chi-square quantile with one degree of freedom at 99 %: "theta +- delta at 99 %" means a variance
+#: of delta**2 / 6.635.
 CHI_SQUARE_99 = float(stats.chi2.ppf(0.99, 1))
 
 
@@ -76,7 +77,7 @@ def _positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Normal(_FromScipy):
-    """Normal prior with mean ``centre`` and standard deviation ``spread`` (Verbeek 1993, eq. 2.29)."""
+    """Normal with mean ``centre`` and standard deviation ``spread`` (Verbeek 1993, eq. 2.29)."""
 
     centre: float
     spread: float
@@ -112,7 +113,7 @@ class Uniform(_FromScipy):
 
 @dataclass(frozen=True)
 class LogNormal(_FromScipy):
-    """Log-normal prior: ``log(value)`` is normal about ``log(median)`` with standard deviation ``log_spread``."""
+    """Log-normal: ``log(value)`` is normal about ``log(median)``, standard deviation ``log_spread``."""
 
     median: float
     log_spread: float
