@@ -20,6 +20,14 @@ SECOND = np.array([2.0, -5.0, 4.0, -1.0])
 
 
 @dataclass(frozen=True)
+class CubicPlan:
+    """Four nodes and their weights for each of N phases, shapes (4, N)."""
+
+    nodes: NDArray[np.int64]
+    weights: Array
+
+
+@dataclass(frozen=True)
 class BackwardDifferences:
     """Backward differences for dofs of given orders (1 or 2 each)."""
 
@@ -60,20 +68,28 @@ class BackwardDifferences:
                 rows.append(sum(weight * q for weight, q in zip(SECOND, past, strict=True)) / step**2)
         return np.stack(rows, axis=1)
 
-    def sample(self, x: Array, phase: Array, step: float) -> Array:
-        """Values and derivatives at any phases by cubic interpolation between nodes, shape (L, nz, C, N)."""
-        n = x.shape[1]
-        rows = self._node_rows(x, step)
+    def plan(self, phase: Array, n: int) -> CubicPlan:
+        """Nodes around given phases (cycles) and the weights of the cubic through them."""
         scaled = (phase % 1.0) * n
         index = np.floor(scaled).astype(np.int64)
         t = scaled - index
-        weights = (
-            -t * (t - 1) * (t - 2) / 6,
-            (t + 1) * (t - 1) * (t - 2) / 2,
-            -(t + 1) * t * (t - 2) / 2,
-            (t + 1) * t * (t - 1) / 6,
+        weights = np.stack(
+            [
+                -t * (t - 1) * (t - 2) / 6,
+                (t + 1) * (t - 1) * (t - 2) / 2,
+                -(t + 1) * t * (t - 2) / 2,
+                (t + 1) * t * (t - 1) / 6,
+            ]
         )
-        return sum(w * rows[..., (index + k) % n] for k, w in zip((-1, 0, 1, 2), weights, strict=True))
+        return CubicPlan((index + np.arange(-1, 3)[:, None]) % n, weights)
+
+    def sample(self, x: Array, plan: CubicPlan, step: float) -> Array:
+        """Values and derivatives at planned phases by cubic interpolation between nodes, shape (L, nz, C, N)."""
+        rows = self._node_rows(x, step)
+        total = np.zeros((*rows.shape[:3], plan.weights.shape[1]))
+        for nodes, weights in zip(plan.nodes, plan.weights, strict=True):
+            total += weights * rows[..., nodes]
+        return total
 
     def linear(
         self,

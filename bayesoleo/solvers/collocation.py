@@ -19,6 +19,17 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class SamplePlan:
+    """Steps of the mesh, positions inside them and interpolation weights of N phases."""
+
+    index: NDArray[np.int64]
+    position: Array
+    w0: Array
+    w1: Array
+    w2: Array
+
+
+@dataclass(frozen=True)
 class Collocation:
     """A collocation scheme for dofs of given orders.
 
@@ -82,15 +93,22 @@ class Collocation:
         weights = (np.tile(w, (n, 1)) for w in self.method.weights(self.method.c))
         _sample(x[..., None], lanes, index, np.tile(self.method.c, n), *weights, step, self._orders, z[:, :, None])
 
-    def sample(self, x: Array, phase: Array, step: float) -> Array:
-        """Values and derivatives at any phases.
+    def plan(self, phase: Array, n: int) -> SamplePlan:
+        """Where in the mesh given phases (cycles) lie, with their interpolation weights; worth keeping for fixed samples."""
+        scaled = (phase % 1.0) * n
+        index = np.minimum(scaled.astype(np.int64), n - 1)
+        position = scaled - index
+        return SamplePlan(index, position, *self.method.weights(position))
+
+    def sample(self, x: Array, plan: SamplePlan, step: float) -> Array:
+        """Values and derivatives at planned phases.
 
         Parameters
         ----------
         x : ndarray, shape (L, n, w, C)
             Unknowns, or their derivatives, in C columns.
-        phase : ndarray, shape (N,)
-            Cycles.
+        plan : SamplePlan
+            Of N phases.
         step : float
             Length of a step of the mesh, s.
 
@@ -98,14 +116,10 @@ class Collocation:
         -------
         ndarray, shape (L, nz, C, N)
         """
-        n = x.shape[1]
-        scaled = (phase % 1.0) * n
-        index = np.minimum(scaled.astype(np.int64), n - 1)
-        position = scaled - index
         nz = self.state_size + len(self.orders)
-        z = np.empty((x.shape[0], nz, x.shape[3], phase.size))
-        weights = self.method.weights(position)
-        _sample(x, np.arange(x.shape[0]), index, position, *weights, step, self._orders, z)
+        z = np.empty((x.shape[0], nz, x.shape[3], plan.index.size))
+        everyone = np.arange(x.shape[0])
+        _sample(x, everyone, plan.index, plan.position, plan.w0, plan.w1, plan.w2, step, self._orders, z)
         return z
 
     def linear(

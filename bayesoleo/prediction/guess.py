@@ -1,0 +1,54 @@
+"""A first guess of a periodic motion: measured where a dof is measured, declared otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from bayesoleo.model import Model
+from bayesoleo.model.derive import Derived
+from bayesoleo.model.expressions import derivative_symbol, parse, split_derivative, symbol, total_derivative
+from bayesoleo.prediction.inputs import harmonics_of
+from bayesoleo.prediction.records import Record
+
+Array = NDArray[np.float64]
+
+
+def guess_rows(model: Model, derived: Derived, record: Record, constants: Mapping[str, float], phase: Array) -> Array:
+    """Values and derivatives of every dof at phases, shape (nz, N)."""
+    rows = []
+    for dof, order in zip(derived.dofs, derived.orders, strict=True):
+        expression = _measured(model, dof, record) or _declared(model, dof)
+        for _ in range(order + 1):
+            rows.append(_evaluate(expression, record, constants, phase))
+            expression = total_derivative(expression, list(record.harmonics))
+    return np.stack(rows) if rows else np.empty((0, phase.size))
+
+
+def _measured(model: Model, dof: str, record: Record) -> sp.Expr | None:
+    """The channel that measures a dof directly, if there is one."""
+    for channel in model.outputs:
+        if model.output(channel) == symbol(dof) and channel in record.harmonics:
+            return symbol(channel)
+    return None
+
+
+def _declared(model: Model, dof: str) -> sp.Expr:
+    known = {name: symbol(name) for name in (*model.parameters, *model.conditions, *model.inputs)}
+    return parse(model.dofs[dof].guess, known, model.inputs, f"model {model.name!r}, guess of {dof!r}")
+
+
+def _evaluate(expression: sp.Expr, record: Record, constants: Mapping[str, float], phase: Array) -> Array:
+    values = {symbol(name): value for name, value in constants.items()}
+    total = np.zeros(phase.size)
+    moving = [item for item in expression.free_symbols if split_derivative(item)[0] in record.harmonics]
+    columns = []
+    for item in moving:
+        channel, order = split_derivative(item)
+        assert item == derivative_symbol(channel, order)
+        columns.append(harmonics_of(record, channel).evaluate(phase, record.frequency, order))
+    function = sp.lambdify(moving, expression.subs(values), "numpy")
+    return total + np.asarray(function(*columns), dtype=float)

@@ -1,0 +1,49 @@
+"""Rows of inputs and their exact derivatives, at any phase of a record."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import CampaignError
+from bayesoleo.prediction.records import Harmonics, Record
+
+Array = NDArray[np.float64]
+
+
+def harmonics_of(record: Record, channel: str) -> Harmonics:
+    """A channel's periodic representation.
+
+    Raises
+    ------
+    CampaignError
+        If the record lacks the channel.
+    """
+    if channel not in record.harmonics:
+        raise CampaignError(
+            f"the model needs channel {channel!r}",
+            run=record.label,
+            hint=f"channels there are: {', '.join(record.harmonics) or 'none'}",
+        )
+    return record.harmonics[channel]
+
+
+def input_rows(record: Record, rows: tuple[tuple[str, int], ...], phase: Array) -> Array:
+    """Values of input rows ``(channel, derivative)``, shape (nu, N).
+
+    Parameters
+    ----------
+    record : Record
+        A periodic run.
+    rows : tuple of (str, int)
+        As in :class:`~bayesoleo.model.derive.Derived`; the channel ``time`` gives seconds since the first sample.
+    phase : ndarray, shape (N,)
+        Cycles since the first sample.
+    """
+    table = np.empty((len(rows), phase.size))
+    for k, (channel, derivative) in enumerate(rows):
+        if channel == "time":
+            table[k] = phase / record.frequency
+        else:
+            table[k] = harmonics_of(record, channel).evaluate(phase, record.frequency, derivative)
+    return table

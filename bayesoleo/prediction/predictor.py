@@ -1,0 +1,156 @@
+"""Predict all runs of a campaign for one or many vectors of unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.model import Model
+from bayesoleo.model.kernels import kernels
+from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.layout import Layout
+from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.run import RunPredictor, Samples
+from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
+BLOCK = 16
+
+
+@dataclass(frozen=True)
+class RunPrediction:
+    """Prediction of one run at one vector of unknowns.
+
+    Parameters
+    ----------
+    y : ndarray, shape (ny, N)
+        Outputs at the raw samples, SI.
+    sensitivity : ndarray, shape (ny, l, N)
+        Derivatives with respect to all unknowns.
+    status : Status
+    """
+
+    y: Array
+    sensitivity: Array
+    status: Status
+
+
+@numba.njit(nogil=True, cache=True)
+def _squares(measured: Array, y: Array) -> Array:
+    """Sums of squared residuals by lane and output, shape (L, ny); library reductions change their order with the batch."""
+    lanes, outputs, samples = y.shape
+    total = np.zeros((lanes, outputs))
+    for lane in range(lanes):
+        for output in range(outputs):
+            for i in range(samples):
+                residual = measured[output, i] - y[lane, output, i]
+                total[lane, output] += residual * residual
+    return total
+
+
+class Predictor:
+    """A model over the runs of a campaign.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    records : sequence of Record
+        The runs.
+    steps : int
+        Steps of the mesh in a period.
+    scheme : str
+        Discretisation, see :func:`bayesoleo.solvers.schemes.scheme`.
+    backend : {"numba", "numpy"}
+        Kernels; NumPy's are ready at once.
+    jobs : int, optional
+        Threads.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        records: Sequence[Record],
+        *,
+        steps: int = 256,
+        scheme: str = DEFAULT_SCHEME,
+        backend: str = "numba",
+        jobs: int | None = None,
+    ):
+        self.model, self.records, self.steps, self.scheme, self.jobs = model, tuple(records), steps, scheme, jobs
+        self.backend = backend
+        self.layout = Layout.of(model, [record.label for record in records])
+        compiled = kernels(model, self.layout.active, backend)
+        self.outputs = compiled.derived.outputs
+        build = _Builder(model, compiled, steps, scheme)
+        self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
+        self._base = np.stack([run.base_constants() for run in self.runs])
+
+    def constants(self, theta: Array, run: int) -> Array:
+        """Model constants of a run, shape (L, np), from unknowns of shape (L, l)."""
+        p = np.repeat(self._base[run][None], theta.shape[0], axis=0)
+        p[:, self.runs[run].active] = theta[:, self.layout.columns[run]]
+        return p
+
+    def set_anchor(self, theta: Array) -> list[Status]:
+        """Solve every run at ``theta (l,)`` and start later solutions from there."""
+        work = range(len(self.runs))
+        return thread_map(lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs)
+
+    def predict(self, theta: Array) -> list[RunPrediction]:
+        """Outputs and sensitivities of every run at ``theta (l,)``."""
+        return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)
+
+    def _predict_run(self, theta: Array, r: int) -> RunPrediction:
+        samples = self.runs[r].predict(self.constants(theta[None], r), derivatives=True)
+        assert samples.y_p is not None
+        _, ny, _, count = samples.y_p.shape
+        sensitivity = np.zeros((ny, theta.size, count))
+        sensitivity[:, self.layout.columns[r]] = samples.y_p[0]
+        return RunPrediction(samples.y[0], sensitivity, Status(int(samples.status[0])))
+
+    def simulate(self, theta: Array, r: int) -> Samples:
+        """Outputs of run number ``r`` for many vectors, shape (L, l)."""
+        return self.runs[r].predict(self.constants(theta, r))
+
+    def sum_of_squares(self, theta: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Sums of squared residuals, shape (L, N, ny), and the status of each vector, shape (L,).
+
+        The work is cut into blocks of runs and vectors; every vector's result is computed from its own lane in a fixed order, so
+        neither the cut nor the threads change a bit of it.
+        """
+        count, runs = theta.shape[0], len(self.runs)
+        total = np.full((count, runs, len(self.outputs)), np.nan)
+        status = np.zeros((count, runs), dtype=np.int64)
+        blocks = [(r, slice(k, min(k + BLOCK, count))) for r in range(runs) for k in range(0, count, BLOCK)]
+
+        def work(task: tuple[int, slice]) -> None:
+            r, block = task
+            samples = self.simulate(theta[block], r)
+            total[block, r] = _squares(self.runs[r].measured, samples.y)
+            status[block, r] = samples.status
+
+        thread_map(work, blocks, self.jobs)
+        worst = status.max(axis=1, initial=0)
+        total[worst != Status.CONVERGED.value] = np.nan
+        return total, worst
+
+
+@dataclass(frozen=True)
+class _Builder:
+    """Builds the predictor of one run; a class because threads need no more than a callable."""
+
+    model: Model
+    compiled: object
+    steps: int
+    scheme: str
+
+    def __call__(self, record: Record) -> RunPredictor:
+        return RunPredictor(self.model, self.compiled, record, self.steps, self.scheme)  # type: ignore[arg-type]

@@ -1,0 +1,227 @@
+"""Predict one run: solve the model under the run's inputs and evaluate outputs at its raw samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import CampaignError
+from bayesoleo.model import Model
+from bayesoleo.model.kernels import Kernels
+from bayesoleo.prediction.guess import guess_rows
+from bayesoleo.prediction.inputs import input_rows
+from bayesoleo.prediction.records import Record
+from bayesoleo.solvers.continuation import solve_from_guess
+from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities, solve_periodic
+from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: A start extrapolated too far is retried along a path of this many pieces.
+PATH_PIECES = (4, 16)
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A solution with derivatives, from which others start: ``x + x_p (p - p0)``.
+
+    Frozen before sampling, it makes a solution a function of its own parameters alone.
+    """
+
+    p: Array
+    x: Array
+    x_p: Array
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Predicted outputs of one run.
+
+    Parameters
+    ----------
+    y : ndarray, shape (L, ny, N)
+        At the raw samples, SI; NaN where the solve failed.
+    y_p : ndarray, shape (L, ny, na, N), or None
+        Derivatives with respect to the active parameters.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers.status.Status`.
+    """
+
+    y: Array
+    y_p: Array | None
+    status: NDArray[np.int64]
+
+
+class RunPredictor:
+    """One run of one model; all arrays that do not depend on parameters are computed once.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    kernels : Kernels
+        Of that model.
+    record : Record
+        A periodic run.
+    steps : int
+        Steps of the mesh.
+    scheme_name : str
+        Discretisation.
+    """
+
+    def __init__(self, model: Model, kernels: Kernels, record: Record, steps: int, scheme_name: str):
+        self.model, self.kernels, self.record, self.steps = model, kernels, record, steps
+        derived = kernels.derived
+        self._check(record)
+        self.scheme = scheme(scheme_name, derived.orders)
+        self.period = 1.0 / record.frequency
+        self.points = self.scheme.phases(steps)
+        self.boundary = Boundary(
+            equations=kernels,
+            scheme=self.scheme,
+            period=self.period,
+            inputs=input_rows(record, derived.inputs, self.points),
+            conditions=len(derived.admissible),
+            active=len(derived.active),
+        )
+        self.plan = self.scheme.plan(record.phase, steps) if derived.dofs else None
+        self.sample_inputs = input_rows(record, derived.inputs, record.phase)
+        self.measured = np.stack([record.samples[name] for name in derived.outputs])
+        self.anchor: Anchor | None = None
+        self.active = np.array([derived.constants.index(name) for name in derived.active], dtype=np.int64)
+
+    def _check(self, record: Record) -> None:
+        missing = [name for name in (*self.model.inputs, *self.model.outputs) if name not in record.samples]
+        if missing:
+            raise CampaignError(
+                f"model {self.model.name!r} needs channel {missing[0]!r}, which the campaign lacks",
+                run=record.label,
+                hint=f"channels there are: {', '.join(record.samples)}",
+            )
+        for name, condition in self.model.conditions.items():
+            if name not in record.conditions and condition.default is None:
+                raise CampaignError(
+                    f"model {self.model.name!r} needs condition {name!r}",
+                    run=record.label,
+                    hint=f'write {name} = {{ value = …, unit = "{condition.unit}" }} under [runs.conditions]',
+                )
+
+    def base_constants(self) -> Array:
+        """Nominal parameters and this run's conditions, shape (np,)."""
+        values = []
+        for name in self.kernels.derived.constants:
+            if name in self.model.parameters:
+                values.append(self.model.parameters[name].value)
+            else:
+                default = self.model.conditions[name].default
+                values.append(self.record.conditions.get(name, np.nan if default is None else default))
+        return np.array(values)
+
+    # -- solving ----------------------------------------------------------------------------------------------------------
+
+    def guess(self, p: Array) -> Array:
+        """First guess of the unknowns, shape (1, n, w)."""
+        derived = self.kernels.derived
+        constants = dict(zip(derived.constants, p, strict=True))
+        nodes = np.arange(self.steps) / self.steps
+        at_nodes = guess_rows(self.model, derived, self.record, constants, nodes)
+        at_points = guess_rows(self.model, derived, self.record, constants, self.points)
+        return self.scheme.from_motion(at_nodes[None], at_points[None])
+
+    def set_anchor(self, p: Array) -> Status:
+        """Solve at constants ``p (np,)`` and keep the solution as the start of later ones."""
+        if not self.kernels.derived.dofs:
+            return Status.CONVERGED
+        solution = self._from_anchor(p[None]) if self.anchor is not None else None
+        if solution is None or solution.status[0] != Status.CONVERGED.value:
+            solution = solve_from_guess(self.boundary, p[None], self.guess(p))
+        if solution.status[0] == Status.CONVERGED.value:
+            solution, x_p, _ = sensitivities(self.boundary, p[None], solution)
+            if solution.status[0] == Status.CONVERGED.value:
+                self.anchor = Anchor(p.copy(), solution.x[0], x_p[0])
+        return Status(int(solution.status[0]))
+
+    def _from_anchor(self, p: Array) -> Solution:
+        anchor = self.anchor
+        assert anchor is not None
+        change = p[:, self.active] - anchor.p[self.active]
+        start = np.repeat(anchor.x[None], p.shape[0], axis=0)
+        for k in range(change.shape[1]):  # not a matrix product: its order of summation varies with the batch
+            start += change[:, k, None, None] * anchor.x_p[:, :, k]
+        solution = solve_periodic(self.boundary, p, start)
+        for pieces in PATH_PIECES:
+            failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
+            for lane in failed:
+                solution = self._along_path(p, solution, lane, pieces)
+        return solution
+
+    def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:
+        """Walk from the anchor to one lane's parameters in equal pieces."""
+        anchor = self.anchor
+        assert anchor is not None
+        x = anchor.x[None]
+        for fraction in np.linspace(0.0, 1.0, pieces + 1)[1:]:
+            between = anchor.p + fraction * (p[lane] - anchor.p)
+            trial = solve_periodic(self.boundary, between[None], x, max_iterations=15)
+            if trial.status[0] != Status.CONVERGED.value:
+                return solution
+            x = trial.x
+        result, status = solution.x.copy(), solution.status.copy()
+        result[lane], status[lane] = x[0], Status.CONVERGED.value
+        return replace(solution, x=result, status=status)
+
+    def solve(self, p: Array) -> Solution:
+        """Periodic solutions for constants ``p (L, np)``; the anchor must be set."""
+        if self.anchor is None:
+            count = p.shape[0]
+            failed = np.full(count, Status.NO_CONVERGENCE.value, dtype=np.int64)
+            empty = np.zeros((count, self.steps, self.scheme.width))
+            return Solution(empty, failed, np.zeros(count, dtype=np.int64))
+        return self._from_anchor(p)
+
+    # -- predicting -------------------------------------------------------------------------------------------------------
+
+    def predict(self, p: Array, *, derivatives: bool = False) -> Samples:
+        """Outputs at the raw samples for constants ``p (L, np)``."""
+        derived, count = self.kernels.derived, p.shape[0]
+        samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
+        x_p: Array | None = None
+        if derived.dofs:
+            solution = self.solve(p)
+            if derivatives:
+                solution, x_p, _ = sensitivities(self.boundary, p, solution)
+            status = solution.status
+            z = self.scheme.sample(solution.x[..., None], self.plan, self.boundary.step(self.steps))[:, :, 0]
+        else:
+            status, z = np.zeros(count, dtype=np.int64), np.empty((count, 0, samples))
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        y = np.full((count, ny, samples), np.nan)
+        with np.errstate(all="ignore"):
+            self.kernels.output(z, self.sample_inputs, p, lanes, y)
+        status = self._judge(status, z, p, y, lanes)
+        if not derivatives:
+            return Samples(y, None, status)
+        yz, yp = np.zeros((count, ny, z.shape[1], samples)), np.zeros((count, ny, na, samples))
+        with np.errstate(all="ignore"):
+            self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
+        if x_p is not None:
+            z_p = self.scheme.sample(x_p, self.plan, self.boundary.step(self.steps))
+            yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
+        return Samples(y, yp, status)
+
+    def _judge(self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
+        status = status.copy()
+        finite = np.isfinite(y[lanes]).all(axis=(1, 2))
+        status[lanes[~finite]] = Status.NOT_FINITE.value
+        if self.boundary.conditions:
+            a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
+            with np.errstate(all="ignore"):
+                self.kernels.admissible(z, self.sample_inputs, p, lanes, a)
+            inside = (a[lanes] > 0).all(axis=(1, 2))
+            status[lanes[~inside]] = Status.INADMISSIBLE.value
+        y[status != Status.CONVERGED.value] = np.nan
+        return status
