@@ -6,12 +6,36 @@ import difflib
 from collections.abc import Collection, Iterable
 from functools import cache
 
-from bayesoleo.effects import contact, damping, force, friction, memory, stiffness
+from bayesoleo.effects import (
+    compliance,
+    contact,
+    damping,
+    force,
+    friction,
+    gas,
+    memory,
+    run_to_run,
+    sensor,
+    stiffness,
+    thermal,
+)
 from bayesoleo.effects.effect import Candidate, Effect, Scales
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 
-_MODULES = (damping, friction, memory, stiffness, contact, force)
+_MODULES = (
+    damping,
+    friction,
+    memory,
+    stiffness,
+    contact,
+    force,
+    gas,
+    thermal,
+    compliance,
+    sensor,
+    run_to_run,
+)
 
 
 @cache

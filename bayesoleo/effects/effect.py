@@ -104,8 +104,8 @@ class Amplitude:
     name : str
         As the effect's expression calls it.
     unit : str
-        May use the words ``force`` (of the balance), ``position`` and ``channel`` for the units of
-        the place, e.g.
+        May use the words ``force`` (of the balance), ``position``, ``channel`` and ``parameter``
+        for the units of the place, e.g.
         ``force/position**3``.
     latex, description : str
         For reports.
@@ -226,17 +226,19 @@ class Effect:
             raise InputError(f"effect {self.id}: no parameters", hint="state at least one")
 
     @property
+    def _parts(self) -> tuple[Amplitude | Shape | Constant, ...]:
+        return (*self.amplitudes, *self.shapes, *self.constants)
+
+    @property
     def units(self) -> dict[str, str]:
         """Units of all new parameters, in words of the place."""
-        parts = (*self.amplitudes, *self.shapes, *self.constants)
-        return {part.name: part.unit for part in parts}
+        return {part.name: part.unit for part in self._parts}
 
     def names(self, model: Model, target: str) -> dict[str, str]:
         """Parameter names in the model by names in the effect, before collisions are resolved."""
         many = self.own_name_per_target or len(self.places(model)) > 1
         suffix = "_" + re.sub(r"\W+", "_", target) if many else ""
-        parts = (*self.amplitudes, *self.shapes, *self.constants)
-        return {part.name: _with_prefix(self.id, part.name) + suffix for part in parts}
+        return {part.name: _with_prefix(self.id, part.name) + suffix for part in self._parts}
 
     def is_in(self, model: Model, target: str) -> bool:
         """Whether this effect has been added at this target before."""

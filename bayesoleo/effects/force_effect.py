@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import sympy as sp
@@ -179,12 +179,9 @@ def _names_in(text: str, effect: str) -> set[str]:
     except SyntaxError as error:
         hint = "write it as in Python, e.g. k*position**3"
         raise InputError(f"effect {effect}: not an expression", value=text, hint=hint) from error
-    called = {node.func.id for node in ast.walk(tree) if _is_named_call(node)}
+    calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    called = {function.id for function in calls if isinstance(function, ast.Name)}
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)} - called
-
-
-def _is_named_call(node: ast.AST) -> bool:
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
 
 
 def _check_declared(used: set[str], own: set[str], effect: str) -> None:
@@ -195,7 +192,9 @@ def _check_declared(used: set[str], own: set[str], effect: str) -> None:
         raise InputError(f"effect {effect}: unknown name", value=name, hint=hint)
 
 
-def _places_for(used: set[str], requires: tuple[str, ...]):  # type: ignore[no-untyped-def]
+def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], tuple[str, ...]]:
+    """Where an expression that uses these names makes sense."""
+
     def places(model: Model) -> tuple[str, ...]:
         if not is_quantity(model, *requires):
             return ()
@@ -224,7 +223,11 @@ def _pressure(model: Model) -> sp.Symbol | None:
     return None
 
 
-def _adding_term(effect: str, expression: str, states: Mapping[str, State]):  # type: ignore[no-untyped-def]
+def _adding_term(
+    effect: str, expression: str, states: Mapping[str, State]
+) -> Callable[[Model, str, Names], Model]:
+    """The change that adds the states and the force."""
+
     def change(model: Model, target: str, names: Names) -> Model:
         place = force_places(model)[target]
         dofs = {own: free_name(f"{effect}_{own}", model) for own in states}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
 
 import sympy as sp
 
 from bayesoleo.model import Coordinate, Model
-from bayesoleo.model.expressions import derivative_symbol, split_derivative, symbol
+from bayesoleo.model.expressions import derivative_symbol, split_derivative
 
 
 def force_places(model: Model) -> dict[str, Coordinate]:
@@ -92,9 +94,8 @@ def is_quantity(model: Model, *names: str) -> bool:
     return known.issuperset(names)
 
 
-def substitute(model: Model, table: dict[sp.Symbol, sp.Expr]) -> Model:
+def substitute(model: Model, table: Mapping[sp.Symbol, sp.Expr]) -> Model:
     """Replace symbols everywhere in a model: definitions, equations, outputs, admissible region."""
-    from dataclasses import replace
 
     def swap(expression: sp.Expr) -> sp.Expr:
         return expression.xreplace(table)
@@ -114,8 +115,3 @@ def substitute(model: Model, table: dict[sp.Symbol, sp.Expr]) -> Model:
         },
         admissible=[swap(e) for e in model.admissible],
     )
-
-
-def quantity(name: str) -> sp.Symbol:
-    """Symbol of a declared name."""
-    return symbol(name)

@@ -122,13 +122,14 @@ class TargetUnits:
     words: dict[str, str]
 
     def resolve(self, text: str) -> str:
-        """Replace the words ``force``, ``position`` and ``channel``; empty for a plain number."""
+        """Replace the words ``force``, ``position``, ``channel`` and ``parameter``."""
 
         def unit(match: re.Match[str]) -> str:
             word = self.words.get(match.group(), "") or "dimensionless"
-            return word if word.isidentifier() else f"({word})"
+            alone = word.isidentifier() or match.group() == text
+            return word if alone else f"({word})"
 
-        composed = re.sub(r"\b(force|position|channel)\b", unit, text)
+        composed = re.sub(r"\b(force|position|channel|parameter)\b", unit, text)
         if parse_unit(composed) == parse_unit(""):
             return ""
         if "dimensionless" in composed:
@@ -137,11 +138,13 @@ class TargetUnits:
 
 
 def target_units(model: Model, target: str) -> TargetUnits:
-    """Units of the balance and the position at a target, and of the channel if it is one."""
-    words = {}
+    """Units at a target: of the balance and the position, of the channel, of the parameter."""
+    words: dict[str, str] = {}
     name, _, coordinate = target.partition("/")
     if name in model.dofs:
         words |= {"force": balance_unit(model, name), "position": model.dofs[name].unit}
+    if name in model.parameters:
+        words |= {"parameter": model.parameters[name].unit}
     if name in model.inputs:
         words |= {"channel": model.inputs[name]}
     if name in model.outputs:

@@ -1,7 +1,8 @@
 """Prior densities of single parameters.
 
 The kinds are those of Verbeek (1993), section 2.2.4 - uniform within absolute bounds, normal, and
-normal read as a 99 % band - and the log-normal and truncated normal that positive physical quantities ask for.
+normal read as a 99 % band - and the log-normal and truncated normal that positive quantities ask
+for.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class Uniform(_FromScipy):
 
 @dataclass(frozen=True)
 class LogNormal(_FromScipy):
-    """Log-normal: ``log(value)`` is normal about ``log(median)``, standard deviation ``log_spread``."""
+    """Log-normal: ``log(value)`` is normal about ``log(median)``, spread ``log_spread``."""
 
     median: float
     log_spread: float

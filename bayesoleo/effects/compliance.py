@@ -1,0 +1,93 @@
+"""Compliance in series: the frame gives, so what is measured is not what moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sympy as sp
+
+from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
+from bayesoleo.effects.places import force_places, substitute
+from bayesoleo.model import Coordinate, Dof, Model
+from bayesoleo.model.expressions import (
+    derivative_symbol,
+    partial,
+    split_derivative,
+    symbol,
+)
+
+#: Inputs have exact derivatives; laws use at most this many.
+_DERIVATIVES = 5
+
+
+def _places(model: Model) -> Sequence[str]:
+    found = force_places(model)
+    return tuple(
+        name
+        for name, place in found.items()
+        if place.kind == "output" or (_shown_at(model, place) and _external(model, place) != 0)
+    )
+
+
+def _shown_at(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
+    """Outputs that show the position itself, up to a constant factor, and that factor."""
+    moving = {*model.dofs, *model.inputs}
+    found = {}
+    for name in model.outputs:
+        slope = sp.diff(model.output(name), place.position)
+        if slope != 0 and not any(split_derivative(i)[0] in moving for i in slope.free_symbols):
+            found[name] = slope
+    return found
+
+
+def _external(model: Model, place: Coordinate) -> sp.Expr:
+    """The force that inputs exert in the balance at a place."""
+    equation = model.equation(place.target)
+    inputs = (symbol(name) for name in model.inputs)
+    return -place.sign * sp.Add(*(partial(equation, item) * item for item in inputs))
+
+
+def _yield(model: Model, target: str, names: Names) -> Model:
+    place = force_places(model)[target]
+    if place.kind == "output":
+        return _yield_in_law(model, place, names["frame_compliance"])
+    give = names["frame_compliance"] * _external(model, place)
+    for name, slope in _shown_at(model, place).items():
+        model = model.with_term("output", name, "frame_compliance", slope * give)
+    return model
+
+
+def _yield_in_law(model: Model, place: Coordinate, compliance: sp.Symbol) -> Model:
+    """A force law behind a spring: it feels z with z + c F(z, dz/dt) = x, regular at c = 0."""
+    inner = free_name(f"{place.name}_inside", model)
+    table = {
+        derivative_symbol(place.name, n): derivative_symbol(inner, n) for n in range(_DERIVATIVES)
+    }
+    # Sum of the named terms: definitions keep their names.
+    swapped = substitute(model, table)
+    force = sp.Add(*swapped.output_terms(place.target).values())
+    dof = Dof(model.inputs[place.name], symbol(place.name), f"{place.name} behind the frame")
+    equation = {
+        "inside": symbol(inner),
+        "frame": compliance * force,
+        "outside": -symbol(place.name),
+    }
+    return swapped.with_dof(inner, dof, equation)
+
+
+FRAME = Effect(
+    id="frame_compliance",
+    family="compliance",
+    title="Frame that gives, in series",
+    formula="x = q + c F",
+    amplitudes=(
+        Amplitude(
+            "frame_compliance", "position/force", "c", "displacement of the frame a force", 1
+        ),
+    ),
+    places=_places,
+    change=_yield,
+    applies_to="force laws, and models that show a position that a force moves",
+)
+
+EFFECTS = (FRAME,)

@@ -1,0 +1,223 @@
+r"""The gas law: solubility, compliant oil and cylinder, volume, pressure and exponent.
+
+A model has a gas spring that these effects know if it declares, under these names,
+
+========================= ============================================================
+``volume_ratio``          definition: gas volume over ``initial_volume``
+``free_volume_ratio``     definition: the same, corrected for dissolved gas
+``temperature_ratio``     definition: gas temperature over ``ambient_temperature``, or 1
+``gas_pressure``          definition: absolute pressure, Pa
+``initial_volume``        parameter, m³
+``initial_pressure``      condition or parameter: absolute, Pa, at volume ratio one
+``ambient_temperature``   condition or parameter, K
+``ambient_pressure``      parameter or condition, Pa (for the thermal effects; optional)
+========================= ============================================================
+
+as the oleos of :mod:`bayesoleo.systems.oleo` do, each definition in terms of those before it.
+
+References
+----------
+Verbeek (1993), eqs. 6.1-6.4 and section 7.3 (the five causes behind "solubility").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import sympy as sp
+
+from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
+from bayesoleo.effects.places import is_quantity, substitute
+from bayesoleo.model import Dof, Model
+from bayesoleo.model.expressions import symbol
+
+_ROLES = ("volume_ratio", "free_volume_ratio", "temperature_ratio", "gas_pressure")
+
+
+def has_gas(model: Model, *more: str) -> bool:
+    """Whether a model declares a gas spring, and further names."""
+    return all(name in model.definitions for name in _ROLES) and is_quantity(model, *more)
+
+
+def _where(target: str, *more: str) -> Callable[[Model], Sequence[str]]:
+    return lambda model: (target,) if has_gas(model, *more) else ()
+
+
+# -- solubility ------------------------------------------------------------------------------------
+
+
+def _undissolved(model: Model) -> Sequence[str]:
+    """Models whose free volume is the whole volume."""
+    if not has_gas(model):
+        return ()
+    whole = model.expand(symbol("free_volume_ratio")) == model.expand(symbol("volume_ratio"))
+    return ("free_volume_ratio",) if whole else ()
+
+
+def _dissolve(model: Model, target: str, names: Names) -> Model:
+    r"""With :math:`\sigma = \theta_7 T_0` and n = 1 this is Verbeek (1993), eq. 6.4:
+
+    p = p0 (1/T0 + theta7) T / (v + theta7 T) = p0 (T/T0) / ((v + sigma T/T0) / (1 + sigma)).
+    """
+    sigma = names["gas_solubility"]
+    body = symbol("volume_ratio") + sigma * symbol("temperature_ratio")
+    return model.with_definition(target, body / (1 + sigma))
+
+
+SOLUBILITY = Effect(
+    id="gas_solubility",
+    family="gas",
+    title="Gas that dissolves as pressure rises",
+    formula=r"p = p_0 \frac{T}{T_0} \left(\frac{v + \sigma T/T_0}{1 + \sigma}\right)^{-n},"
+    r" \quad \sigma = -\frac{dn}{dp} \frac{R T_0}{V_0}",
+    amplitudes=(
+        Amplitude("gas_solubility", "", r"\sigma", "dissolved over free gas, by pressure", 1),
+    ),
+    places=_undissolved,
+    change=_dissolve,
+    source="Verbeek (1993), eq. 6.4",
+    applies_to="gas springs without solubility",
+)
+
+
+# -- volume that follows pressure ------------------------------------------------------------------
+
+
+def _compliant(
+    id: str,  # noqa: A002
+    title: str,
+    formula: str,
+    latex: str,
+    description: str,
+    weight: Callable[[], sp.Expr],
+) -> Effect:
+    """Gas volume that grows with pressure.
+
+    Pressure depends on volume and volume on pressure, so the added volume is a dof of its own, with
+    an algebraic equation ``u = c w (p - p0) / V0`` that is regular at the null ``c = 0``.
+    """
+
+    def change(model: Model, target: str, names: Names) -> Model:
+        dof = free_name(f"{id}_ratio", model)
+        added = symbol(dof)
+        compliance = names[id] * weight()
+        pressure = symbol("gas_pressure") - symbol("initial_pressure")
+        wider = model.definitions[target] + added
+        unit = Dof("", 0.0, "added gas volume over initial volume")
+        follow = -compliance * pressure / symbol("initial_volume")
+        return model.with_dof(dof, unit, {"volume": added, "pressure": follow}).with_definition(
+            target, wider
+        )
+
+    return Effect(
+        id=id,
+        family="gas",
+        title=title,
+        formula=formula,
+        amplitudes=(Amplitude(id, "m**3/Pa", latex, description, 1),),
+        places=_where("volume_ratio", "initial_volume", "initial_pressure"),
+        change=change,
+        source="Verbeek (1993), section 7.3",
+        applies_to="gas springs",
+    )
+
+
+OIL_COMPRESSIBILITY = _compliant(
+    "oil_compressibility",
+    "Oil that gives under pressure",
+    r"v = 1 - \frac{A_p q - c_o (p - p_0)}{V_0}",
+    "c_o",
+    "oil volume lost a pressure",
+    lambda: sp.Integer(1),
+)
+
+CYLINDER_EXPANSION = _compliant(
+    "cylinder_expansion",
+    "Cylinder that widens around the gas",
+    r"v = (1 - A_p q / V_0) \left(1 + c_c \frac{p - p_0}{V_0}\right)",
+    "c_c",
+    "volume of the whole gas space gained a pressure",
+    lambda: symbol("free_volume_ratio"),
+)
+
+
+# -- volume, pressure, exponent --------------------------------------------------------------------
+
+
+def _replacing(name: str, own: str, factor: bool) -> Callable[[Model, str, Names], Model]:
+    """Replace a quantity by itself plus (or times one plus) the new parameter, everywhere."""
+
+    def change(model: Model, target: str, names: Names) -> Model:
+        old = symbol(name)
+        return substitute(model, {old: old * (1 + names[own]) if factor else old + names[own]})
+
+    return change
+
+
+EXTRA_VOLUME = Effect(
+    id="extra_volume",
+    family="gas",
+    title="More gas volume than stated (gauge, lines)",
+    formula=r"V_0 + V_e",
+    amplitudes=(Amplitude("extra_volume", "m**3", "V_e", "volume beyond the initial volume"),),
+    places=_where("initial_volume", "initial_volume"),
+    change=_replacing("initial_volume", "extra_volume", factor=False),
+    source="Verbeek (1993), section 7.3",
+    applies_to="gas springs",
+)
+
+PRESSURE_ERROR = Effect(
+    id="initial_pressure_error",
+    family="gas",
+    title="Error of the initial pressure, the same in all runs",
+    formula=r"p_0 (1 + \epsilon)",
+    amplitudes=(Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),),
+    places=_where("initial_pressure", "initial_pressure"),
+    change=_replacing("initial_pressure", "initial_pressure_error", factor=True),
+    applies_to="gas springs",
+)
+
+PRESSURE_ERROR_BY_RUN = Effect(
+    id="initial_pressure_by_run",
+    family="gas",
+    title="Error of the initial pressure by run (leakage, drift)",
+    formula=r"p_0 (1 + \epsilon_r)",
+    amplitudes=(
+        Amplitude(
+            "initial_pressure_by_run", "", r"\epsilon_r", "relative error of p_0", by_run=True
+        ),
+    ),
+    places=_where("initial_pressure", "initial_pressure"),
+    change=_replacing("initial_pressure", "initial_pressure_by_run", factor=True),
+    applies_to="gas springs",
+)
+
+
+def _steepen(model: Model, target: str, names: Names) -> Model:
+    factor = symbol("free_volume_ratio") ** (-names["gas_exponent_error"])
+    return model.with_definition(target, model.definitions[target] * factor)
+
+
+EXPONENT = Effect(
+    id="gas_exponent_error",
+    family="gas",
+    title="Another exponent of the gas law",
+    formula=r"p \, v^{-\delta n}",
+    amplitudes=(
+        Amplitude("gas_exponent_error", "", r"\delta n", "exponent beyond that of the model"),
+    ),
+    places=_where("gas_pressure"),
+    change=_steepen,
+    source="Verbeek (1993), eq. 6.2",
+    applies_to="gas springs",
+)
+
+EFFECTS = (
+    SOLUBILITY,
+    OIL_COMPRESSIBILITY,
+    CYLINDER_EXPANSION,
+    EXTRA_VOLUME,
+    PRESSURE_ERROR,
+    PRESSURE_ERROR_BY_RUN,
+    EXPONENT,
+)

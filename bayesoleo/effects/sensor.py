@@ -1,0 +1,127 @@
+r"""Sensors: offset, gain, lag and drift of a channel.
+
+A channel shows :math:`m` where the model says :math:`y`. Of an output the expression changes;
+of an input, which *is* what was measured, the model's own quantity is got back from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import sympy as sp
+
+from bayesoleo.effects.effect import Amplitude, Effect, Names
+from bayesoleo.effects.places import substitute
+from bayesoleo.model import Model, possible_drives
+from bayesoleo.model.expressions import (
+    TIME,
+    derivative_symbol,
+    split_derivative,
+    total_derivative,
+)
+
+_DERIVATIVES = 4
+
+
+def _channels(model: Model) -> Sequence[str]:
+    return (*model.inputs, *model.outputs)
+
+
+def _correct_input(
+    model: Model, channel: str, true: Callable[[sp.Expr, sp.Expr], sp.Expr]
+) -> Model:
+    """Replace an input and its derivatives by ``true(x, dx/dt)`` and the derivatives of that."""
+    table = {}
+    for order in range(_DERIVATIVES):
+        now, next_ = (derivative_symbol(channel, order + more) for more in (0, 1))
+        shown = true(now, next_)
+        # A constant offset leaves derivatives alone.
+        table[now] = shown if order == 0 else shown - true(sp.Integer(0), sp.Integer(0))
+    return substitute(model, table)
+
+
+def _offset(model: Model, channel: str, names: Names) -> Model:
+    offset = names["sensor_offset"]
+    if channel in model.inputs:
+        return _correct_input(model, channel, lambda x, rate: x - offset)
+    return model.with_term("output", channel, "sensor_offset", offset)
+
+
+def _gain(model: Model, channel: str, names: Names) -> Model:
+    gain = names["sensor_gain"]
+    if channel in model.inputs:
+        return _correct_input(model, channel, lambda x, rate: x / (1 + gain))
+    whole = sp.Add(*model.output_terms(channel).values())
+    return model.with_term("output", channel, "sensor_gain", gain * whole)
+
+
+def _lag(model: Model, channel: str, names: Names) -> Model:
+    lag = names["sensor_lag"]
+    if channel in model.inputs:
+        return _correct_input(model, channel, lambda x, rate: x + lag * rate)
+    return model.with_term("output", channel, "sensor_lag", -lag * _rate(model, channel))
+
+
+def _rate(model: Model, channel: str) -> sp.Expr:
+    return total_derivative(model.output(channel), (*model.dofs, *model.inputs))
+
+
+def _laggable(model: Model) -> Sequence[str]:
+    """Channels whose rate exists: an output that shows an acceleration has none."""
+
+    def exists(channel: str) -> bool:
+        found = map(split_derivative, _rate(model, channel).free_symbols)
+        return all(name not in model.dofs or n <= model.order(name) for name, n in found)
+
+    return tuple(name for name in _channels(model) if name in model.inputs or exists(name))
+
+
+def _drift(model: Model, channel: str, names: Names) -> Model:
+    return model.with_term("output", channel, "sensor_drift", names["sensor_drift"] * TIME)
+
+
+def _driftable(model: Model) -> Sequence[str]:
+    """Outputs that can not be an input: a periodic state cannot follow what drifts."""
+    return tuple(name for name in model.outputs if name not in possible_drives(model))
+
+
+def _sensor(
+    id: str,  # noqa: A002
+    title: str,
+    formula: str,
+    unit: str,
+    latex: str,
+    places: Callable[[Model], Sequence[str]],
+    change: Callable[[Model, str, Names], Model],
+) -> Effect:
+    return Effect(
+        id=id,
+        family="sensor",
+        title=title,
+        formula=formula,
+        amplitudes=(Amplitude(id, unit, latex, title[0].lower() + title[1:]),),
+        places=places,
+        change=change,
+        applies_to="outputs" if id == "sensor_drift" else "every channel",
+        own_name_per_target=True,
+    )
+
+
+OFFSET = _sensor(
+    "sensor_offset", "Offset of a sensor", "m = y + b", "channel", "b", _channels, _offset
+)
+GAIN = _sensor("sensor_gain", "Gain error of a sensor", "m = (1 + g) y", "", "g", _channels, _gain)
+LAG = _sensor(
+    "sensor_lag",
+    "Lag of a sensor, channels misaligned in time",
+    r"m(t) = y(t - \tau) \approx y - \tau \dot y",
+    "s",
+    r"\tau",
+    _laggable,
+    _lag,
+)
+DRIFT = _sensor(
+    "sensor_drift", "Drift of a sensor", "m = y + d t", "channel/s", "d", _driftable, _drift
+)
+
+EFFECTS = (OFFSET, GAIN, LAG, DRIFT)
