@@ -1,0 +1,32 @@
+"""How a result is shown as figures: each function takes the DataTree and returns one Figure.
+
+Figures are made without pyplot, hence without global state: they can be drawn in threads and on
+machines without a display, and are saved with ``figure.savefig(path)``.
+"""
+
+from bayesoleo.plots.corners import corner
+from bayesoleo.plots.errors import error
+from bayesoleo.plots.fits import fit
+from bayesoleo.plots.forest import point_against_posterior
+from bayesoleo.plots.predictions import predictive
+from bayesoleo.plots.rankings import ranking
+from bayesoleo.plots.records import records
+from bayesoleo.plots.residuals import residual
+from bayesoleo.plots.traces import trace
+from bayesoleo.plots.units import Scale, engineering, format_unit, format_value
+
+__all__ = [
+    "Scale",
+    "corner",
+    "engineering",
+    "error",
+    "fit",
+    "format_unit",
+    "format_value",
+    "point_against_posterior",
+    "predictive",
+    "ranking",
+    "records",
+    "residual",
+    "trace",
+]

@@ -1,0 +1,163 @@
+"""The error before and after, run by run, over the noise floor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from bayesoleo import schema
+from bayesoleo.plots import reading, style
+from bayesoleo.plots.units import engineering
+
+LEFT, TOP, BOTTOM, ROW = 1.9, 0.85, 0.6, 0.3
+
+
+def error(tree: xr.DataTree) -> Figure:
+    """Repeating error over its noise for each run, before and after, one column for each output.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Its ``summary`` attribute is read: the first round is before, the last is after.
+
+    Returns
+    -------
+    Figure
+        On a logarithmic axis; at 1 nothing is missing. Where no run has a noise floor, as with
+        transients, the rms of the raw residual is shown instead.
+    """
+    rounds = reading.summary(tree)["rounds"]
+    first, last = rounds[0]["error"], rounds[-1]["error"]
+    labels = _order(first)
+    height = TOP + ROW * len(labels) + BOTTOM
+    figure = style.blank(style.WIDTH, height)
+    wide = (style.WIDTH - LEFT - 0.15) / max(len(first), 1)
+    for column, output in enumerate(first):
+        x = (LEFT + column * wide) / style.WIDTH
+        box = (x, BOTTOM / height, 0.93 * wide / style.WIDTH, 1 - (TOP + BOTTOM) / height)
+        axes = figure.add_axes(box)
+        _column(axes, tree, output, labels, first[output], last[output], len(rounds) > 1)
+        _rows(axes, labels, first[output], column == 0)
+        axes.set_title(style.plain(output), fontsize=style.TEXT, fontweight="bold", pad=6)
+    style.legend(figure, _handles(len(rounds) > 1))
+    return figure
+
+
+def _order(error: dict[str, Any]) -> list[str]:
+    """Labels of all runs, those fitted first."""
+    roles = {label: run["role"] for runs in error.values() for label, run in runs.items()}
+    return sorted(roles, key=lambda label: roles[label] == schema.HOLD_OUT)
+
+
+def _column(
+    axes: Axes,
+    tree: xr.DataTree,
+    output: str,
+    labels: list[str],
+    first: dict[str, Any],
+    last: dict[str, Any],
+    two: bool,
+) -> None:
+    """One output."""
+    ratios = [run[schema.RATIO_TO_NOISE] for runs in (first, last) for run in runs.values()]
+    key = schema.RATIO_TO_NOISE if any(ratio is not None for ratio in ratios) else schema.RMS
+    values = [run[key] for runs in (first, last) for run in runs.values() if run[key]]
+    factor, text = 1.0, "repeating error / noise"
+    if key == schema.RMS:
+        scale = engineering(_unit(tree, output), max(values, default=0.0))
+        factor, text = scale.factor, scale.label("rms")
+    else:
+        axes.axvline(1.0, color=style.INK, lw=1.0, zorder=0.5)
+        values.append(1.0)
+    for row, label in enumerate(labels):
+        pair = [factor * runs[label][key] if runs.get(label, {}).get(key) else None for runs in (first, last)]
+        _dumbbell(axes, row, pair[0], pair[1], two)
+    _logarithmic(axes, factor * np.array(values or [1.0]))
+    axes.set_xlabel(text, fontsize=style.TEXT)
+
+
+def _dumbbell(
+    axes: Axes, row: int, before: float | None, after: float | None, two: bool
+) -> None:
+    """One run: where it was, where it is, and the way between."""
+    if before is None or after is None:
+        place = axes.get_yaxis_transform()
+        text = "no noise floor; rms in the table"
+        axes.text(0.03, row, text, transform=place, va="center", fontsize=7, color=style.FAINT)
+        return
+    if two:
+        axes.plot([before, after], [row, row], color=style.NEUTRAL, lw=2.2, zorder=1)
+        axes.plot(before, row, "o", ms=6.5, mfc="white", mec=style.BEFORE, mew=1.6, zorder=2)
+    axes.plot(after, row, "o", ms=6.5, color=style.AFTER, zorder=3)
+
+
+def _rows(axes: Axes, labels: list[str], first: dict[str, Any], named: bool) -> None:
+    """Labels of the runs; hold-out runs lie on a pale ground below the fitted ones."""
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_yticks(range(len(labels)), [style.plain(label, 24) for label in labels])
+    axes.tick_params(axis="y", length=0, labelleft=named)
+    axes.spines[["left", "right", "top"]].set_visible(False)
+    roles = [first.get(label, {}).get("role") for label in labels]
+    for role, colour in ((schema.FIT, style.FAINT), (schema.HOLD_OUT, style.AFTER)):
+        rows = [row for row, own in enumerate(roles) if own == role]
+        if not rows:
+            continue
+        if role == schema.HOLD_OUT:
+            axes.axhspan(rows[0] - 0.5, rows[-1] + 0.5, color="#eef4f9", lw=0, zorder=-2)
+        if named:
+            _bracket(axes, role, (rows[0] + rows[-1]) / 2, colour)
+
+
+def _bracket(axes: Axes, role: str, middle: float, colour: str) -> None:
+    """The role, beside the labels of its runs."""
+    axes.annotate(
+        role,
+        (0, middle),
+        (12 - LEFT * 72, 0),
+        xycoords=("axes fraction", "data"),
+        textcoords="offset points",
+        rotation=90,
+        va="center",
+        fontsize=style.SMALL,
+        color=colour,
+    )
+
+
+def _logarithmic(axes: Axes, values: reading.Array) -> None:
+    """A logarithmic axis of at least half a decade with plain numbers at 1, 2 and 5."""
+    low, high = 0.8 * values.min(), 1.25 * values.max()
+    if high / low < 3.0:
+        middle = np.sqrt(low * high)
+        low, high = middle / 1.8, middle * 1.8
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    span = high / low
+    marks = (1, 1.5, 2, 3, 5, 7) if span < 8 else (1, 2, 5) if span < 300 else (1,)
+    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    places = [m * 10.0**k for k in decades for m in marks if low <= m * 10.0**k <= high]
+    axes.xaxis.set_major_locator(FixedLocator(places))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.tick_params(labelsize=style.SMALL, color=style.FAINT)
+    axes.grid(axis="x", color=style.NOISE, lw=0.6, zorder=-1)
+    axes.set_axisbelow(True)
+
+
+def _unit(tree: xr.DataTree, output: str) -> str:
+    data = reading.group(tree, schema.OBSERVED_DATA)
+    return "" if data is None or output not in data else reading.unit(data[output])
+
+
+def _handles(two: bool) -> list[style.Artist]:
+    """What the marks mean."""
+    point = {"marker": "o", "ls": "", "ms": 6.5}
+    hollow = Line2D([], [], mfc="white", mec=style.BEFORE, mew=1.6, label="before", **point)  # type: ignore[arg-type]
+    full = Line2D([], [], color=style.AFTER, label="after" if two else "error", **point)  # type: ignore[arg-type]
+    floor = Line2D([], [], color=style.INK, lw=1.0, label="noise floor")
+    return [hollow, full, floor] if two else [full, floor]

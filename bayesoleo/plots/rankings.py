@@ -1,0 +1,117 @@
+"""The ranking of the candidate effects of one round."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from bayesoleo.plots import reading, style
+
+LEFT, TOP, BOTTOM, ROW, RIGHT = 2.9, 0.55, 0.6, 0.27, 2.0
+
+
+def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
+    """Share of the excess error that each candidate explains, with its p-value.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Its ``summary`` attribute is read.
+    number : int
+        Which round, from 0.
+    most : int
+        How many candidates are shown, the best first.
+
+    Returns
+    -------
+    Figure
+        The accepted effect is blue, those the data cannot tell from it are pale blue. A letter
+        marks a class of effects that the data cannot tell apart from each other.
+    """
+    entry = reading.summary(tree)["rounds"][number]
+    candidates = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
+    shown = candidates[:most]
+    height = TOP + ROW * max(len(shown), 2) + BOTTOM
+    figure = style.blank(style.WIDTH, height)
+    width = style.WIDTH - LEFT - RIGHT
+    box = (LEFT / style.WIDTH, BOTTOM / height, width / style.WIDTH, 1 - (TOP + BOTTOM) / height)
+    axes = figure.add_axes(box)
+    style.dress(axes, ticks=6)
+    letters = classes(candidates)
+    for row, candidate in enumerate(shown):
+        _bar(axes, row, candidate, entry["accepted"], letters.get(candidate["effect"], ""))
+    axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
+    axes.set_yticks(range(len(shown)), [style.plain(name(c), 44) for c in shown])
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
+    largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)
+    axes.set_xlim(0.0, max(1.02 * largest, 10.0))
+    axes.set_xlabel("share of the excess error explained in %", fontsize=style.TEXT)
+    _explain(figure, entry, len(candidates) - len(shown))
+    return figure
+
+
+def name(candidate: dict[str, Any]) -> str:
+    """Effect, and what it sits on where that is said."""
+    target = candidate.get("target")
+    return f"{candidate['effect']} @ {target}" if target else str(candidate["effect"])
+
+
+def classes(candidates: list[dict[str, Any]]) -> dict[str, str]:
+    """A letter for every effect that others cannot be told from, the same within a class."""
+    letters: dict[str, str] = {}
+    for candidate in candidates:
+        same = [candidate["effect"], *candidate["indistinguishable_from"]]
+        if len(set(same)) < 2:
+            continue
+        known = next((letters[effect] for effect in same if effect in letters), None)
+        letter = known or "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[len(set(letters.values())) % 26]
+        letters.update({effect: letters.get(effect, letter) for effect in same})
+    return letters
+
+
+def format_p(value: float | None) -> str:
+    """A p-value; None, where it was not computed, gives nothing."""
+    if value is None:
+        return ""
+    return "p < 0.001" if value < 1e-3 else f"p = {value:.3f}" if value < 0.1 else f"p = {value:.2f}"
+
+
+def _bar(axes: Axes, row: int, candidate: dict[str, Any], accepted: str | None, letter: str) -> None:
+    """One candidate: bar, share, p-value and class."""
+    first = candidate["effect"] == accepted
+    similar = accepted is not None and accepted in candidate["indistinguishable_from"]
+    colour = style.AFTER if first else style.SIMILAR if similar else style.NEUTRAL
+    axes.barh(row, max(100 * candidate["gain"], 0.0), 0.68, color=colour)
+    texts = (f"{100 * candidate['gain']:.1f} %".replace("-", "−"), format_p(candidate["p_value"]), letter)
+    weight = "bold" if first else "normal"
+    for inches, text, side in zip((0.7, 1.55, 1.75), texts, ("right", "right", "left"), strict=True):
+        place = 1 + inches / (style.WIDTH - LEFT - RIGHT)
+        axes.text(
+            place,
+            row,
+            text,
+            transform=axes.get_yaxis_transform(),
+            ha=side,
+            va="center",
+            fontsize=style.SMALL,
+            fontweight=weight,
+            color=style.INK if first else style.FAINT,
+        )
+
+
+def _explain(figure: Figure, entry: dict[str, Any], hidden: int) -> None:
+    """What the colours mean, and how many candidates are not shown."""
+    handles = [Patch(facecolor=style.NEUTRAL, label="candidate")]
+    if entry["accepted"]:
+        handles = [
+            Patch(facecolor=style.AFTER, label="accepted"),
+            Patch(facecolor=style.SIMILAR, label="not distinguishable from it"),
+            *handles,
+        ]
+    remark = f"{hidden} more with less" if hidden > 0 else ""
+    style.legend(figure, handles, remark)

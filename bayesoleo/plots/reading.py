@@ -1,0 +1,140 @@
+"""What figures take out of a DataTree; groups that are absent are None, never an error."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from bayesoleo import schema
+
+Array = NDArray[np.float64]
+
+BINS = 120
+"""Points shown over one period."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is said about a run in the title of its panel."""
+
+    index: int
+    label: str
+    role: str
+    frequency: float
+    duration: float
+
+    @property
+    def periodic(self) -> bool:
+        """Whether the run has a phase."""
+        return bool(np.isfinite(self.frequency))
+
+    @property
+    def remark(self) -> str:
+        """Frequency of a periodic run, duration of a transient one."""
+        return f"{self.frequency:.3g} Hz" if self.periodic else f"transient, {self.duration:.3g} s"
+
+
+def group(tree: xr.DataTree, name: str) -> xr.Dataset | None:
+    """A group as a Dataset, or None."""
+    return tree[name].to_dataset() if name in tree.children else None
+
+
+def summary(tree: xr.DataTree) -> dict[str, Any]:
+    """The summary in the root attributes, empty if there is none."""
+    found: dict[str, Any] = json.loads(tree.attrs.get(schema.SUMMARY, "{}"))
+    return found
+
+
+def outputs(tree: xr.DataTree) -> list[str]:
+    """Output channels, in the order of the prediction."""
+    data = group(tree, schema.PREDICTION)
+    end = schema.before("")
+    return [] if data is None else [str(n)[: -len(end)] for n in data.data_vars if str(n).endswith(end)]
+
+
+def channels(tree: xr.DataTree) -> list[str]:
+    """Measured channels: those that are not outputs (the inputs) first."""
+    data = group(tree, schema.OBSERVED_DATA)
+    if data is None:
+        return []
+    own = [str(name) for name in data.data_vars if name not in (schema.TIME, schema.PHASE)]
+    return sorted(own, key=lambda name: name in outputs(tree))
+
+
+def runs(tree: xr.DataTree) -> list[Run]:
+    """The runs, in the order of the tree."""
+    data, constant = group(tree, schema.OBSERVED_DATA), group(tree, schema.CONSTANT_DATA)
+    if data is None:
+        return []
+    count = data.sizes[schema.RUN]
+    labels = data[schema.RUN].values if schema.RUN in data.coords else range(1, count + 1)
+    roles, frequencies = [""] * count, np.full(count, np.nan)
+    if constant is not None:
+        roles = [str(role) for role in constant[schema.ROLE].values]
+        frequencies = constant[schema.FREQUENCY].values.astype(float)
+    time = data[schema.TIME].values
+    duration = np.nanmax(time, axis=1) - np.nanmin(time, axis=1)
+    return [
+        Run(i, str(labels[i]), roles[i], float(frequencies[i]), float(duration[i]))
+        for i in range(count)
+    ]
+
+
+def unit(data: xr.DataArray) -> str:
+    """Unit of a variable, empty if it has none."""
+    return str(data.attrs.get(schema.UNITS, ""))
+
+
+def abscissa(tree: xr.DataTree, run: Run) -> Array:
+    """Phase modulo 1 of every sample; of a transient the fraction of its duration; NaN padded."""
+    data = tree[schema.OBSERVED_DATA]
+    if run.periodic and schema.PHASE in data:
+        return np.asarray(data[schema.PHASE].values[run.index] % 1.0, dtype=float)
+    time = np.asarray(data[schema.TIME].values[run.index], dtype=float)
+    return (time - np.nanmin(time)) / max(run.duration, np.finfo(float).tiny)
+
+
+def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
+    """Average values in equal bins of a position from 0 to 1; bins without a sample are NaN.
+
+    Parameters
+    ----------
+    position, values : ndarray, shape (n,)
+        Pairs with a NaN are left out.
+    bins : int
+        Number of bins.
+
+    Returns
+    -------
+    centres, means : ndarray, shape (bins,)
+    """
+    keep = np.isfinite(position) & np.isfinite(values)
+    index = np.minimum((position[keep] * bins).astype(int), bins - 1)
+    count = np.bincount(index, minlength=bins)
+    total = np.bincount(index, weights=values[keep], minlength=bins)
+    means = np.full(bins, np.nan)
+    np.divide(total, count, out=means, where=count > 0)
+    return (np.arange(bins) + 0.5) / bins, means
+
+
+def is_resolved(position: Array, values: Array) -> bool:
+    """Whether bins of phase show a signal; a multisine with hundreds of harmonics they average out."""
+    means = fold(position, values)[1]
+    variance = np.nanvar(values)
+    return bool(variance == 0.0 or np.nanvar(means) > 0.9 * variance)
+
+
+def thin(x: Array, y: Array, points: int = 2 * BINS) -> tuple[Array, Array]:
+    """At most ``points`` pairs that keep the extremes: of each stretch its smallest and largest."""
+    if y.size <= points or not np.isfinite(y).any():
+        return x, y
+    chosen: list[int] = []
+    for part in np.array_split(np.arange(y.size), points // 2):
+        if np.isfinite(y[part]).any():
+            chosen += sorted({part[np.nanargmin(y[part])], part[np.nanargmax(y[part])]})
+    return x[chosen], y[chosen]
