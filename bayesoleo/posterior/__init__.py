@@ -1,4 +1,4 @@
-"""Which parameter values fit, as a density: the posterior over parameters and error variances, sampled."""
+"""Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
 
 from bayesoleo.posterior.density import LogDensity
 from bayesoleo.posterior.diagnostics import Comparison, compare_with_point

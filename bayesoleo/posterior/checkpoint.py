@@ -1,7 +1,8 @@
 """Where segments go: files that are never changed, or memory.
 
-A segment is written under another name, synchronised and renamed, so that a file with a segment's name is whole; a checksum inside
-tells if it is not after all. The generator's state lies in the same file, so that a killed run continues to the same draws.
+A segment is written under another name, synchronised and renamed, so that a file with a segment's
+name is whole; a checksum inside tells if it is not after all. The generator's state lies in the
+same file, so that a killed run continues to the same draws.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import sys
 import zipfile
 import zlib
 from collections import Counter
@@ -70,7 +72,7 @@ class FolderStore:
     def __init__(self, folder: Path, fingerprint: str) -> None:
         self.folder, self.fingerprint = folder, fingerprint
         self.segments: list[Segment] = []
-        for leftover in folder.glob(_NAME.format(0).split("0")[0] + "*.tmp"):
+        for leftover in folder.glob("segment-*.tmp"):
             leftover.unlink()
         self._load_good_prefix()
 
@@ -87,7 +89,7 @@ class FolderStore:
         self.segments.append(segment)
 
     def _load_good_prefix(self) -> None:
-        """Load up to the first segment that is missing or broken; what comes after it is set aside."""
+        """Load up to the first segment that is missing or broken; set aside what comes after it."""
         for index in range(len(list(self.folder.glob("segment-*.npz")))):
             path = self.folder / _NAME.format(index)
             try:
@@ -159,7 +161,7 @@ def write_durably(path: Path, content: bytes) -> None:
 
 
 def _synchronise_folder(folder: Path) -> None:
-    if os.name == "nt":  # Windows cannot open a folder; its rename is durable with the file
+    if sys.platform == "win32":  # Windows cannot open a folder; its rename is durable with the file
         return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -181,7 +183,7 @@ def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
         "degrees": segment.mixture.degrees,
         **counters,
     }
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "coords": segment.coords,
         "log_density": segment.log_density,
         "by_run": segment.by_run,
@@ -199,7 +201,7 @@ def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
 
 
 def decode(content: bytes, index: int) -> tuple[Segment, str]:
-    """Segment and fingerprint out of an archive's bytes; raises one of many errors when it is not whole."""
+    """Segment and fingerprint out of an archive's bytes; one of many errors if it is not whole."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {key: archive[key] for key in archive.files}
     checksum = arrays.pop("checksum")
@@ -279,10 +281,10 @@ def open_store(folder: Path | None, fingerprint: str) -> Iterator[Store]:
 
 def _lock(file: IO[bytes]) -> bool:
     try:
-        if os.name == "nt":
+        if sys.platform == "win32":
             import msvcrt
 
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl
 

@@ -49,15 +49,16 @@ class LogDensity:
     problem : Problem
         What is fitted: ``l`` unknowns, ``N`` runs, ``s`` outputs.
     jobs : int, optional
-        Threads over which the rows are spread. By default the problem's ``misfit`` is called once for all rows and spreads its
-        own work. The result does not depend on it.
+        Threads over which the rows are spread. By default the problem's ``misfit`` is called once
+        for all rows and spreads its own work. The result does not depend on it.
 
     Attributes
     ----------
     evaluations : int
         Rows evaluated so far.
     failures : collections.Counter
-        Rows of density zero so far, by the lower-case name of their :class:`~bayesoleo.solvers.status.Status`.
+        Rows of density zero so far, by the lower-case name of their
+        :class:`~bayesoleo.solvers.status.Status`.
 
     Notes
     -----
@@ -91,14 +92,14 @@ class LogDensity:
         return len(self.names)
 
     def natural(self, phi: Array) -> Array:
-        """Parameters in their units and ``ln v``, shape (W, l + s), from coordinates of the same shape."""
+        """Parameters in their units and ``ln v``, from coordinates, both of shape (W, l + s)."""
         phi = np.asarray(phi, dtype=float)
         unknowns = len(self.problem.names)
         theta = self.transforms.natural(phi[:, :unknowns])
         return np.concatenate([theta, phi[:, unknowns:]], axis=1)
 
     def coordinates(self, natural: Array) -> Array:
-        """Coordinates, shape (W, l + s), of parameters in their units and ``ln v``, shape (W, l + s)."""
+        """Coordinates of parameters in their units and ``ln v``, both of shape (W, l + s)."""
         natural = np.asarray(natural, dtype=float)
         unknowns = len(self.problem.names)
         u = self.transforms.unbounded(natural[:, :unknowns])
@@ -115,7 +116,8 @@ class LogDensity:
         Returns
         -------
         log_density : ndarray, shape (W,)
-            Log-likelihood + log prior + log Jacobian; minus infinity where it cannot be evaluated, never NaN.
+            Log-likelihood + log prior + log Jacobian; minus infinity where it cannot be evaluated,
+            never NaN.
         by_run : ndarray, shape (W, N)
             Normalised log-likelihood of every run; minus infinity likewise.
         """

@@ -1,11 +1,10 @@
-"""How many draws the draws are worth, whether the ensembles agree, and what the posterior says that the point did not."""
+"""What draws are worth, whether ensembles agree, and what a point estimate did not say."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from emcee.autocorr import auto_window
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -27,13 +26,14 @@ def autocorrelation_time(draws: Array) -> Array:
 
     Notes
     -----
-    As ``emcee.autocorr``, but deviations are from the mean of all walkers: a walker that stays in one of two modes then counts as
-    correlated, where deviations from its own mean would look like noise.
+    As ``emcee.autocorr``, but deviations are from the mean of all walkers: a walker that stays in
+    one of two modes then counts as correlated, where deviations from its own mean would look like
+    noise.
 
     References
     ----------
-    Sokal (1996), "Monte Carlo methods in statistical mechanics", section 3 (window of five times). Goodman and Weare (2010),
-    "Ensemble samplers with affine invariance", *CAMCoS* 5, section 5.
+    Sokal (1996), "Monte Carlo methods in statistical mechanics", section 3 (window of five times).
+    Goodman and Weare (2010), "Ensemble samplers with affine invariance", *CAMCoS* 5, section 5.
     """
     centred = draws - draws.mean(axis=(0, 1))
     length = draws.shape[1]
@@ -45,12 +45,22 @@ def autocorrelation_time(draws: Array) -> Array:
     times = np.full(draws.shape[2], np.nan)
     for a in np.flatnonzero(covariance[0] > 0):
         sums = 2.0 * np.cumsum(covariance[:, a] / covariance[0, a]) - 1.0
-        times[a] = sums[auto_window(sums, 5)]
+        times[a] = sums[_window(sums)]
     return times
 
 
+def _window(sums: Array) -> int:
+    """First lag that is five times as long as the sum up to it.
+
+    ``emcee.autocorr.auto_window`` answers zero where there is none, and so calls a walker that
+    never leaves its mode independent; here it is half the chain, and the time as long as that.
+    """
+    long_enough = np.flatnonzero(np.arange(len(sums)) >= 5 * sums)
+    return int(long_enough[0]) if long_enough.size else len(sums) // 2
+
+
 def effective_size(draws: Array) -> Array:
-    """Effective number of independent draws of every quantity: the smaller of two estimates.
+    """Effective number of independent draws of every quantity: the smallest of the estimates.
 
     Parameters
     ----------
@@ -64,8 +74,9 @@ def effective_size(draws: Array) -> Array:
 
     References
     ----------
-    Vehtari et al. (2021), "Rank-normalization, folding, and localization: an improved R-hat", *Bayesian Analysis* 16, section 3
-    (bulk); and all draws over :func:`autocorrelation_time`.
+    Vehtari et al. (2021), "Rank-normalization, folding, and localization: an improved R-hat",
+    *Bayesian Analysis* 16, section 3 (bulk and tail); and all draws over
+    :func:`autocorrelation_time`.
     """
     import arviz as az
 
@@ -73,9 +84,12 @@ def effective_size(draws: Array) -> Array:
     times = autocorrelation_time(draws)
     out = np.zeros(draws.shape[2])
     for a in np.flatnonzero(np.isfinite(times)):
-        bulk = float(az.ess(draws[:, :, a], chain_axis=0, draw_axis=1, method="bulk"))
+        ranked = [
+            float(az.ess(draws[:, :, a], chain_axis=0, draw_axis=1, method=method, prob=prob))
+            for method, prob in (("bulk", None), ("tail", (0.05, 0.95)))
+        ]
         # Anticorrelated draws are not credited: the estimate of a time below one is mostly noise.
-        out[a] = min(bulk if np.isfinite(bulk) else 0.0, size / max(times[a], 1.0))
+        out[a] = np.nan_to_num(min(*ranked, size / max(times[a], 1.0)), nan=0.0)
     return out
 
 
@@ -96,8 +110,8 @@ def nested_rhat(draws: Array, ensemble: NDArray[np.int64]) -> Array:
 
     References
     ----------
-    Margossian et al. (2024), "Nested R-hat: assessing the convergence of Markov chain Monte Carlo when running many short
-    chains", *Bayesian Analysis*.
+    Margossian et al. (2024), "Nested R-hat: assessing the convergence of Markov chain Monte Carlo
+    when running many short chains", *Bayesian Analysis*.
     """
     import arviz as az
 
@@ -123,8 +137,8 @@ def rhat_limit(ensembles: int, size: float) -> float:
     Returns
     -------
     float
-        At least 1.01. The squared R-hat exceeds one by chi-square / (ensembles - 1) over the effective draws of one ensemble;
-        the limit is that variable's 99.9 % quantile.
+        At least 1.01. The squared R-hat exceeds one by chi-square / (ensembles - 1) over the
+        effective draws of one ensemble; the limit is that variable's 99.9 % quantile.
     """
     spread = stats.chi2.ppf(0.999, ensembles - 1) / (ensembles - 1)
     return float(max(1.01, np.sqrt(1 + spread * ensembles / size)))

@@ -38,13 +38,13 @@ class MoveWeights:
         Relative frequencies.
     """
 
-    independence: float = 0.7
-    differential: float = 0.2
-    snooker: float = 0.1
+    independence: float = 0.8
+    differential: float = 0.15
+    snooker: float = 0.05
 
 
 def default_walkers(dimension: int) -> int:
-    """Walkers of one ensemble: halves of them must span the space and leave differences to choose from."""
+    """Walkers of one ensemble: each half spans the space and leaves differences to choose from."""
     return max(16, 4 * ((dimension + 2) // 2 + 1))
 
 

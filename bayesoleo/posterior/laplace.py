@@ -14,7 +14,8 @@ from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
-#: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding and solver noise.
+#: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding
+#: and solver noise.
 STEP = 0.25
 #: A mode is found when the Newton step is shorter than this many standard deviations.
 TOLERANCE = 1e-3
@@ -35,12 +36,14 @@ class Mode:
     log_weight : float
         Logarithm of the Laplace approximation of the density's integral around the mode.
     status : Status
-        ``CONVERGED``; ``NO_CONVERGENCE`` when the polishing ran out of iterations; ``SINGULAR`` when the Hessian is not negative
-        definite and the covariance is the Gauss-Newton one instead; a failure of the density otherwise.
+        ``CONVERGED``; ``NO_CONVERGENCE`` when the polishing ran out of iterations; ``SINGULAR``
+        when the Hessian is not negative definite and the covariance is the Gauss-Newton one
+        instead; a failure of the density otherwise.
 
     References
     ----------
-    Tierney and Kadane (1986), "Accurate approximations for posterior moments and marginal densities", *JASA* 81, eq. 2.2.
+    Tierney and Kadane (1986), "Accurate approximations for posterior moments and marginal
+    densities", *JASA* 81, eq. 2.2.
     """
 
     centre: Array
@@ -62,8 +65,9 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
     Returns
     -------
     ndarray, shape (l + s, l + s)
-        Inverse of ``A + w^-1`` at fixed ``v`` for the parameters (in coordinates without bounds, ``w`` the curvature of prior and
-        Jacobian there) and ``2 / n_b`` for ``ln v_b``. Where the sensitivities cannot be computed, ``A`` is left out.
+        Inverse of ``A + w^-1`` at fixed ``v`` for the parameters (in coordinates without bounds,
+        ``w`` the curvature of prior and Jacobian there) and ``2 / n_b`` for ``ln v_b``. Where the
+        sensitivities cannot be computed, ``A`` is left out.
 
     References
     ----------
@@ -87,13 +91,14 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
 
 
 def _prior_precision(log_density: LogDensity, u: Array) -> Array:
-    """Negative second derivatives of log prior plus log Jacobian; priors are independent, so each has its own."""
+    """Negative second derivatives of log prior plus log Jacobian, one for each parameter."""
     precision = np.empty(len(u))
     for a, (prior, transform) in enumerate(
         zip(log_density.problem.priors, log_density.transforms.each, strict=True)
     ):
         step = STEP * prior.sd / abs(float(transform.derivative(u[a : a + 1])[0]))
-        # A quarter of the prior's width in u; at most 1/4 where u is a logarithm, whose unit is a factor e.
+        # A quarter of the prior's width in u; at most 1/4 where u is a logarithm, whose unit is a
+        # factor e.
         step = step if transform.low == -np.inf and transform.high == np.inf else min(step, STEP)
         points = u[a] + step * np.array([-1.0, 0.0, 1.0])
         values = prior.log_density(transform.natural(points)) + transform.log_jacobian(points)
@@ -106,8 +111,8 @@ def _prior_precision(log_density: LogDensity, u: Array) -> Array:
 def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) -> Mode:
     """Climb to the mode next to a point and approximate the density there.
 
-    Newton's method in coordinates whitened by the Gauss-Newton covariance; gradient and Hessian come from one batch of
-    ``d^2 + d + 1`` rows, the step length from a second one.
+    Newton's method in coordinates whitened by the Gauss-Newton covariance; gradient and Hessian
+    come from one batch of ``d^2 + d + 1`` rows, the step length from a second one.
 
     Parameters
     ----------
@@ -154,7 +159,7 @@ def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) ->
 
 
 def _derivatives(log_density: LogDensity, phi: Array, factor: Array) -> tuple[float, Array, Array]:
-    """Height, gradient and Hessian in whitened coordinates ``phi + factor @ z`` at ``z = 0``, by central differences."""
+    """Height, gradient and Hessian by central differences in ``z`` of ``phi + factor @ z``."""
     d, h = len(phi), STEP
     unit = h * np.eye(d)
     pairs = [(i, j) for i in range(d) for j in range(i)]
@@ -198,7 +203,7 @@ def _line_search(
 
 
 def _covariance(factor: Array, hessian: Array) -> tuple[Array, bool]:
-    """Covariance from the whitened Hessian, or Gauss-Newton's where that is not negative definite."""
+    """Covariance from the whitened Hessian; Gauss-Newton's where it is not negative definite."""
     try:
         if not np.all(np.isfinite(hessian)):
             raise np.linalg.LinAlgError
@@ -288,16 +293,17 @@ def mixture_of(modes: list[Mode], *, degrees: float = DEGREES_OF_FREEDOM) -> Mix
     Parameters
     ----------
     modes : list of Mode
-        Those that lie within half a standard deviation of a heavier one are taken for the same; those that are lighter by a
-        factor of 3e6 or not finite are dropped.
+        Those that lie within half a standard deviation of a heavier one are taken for the same;
+        those that are lighter by a factor of 3e6 or not finite are dropped.
     degrees : float
         Degrees of freedom of the components' tails.
 
     Returns
     -------
     Mixture
-        Weights are at least 0.05 each before normalisation, because a Laplace integral can be wrong and the sampler corrects a
-        weight that is too large but cannot find a mode that is never proposed.
+        Weights are at least 0.05 each before normalisation, because a Laplace integral can be wrong
+        and the sampler corrects a weight that is too large but cannot find a mode that is never
+        proposed.
 
     Raises
     ------

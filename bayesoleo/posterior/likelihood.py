@@ -32,11 +32,13 @@ def log_likelihood_by_run(
 
     References
     ----------
-    Verbeek (1993), eq. 2.29 without the prior; the constant is added so that models with other data compare.
+    Verbeek (1993), eq. 2.29 without the prior; the constant is added so that models with other data
+    compare.
     """
     vectors, runs, outputs = sum_of_squares.shape
     total = np.zeros((vectors, runs))
-    # Outputs are added one after the other: a reduction by NumPy may change its order with the number of rows.
+    # Outputs are added one after the other: a reduction by NumPy may change its order with the
+    # number of rows.
     for b in range(outputs):
         log_v = np.ascontiguousarray(log_variance[:, b])
         precision = np.exp(-log_v)

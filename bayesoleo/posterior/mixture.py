@@ -1,4 +1,4 @@
-"""Mixtures of multivariate Student-t densities: where walkers start and what the independence move proposes."""
+"""Mixtures of Student-t densities: where walkers start and what the independence move proposes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from bayesoleo.errors import InputError
 
 Array = NDArray[np.float64]
 
-#: Tails heavy enough that the ratio target / proposal stays bounded where a normal approximation would let it grow.
+#: Tails heavy enough that the ratio target / proposal stays bounded where a normal approximation
+#: would let it grow.
 DEGREES_OF_FREEDOM = 6.0
 
 
@@ -75,7 +76,7 @@ class Mixture:
         return np.linalg.inv(self._factors)
 
     def distances(self, phi: Array) -> Array:
-        """Squared Mahalanobis distances to every component, shape (W, K), of rows of shape (W, d)."""
+        """Squared Mahalanobis distances of rows, shape (W, d), to every component, shape (W, K)."""
         columns = []
         for centre, whiten in zip(self.centres, self._whitening, strict=True):
             columns.append(np.sum(((phi - centre) @ whiten.T) ** 2, axis=1))
@@ -128,10 +129,12 @@ class Mixture:
 
         References
         ----------
-        Peel and McLachlan (2000), "Robust mixture modelling using the t distribution", *Statistics and Computing* 10, eq. 22-31.
+        Peel and McLachlan (2000), "Robust mixture modelling using the t distribution", *Statistics
+        and Computing* 10, eq. 22-31.
         """
         fitted = self
-        # Each component keeps so many pseudo-draws of its former shape: it stays positive definite when few draws reach it.
+        # Each component keeps so many pseudo-draws of its former shape: it stays positive definite
+        # when few draws reach it.
         memory = 2.0 * (self.dimension + 1)
         for _ in range(rounds):
             log_parts = fitted.log_components(phi)

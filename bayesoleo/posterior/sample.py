@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -85,11 +86,13 @@ class Quality:
         short = []
         if self.sizes.min() < schedule.effective_size:
             short.append(
-                f"the effective size is {self.sizes.min():.0f} of {schedule.effective_size:.0f} asked for"
+                f"the effective size is {self.sizes.min():.0f}"
+                f" of {schedule.effective_size:.0f} asked for"
             )
         if self.draws < schedule.times * self.times.max():
             short.append(
-                f"{self.draws} draws are fewer than {schedule.times:.0f} autocorrelation times of {self.times.max():.1f}"
+                f"{self.draws} draws are fewer than {schedule.times:.0f}"
+                f" autocorrelation times of {self.times.max():.1f}"
             )
         limit = rhat_limit(ensembles, schedule.effective_size)
         if self.rhat.max() > limit:
@@ -120,9 +123,11 @@ def sample(
     Parameters
     ----------
     log_density : Density
-        Over ``d`` coordinates without bounds, usually a :class:`~bayesoleo.posterior.density.LogDensity`.
+        Over ``d`` coordinates without bounds, usually a
+        :class:`~bayesoleo.posterior.density.LogDensity`.
     start : Mixture
-        Laplace approximations at the modes; walkers start there and the independence move proposes from it.
+        Laplace approximations at the modes; walkers start there and the independence move proposes
+        from it.
     effective_size : float
         Effective draws of every quantity to stop at, by the smaller of two estimates.
     ensembles : int
@@ -132,9 +137,11 @@ def sample(
     seed : int
         Everything random follows from it; the draws do not depend on threads.
     out : path-like, optional
-        Folder of checkpoints. A run that was killed continues there to the same draws; one that is complete is read.
+        Folder of checkpoints. A run that was killed continues there to the same draws; one that is
+        complete is read.
     fingerprint : str
-        Hash of what the density depends on (data, model, priors); a folder with another one is refused.
+        Hash of what the density depends on (data, model, priors); a folder with another one is
+        refused.
     progress : bool
         Whether to show a bar of the effective size.
     max_evaluations : int
@@ -160,7 +167,8 @@ def sample(
 
     References
     ----------
-    Foreman-Mackey et al. (2013), "emcee: the MCMC hammer", *PASP* 125. Margossian et al. (2024) for the stopping rule.
+    Foreman-Mackey et al. (2013), "emcee: the MCMC hammer", *PASP* 125. Margossian et al. (2024) for
+    the stopping rule.
     """
     dimension = len(log_density.names)
     if start.dimension != dimension:
@@ -196,7 +204,7 @@ def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool
 def _fingerprint(
     given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule
 ) -> str:
-    """Hash of everything that the draws follow from; a larger effective size or limit only continues them."""
+    """Hash of all that the draws follow from; a larger effective size only continues them."""
     digest = hashlib.sha256()
     settings = [
         given,
@@ -212,7 +220,8 @@ def _fingerprint(
     ]
     digest.update(json.dumps(settings).encode())
     for array in (start.centres, start.covariances, start.log_weights):
-        # Rounded: the mode found again on another machine differs in the last bits, and segments hold what was used.
+        # Rounded: the mode found again on another machine differs in the last bits, and segments
+        # hold what was used.
         digest.update(np.array2string(array, precision=6, threshold=array.size + 1).encode())
     return digest.hexdigest()
 
@@ -220,7 +229,7 @@ def _fingerprint(
 def _warm_up(
     store: Store, group: Ensembles, schedule: Schedule, start: Mixture, seed: int, bar: _Bar
 ) -> None:
-    """Rounds of doubling length, each followed by adapting the mixture, until a round is ten autocorrelation times long."""
+    """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau."""
     if not store.segments:
         store.append(group.start(start, seed))
     while not _is_warm(store.segments, schedule):
@@ -248,21 +257,32 @@ def _keep(
     store: Store, group: Ensembles, schedule: Schedule, bar: _Bar
 ) -> tuple[Quality, list[str]]:
     """Add segments until the draws are good enough or the evaluations are spent."""
-    quality: Quality | None = None
     while True:
         kept = [s for s in store.segments if s.phase == "kept"]
-        # Nothing is decided, and so nothing computed, before the least number of draws is there.
-        if sum(s.draws for s in kept) >= schedule.least:
+        done = sum(s.draws for s in kept)
+        if done in _decisions(schedule.least, done):
             quality = _quality(kept, group)
             short = quality.shortfalls(schedule, group.ensembles)
             bar.show("sampling", float(quality.sizes.min()), store.segments)
             if not short:
                 return quality, []
-        steps = _next_steps(kept, quality, schedule)
+        steps = min(_decisions(schedule.least, done)[-1] - done, schedule.segment)
         spent = sum(s.evaluations for s in store.segments)
         if spent + steps * group.chains > schedule.max_evaluations:
             return _stopped(kept, group, schedule)
         store.append(group.advance(store.segments[-1], steps, "kept"))
+
+
+def _decisions(least: int, done: int) -> list[int]:
+    """Numbers of draws at which it is decided whether to stop, up to the first after those done.
+
+    They grow by a fifth and depend on nothing else, so that a run that was interrupted stops at
+    the same draw; and the diagnostics, whose cost grows with the draws, are computed rarely.
+    """
+    numbers = [least]
+    while numbers[-1] <= done:
+        numbers.append(int(np.ceil(1.2 * numbers[-1])))
+    return numbers
 
 
 def _stopped(
@@ -278,20 +298,6 @@ def _stopped(
     quality = _quality(kept, group)
     short = quality.shortfalls(schedule, group.ensembles)
     return quality, [f"stopped before {schedule.max_evaluations} evaluations", *short]
-
-
-def _next_steps(kept: list[Segment], quality: Quality | None, schedule: Schedule) -> int:
-    """As many draws as the present efficiency says are missing, at most one segment."""
-    done = sum(s.draws for s in kept)
-    if quality is None:
-        missing = schedule.least - done
-    elif not np.all(np.isfinite(quality.times)) or quality.sizes.min() <= 0:
-        missing = schedule.segment
-    else:
-        wanted = 1.05 * done * schedule.effective_size / quality.sizes.min()
-        wanted = max(wanted, schedule.times * quality.times.max())
-        missing = int(np.ceil(wanted)) - done
-    return int(np.clip(missing, min(10, schedule.segment), schedule.segment))
 
 
 def _quality(kept: list[Segment], group: Ensembles) -> Quality:
@@ -312,8 +318,8 @@ def _samples(
     coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
     chains, draws, dimension = coords.shape
     natural = group.log_density.natural(coords.reshape(-1, dimension))
-    proposed = sum((s.proposed for s in kept), start=type(kept[0].proposed)())
-    accepted = sum((s.accepted for s in kept), start=type(kept[0].accepted)())
+    proposed = sum((s.proposed for s in kept), start=Counter[str]())
+    accepted = sum((s.accepted for s in kept), start=Counter[str]())
     acceptance = {name: accepted[name] / n for name, n in proposed.items() if n}
     acceptance["all"] = accepted.total() / proposed.total()
     return Samples(
@@ -330,7 +336,7 @@ def _samples(
         rhat_nested=quality.rhat,
         acceptance=acceptance,
         evaluations=sum(s.evaluations for s in segments),
-        failures=dict(sum((s.failures for s in segments), start=type(kept[0].failures)())),
+        failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
         reached=not short,
         warning="; ".join(short),
     )

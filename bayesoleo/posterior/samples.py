@@ -26,7 +26,8 @@ class Samples:
     draws : ndarray, shape (chains, draws, d)
         In natural units (``ln v`` for the variances).
     log_density : ndarray, shape (chains, draws)
-        Log posterior density over the coordinates without bounds, Jacobian included, not normalised.
+        Log posterior density over the coordinates without bounds, Jacobian included, not
+        normalised.
     log_likelihood : ndarray, shape (chains, draws, N)
         Normalised log-likelihood by run.
     ensemble : ndarray of int, shape (chains,)

@@ -1,6 +1,7 @@
 """Maps between parameters in natural units and coordinates without bounds.
 
-A sampler that never meets a bound needs no rejection at it. What the map stretches is paid back by the logarithm of its Jacobian.
+A sampler that never meets a bound needs no rejection at it. What the map stretches is paid back by
+the logarithm of its Jacobian.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class Transform:
 
     References
     ----------
-    Gelman et al. (2013), *Bayesian Data Analysis*, third edition, section 1.8 (transformation of variables).
+    Gelman et al. (2013), *Bayesian Data Analysis*, third edition, section 1.8 (transformation of
+    variables).
     """
 
     low: float
@@ -136,7 +138,8 @@ class Transforms:
         return total
 
     def _by_column(self, what: str, values: Array) -> Array:
-        # Contiguous columns: NumPy's exp and log may take another code path, and round differently, for a strided one.
+        # Contiguous columns: NumPy's exp and log may take another code path, and round differently,
+        # for a strided one.
         values = np.asarray(values, dtype=float)
         columns = zip(values.T, self.each, strict=True)
         out = np.empty_like(values, order="C")

@@ -33,7 +33,8 @@ def to_datasets(
     priors : sequence of Prior
         Of the ``l`` parameters, in the order of ``samples.parameters``.
     units : mapping of str to str, optional
-        Unit of each parameter and output (an output's gives that of its variance); ``"1"`` where there is none.
+        Unit of each parameter and output (an output's gives that of its variance); ``"1"`` where
+        there is none.
     long_names : mapping of str to str, optional
         What each parameter or output is; its name where there is none.
     seed : int
@@ -42,7 +43,8 @@ def to_datasets(
     Returns
     -------
     dict of str to xarray.Dataset
-        By group name, dims ``chain``, ``draw`` and ``run``; ready for ``xarray.DataTree.from_dict``.
+        By group name, dims ``chain``, ``draw`` and ``run``; ready for
+        ``xarray.DataTree.from_dict``.
     """
     units, long_names = units or {}, long_names or {}
     return {

@@ -22,13 +22,14 @@ class Grouped(Move):
 
     References
     ----------
-    Foreman-Mackey et al. (2013), "emcee: the MCMC hammer", *PASP* 125, section 3 (the split in halves).
+    Foreman-Mackey et al. (2013), "emcee: the MCMC hammer", *PASP* 125, section 3 (the split in
+    halves).
     """
 
     def __init__(self, move: RedBlueMove, ensembles: int) -> None:
         self.move, self.ensembles = move, ensembles
 
-    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:  # type: ignore[no-untyped-def]
+    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:
         """Advance every walker once; returns the state and who was accepted, shape (walkers,)."""
         walkers, splits = len(state.coords), self.move.nsplits
         each = walkers // self.ensembles
@@ -47,7 +48,7 @@ class Grouped(Move):
             state = self.update(state, new, accepted, active)
         return state, accepted
 
-    def _proposals(self, coords, halves, half, random):  # type: ignore[no-untyped-def]
+    def _proposals(self, coords, halves, half, random):
         proposals, ratios = [], []
         for mine in np.split(np.arange(len(coords)), self.ensembles):
             sets = [coords[mine[halves[mine] == k]] for k in range(self.move.nsplits)]
@@ -78,7 +79,7 @@ class Counted(Move):
         self.name, self.move = name, move
         self.proposed = self.accepted = 0
 
-    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:  # type: ignore[no-untyped-def]
+    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:
         """Pass on, and count."""
         state, accepted = self.move.propose(model, state)
         self.proposed += len(accepted)

@@ -17,11 +17,13 @@ class IndependenceMove(MHMove):
     Parameters
     ----------
     mixture : Mixture
-        Proposal density. It must not change while draws are kept: a proposal that learns from the chain is not stationary.
+        Proposal density. It must not change while draws are kept: a proposal that learns from the
+        chain is not stationary.
 
     References
     ----------
-    Tierney (1994), "Markov chains for exploring posterior distributions", *Annals of Statistics* 22, section 2.3.3.
+    Tierney (1994), "Markov chains for exploring posterior distributions", *Annals of Statistics*
+    22, section 2.3.3.
     """
 
     def __init__(self, mixture: Mixture) -> None:

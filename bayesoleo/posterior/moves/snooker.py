@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 class SnookerMove(RedBlueMove):
-    """Step along the line through the walker and another, by the difference of two more projected on that line.
+    """Step along the line to another walker, by the difference of two more projected on it.
 
     Parameters
     ----------
@@ -19,13 +19,13 @@ class SnookerMove(RedBlueMove):
 
     Notes
     -----
-    emcee 3.1.6's ``DESnookerMove`` divides by the root of the distance instead of the distance and halves the exponent, so that
-    it has another target.
+    emcee 3.1.6's ``DESnookerMove`` divides by the root of the distance instead of the distance and
+    halves the exponent, so that it has another target.
 
     References
     ----------
-    Ter Braak and Vrugt (2008), "Differential evolution Markov chain with snooker updater and fewer chains", *Statistics and
-    Computing* 18, eq. 3-4.
+    Ter Braak and Vrugt (2008), "Differential evolution Markov chain with snooker updater and fewer
+    chains", *Statistics and Computing* 18, eq. 3-4.
     """
 
     def __init__(self, factor: float = 1.7) -> None:
@@ -35,7 +35,7 @@ class SnookerMove(RedBlueMove):
     def get_proposal(
         self, sample: Array, complement: list[Array], random: np.random.RandomState
     ) -> tuple[Array, Array]:
-        """Proposals, shape (W, d), and log ratios ``(d - 1) ln(|x' - z| / |x - z|)``, shape (W,)."""
+        """Proposals (W, d) and log ratios ``(d - 1) ln(|x' - z| / |x - z|)`` (W,)."""
         others = np.concatenate(complement)
         walkers, dimension = sample.shape
         # Three distinct others for each walker: the smallest of random keys.
@@ -46,6 +46,7 @@ class SnookerMove(RedBlueMove):
         direction = line / length[:, None]
         factor = self.factor * random.uniform(0.7, 1.3, size=walkers)  # 1.2 to 2.2
         travel = factor * np.sum((first - second) * direction, axis=1)
-        # Along the line the new distance is |length + travel|, without rounding of a difference of points.
+        # Along the line the new distance is |length + travel|, without rounding of a difference of
+        # points.
         log_ratio = np.log(np.abs(length + travel)) - np.log(length)
         return sample + travel[:, None] * direction, (dimension - 1) * log_ratio

@@ -1,4 +1,4 @@
-"""The gas spring of Verbeek (1993), section 3.4.2, as a problem, with its posterior by quadrature."""
+"""The gas spring of Verbeek (1993), section 3.4.2, and its posterior by quadrature."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def gas_spring(*, relative_sd: float, seed: int) -> GasSpring:
 
 
 def quadrature(problem: GasSpring, theta: np.ndarray, log_v: np.ndarray):
-    """Posterior on a grid by its definition, normalised by the trapezoidal rule, shape (theta, log_v)."""
+    """Posterior on a grid by its definition, shape (theta, log_v), normalised by trapezoids."""
     squares = problem.misfit(theta[:, None]).sum_of_squares[:, 0, 0]
     n = len(problem.y)
     exponent = -0.5 * n * log_v - 0.5 * squares[:, None] * np.exp(-log_v)

@@ -1,0 +1,114 @@
+"""Student-t mixtures and the Laplace approximations that they are made of."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from posterior_gas_spring import GasSpring, gas_spring, measured
+from scipy import stats
+
+from bayesoleo.errors import InputError
+from bayesoleo.model.priors import Normal
+from bayesoleo.posterior import LogDensity, Mixture, Mode, find_mode, laplace_mixture
+from bayesoleo.posterior.laplace import gauss_newton_covariance, mixture_of
+from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM
+from bayesoleo.solvers.status import Status
+
+
+@pytest.fixture
+def two() -> Mixture:
+    covariances = np.array([[[1.0, 0.3], [0.3, 0.5]], [[0.1, 0.0], [0.0, 2.0]]])
+    return Mixture(np.array([[0.0, 0.0], [4.0, 1.0]]), covariances, np.log([3.0, 1.0]))
+
+
+def test_density_is_that_of_scipy(two):
+    phi = np.random.default_rng(0).normal(size=(20, 2)) * 3
+    parts = [
+        stats.multivariate_t(centre, covariance, DEGREES_OF_FREEDOM).pdf(phi)
+        for centre, covariance in zip(two.centres, two.covariances, strict=True)
+    ]
+    np.testing.assert_allclose(
+        two.log_density(phi), np.log(0.75 * parts[0] + 0.25 * parts[1]), rtol=1e-12
+    )
+
+
+def test_draws_have_the_mixture_s_moments(two):
+    draws = two.sample(np.random.default_rng(0), 200_000)
+    mean = 0.75 * two.centres[0] + 0.25 * two.centres[1]
+    # sd of a coordinate is below 2; 4 standard errors
+    np.testing.assert_allclose(draws.mean(axis=0), mean, atol=4 * 2 / np.sqrt(200_000))
+
+
+def test_refitting_recovers_the_mixture(two):
+    draws = two.sample(np.random.default_rng(0), 40_000)
+    wrong = Mixture(two.centres + 0.5, 2 * two.covariances, np.zeros(2))
+    fitted = wrong.refitted(draws, rounds=200)
+    # 10 000 draws in the lighter component: 4 % is four standard errors of a variance.
+    np.testing.assert_allclose(fitted.weights, [0.75, 0.25], atol=0.02)
+    np.testing.assert_allclose(fitted.centres, two.centres, atol=0.06)
+    np.testing.assert_allclose(fitted.covariances, two.covariances, rtol=0.06, atol=0.04)
+
+
+def test_a_component_without_draws_keeps_its_shape_and_a_little_weight(two):
+    draws = np.random.default_rng(0).normal(size=(500, 2)) * 0.1
+    far = Mixture(np.add(two.centres, [[0, 0], [1e3, 0]]), two.covariances, two.log_weights)
+    fitted = far.refitted(draws)
+    np.testing.assert_allclose(fitted.covariances[1], two.covariances[1], rtol=1e-3, atol=1e-12)
+    assert fitted.weights[1] == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_mixture_refuses_what_is_not_one():
+    with pytest.raises(InputError, match="centres"):
+        Mixture(np.zeros((1, 2)), np.eye(2), np.zeros(1))
+    with pytest.raises(InputError, match="not positive definite"):
+        Mixture(np.zeros((1, 2)), -np.eye(2)[None], np.zeros(1))
+
+
+def test_the_mode_is_found_and_its_curvature():
+    log_density = LogDensity(gas_spring(relative_sd=0.1, seed=1))
+    mode = find_mode(log_density, np.array([1.15, -2.0]))
+    assert mode.status is Status.CONVERGED
+    around = mode.centre + 0.05 * np.sqrt(np.diag(mode.covariance)) * np.array(
+        [[1, 0], [-1, 0], [0, 1], [0, -1]]
+    )
+    top, _ = log_density(mode.centre[None])
+    assert np.all(log_density(around)[0] < top)
+    # Verbeek (1993), Appendix A: at the mode the two blocks decouple but for the weak prior.
+    approximate = gauss_newton_covariance(log_density, mode.centre)
+    np.testing.assert_allclose(np.diag(mode.covariance), np.diag(approximate), rtol=0.03)
+
+
+def test_both_modes_of_the_narrow_prior_are_components_once():
+    log_density = LogDensity(gas_spring(relative_sd=0.01, seed=1))
+    mixture = laplace_mixture(log_density, np.array([[1.227], [1.04], [1.22]]))
+    np.testing.assert_allclose(sorted(mixture.centres[:, 0]), [1.0460, 1.2230], atol=1e-3)
+
+
+def test_without_a_maximum_the_covariance_is_gauss_newton_s_and_says_so():
+    @dataclass(frozen=True)
+    class Saddle(GasSpring):
+        def misfit(self, theta):
+            fine = super().misfit(np.full_like(theta, 1.2))
+            fine.sum_of_squares[:, 0, 0] -= 0.05 * (theta[:, 0] - 1.2) ** 2
+            return fine
+
+    log_density = LogDensity(Saddle(measured(1), Normal(1.2, 100.0)))
+    mode = find_mode(log_density, np.array([1.2, -4.0]), iterations=1)
+    assert mode.status is Status.SINGULAR
+    assert np.all(np.linalg.eigvalsh(mode.covariance) > 0)
+
+
+def test_a_start_that_cannot_be_evaluated_is_refused():
+    @dataclass(frozen=True)
+    class Nothing(GasSpring):
+        def misfit(self, theta):
+            fine = super().misfit(theta)
+            fine.status[:] = Status.INADMISSIBLE
+            return fine
+
+    log_density = LogDensity(Nothing(measured(1), Normal(1.0, 0.1)))
+    with pytest.raises(InputError, match="admissible"):
+        laplace_mixture(log_density, np.array([[1.2]]))
+    dead = Mode(np.zeros(2), np.eye(2), -np.inf, Status.NOT_FINITE)
+    with pytest.raises(InputError, match="no mode"):
+        mixture_of([dead])

@@ -1,0 +1,100 @@
+"""Every move leaves a Gaussian as it is; emcee's snooker does not."""
+
+import emcee
+import numpy as np
+import pytest
+from posterior_targets import Gaussian
+
+from bayesoleo.posterior import Mixture
+from bayesoleo.posterior.moves import (
+    Counted,
+    Grouped,
+    IndependenceMove,
+    SnookerMove,
+    differential_evolution,
+)
+
+
+def second_moment(move, dimension: int, scale: float, *, groups: int, steps: int) -> float:
+    """Mean of (x / scale)^2 over all walkers after some steps from exact draws."""
+    each = 4 * (dimension + 1)
+    random = np.random.RandomState(7)
+    start = scale * random.standard_normal((groups * each, dimension))
+    target = Gaussian(np.full(dimension, scale))
+    sampler = emcee.EnsembleSampler(
+        len(start), dimension, lambda x: target(x)[0], moves=move, vectorize=True
+    )
+    state = emcee.State(start, random_state=random.get_state())
+    final = sampler.run_mcmc(state, steps, skip_initial_state_check=True, store=False)
+    return float(np.mean((final.coords / scale) ** 2))
+
+
+def make(kind: str, dimension: int, scale: float, groups: int):
+    if kind == "independence":
+        # off in place and size, as a mixture is that was fitted to few draws
+        centre = np.full((1, dimension), 0.2 * scale)
+        covariance = (1.2 * scale) ** 2 * np.eye(dimension)[None]
+        return IndependenceMove(Mixture(centre, covariance, np.zeros(1)))
+    within = {
+        "differential": differential_evolution,
+        "snooker": SnookerMove,
+        "emcee's snooker": emcee.moves.DESnookerMove,
+    }[kind]()
+    return Grouped(within, groups)
+
+
+def tolerance(dimension: int, groups: int) -> float:
+    """Four standard errors of a mean of chi-squares: stationary walkers are independent."""
+    return 4 * np.sqrt(2 / (groups * 4 * (dimension + 1) * dimension))
+
+
+KINDS = ["differential", "snooker", "independence"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("dimension", "scale"), [(2, 0.1), (4, 10.0), (9, 1.0)])
+def test_moves_are_stationary(kind, dimension, scale):
+    groups = 60
+    move = make(kind, dimension, scale, groups)
+    moment = second_moment(move, dimension, scale, groups=groups, steps=60)
+    assert moment == pytest.approx(1.0, abs=tolerance(dimension, groups))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dimension", [2, 4, 9])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_moves_are_stationary_to_half_a_percent(kind, dimension, scale):
+    groups = 6000 // dimension
+    move = make(kind, dimension, scale, groups)
+    moment = second_moment(move, dimension, scale, groups=groups, steps=150)
+    assert moment == pytest.approx(1.0, abs=tolerance(dimension, groups))
+
+
+@pytest.mark.parametrize("dimension", [2, 4, 9])
+def test_the_snooker_of_emcee_has_another_target(dimension):
+    groups = 360 // dimension  # the bias is smallest in two dimensions, 0.11
+    move = make("emcee's snooker", dimension, 1.0, groups)
+    moment = second_moment(move, dimension, 1.0, groups=groups, steps=60)
+    assert moment < 1.0 - tolerance(dimension, groups)
+
+
+def test_ensembles_in_one_call_do_not_mix():
+    # Two ensembles far apart, each flat along the first coordinate: differences stay within one.
+    random = np.random.RandomState(3)
+    start = random.standard_normal((24, 2))
+    start[12:, 0] += 1e6
+    sampler = emcee.EnsembleSampler(
+        24, 2, lambda x: np.zeros(len(x)), moves=Grouped(SnookerMove(), 2), vectorize=True
+    )
+    state = emcee.State(start, random_state=random.get_state())
+    final = sampler.run_mcmc(state, 3, skip_initial_state_check=True)
+    assert np.all(np.abs(final.coords[:12, 0]) < 1e5)
+    assert np.all(np.abs(final.coords[12:, 0] - 1e6) < 1e5)
+
+
+def test_acceptance_is_counted():
+    move = Counted("differential", Grouped(differential_evolution(), 2))
+    second_moment(move, 2, 1.0, groups=2, steps=5)
+    assert move.proposed == 5 * 24
+    assert 0 < move.accepted < move.proposed

@@ -1,0 +1,166 @@
+"""Sampling against closed forms and quadrature, and when it stops."""
+
+import numpy as np
+import pytest
+from posterior_gas_spring import gas_spring, quadrature
+from posterior_targets import Banana, Gaussian
+
+from bayesoleo.errors import InputError
+from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
+
+
+def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
+    sd = np.asarray(sd, dtype=float)
+    return Mixture((off * sd)[None], np.diag((stretch * sd) ** 2)[None], np.zeros(1))
+
+
+def within_error(samples, mean, sd):
+    """Mean and standard deviation within four Monte Carlo errors, from the effective size."""
+    flat = samples.draws.reshape(-1, samples.draws.shape[-1])
+    error = 4 / np.sqrt(samples.effective_size)
+    np.testing.assert_array_less(np.abs(flat.mean(axis=0) - mean) / sd, error)
+    # The error of a normal's standard deviation is sd / sqrt(2 n); doubled for heavier tails.
+    np.testing.assert_array_less(np.abs(flat.std(axis=0) / sd - 1), error)
+
+
+@pytest.mark.parametrize("dimension", [1, 2, 9])
+def test_a_gaussian_from_a_start_that_is_off(dimension):
+    sd = 10.0 ** np.linspace(-3, 3, dimension)
+    samples = sample(Gaussian(sd), normal_mixture(sd, off=0.5, stretch=1.5), seed=1, progress=False)
+    assert samples.reached
+    assert samples.warning == ""
+    assert samples.effective_size.min() >= 1000
+    within_error(samples, np.zeros(dimension), sd)
+
+
+@pytest.mark.slow
+def test_a_curved_density_that_no_mixture_fits():
+    target = Banana(np.ones(4))
+    samples = sample(target, normal_mixture(np.ones(4)), seed=1, progress=False)
+    assert samples.reached
+    # Variance of x^2 / 2 is 1/2, so the curved coordinates have variance 3/2.
+    within_error(samples, np.zeros(4), np.sqrt([1, 1.5, 1.5, 1.5]))
+
+
+def grid(problem):
+    """Means and standard deviations of theta and ln v, and the probability of the upper mode."""
+    theta, log_v = np.linspace(0.98, 1.28, 1501), np.linspace(-6.5, 2.5, 451)
+    density = quadrature(problem, theta, log_v)
+    moments = []
+    for axis, marginal in (
+        (theta, np.trapezoid(density, log_v, axis=1)),
+        (log_v, np.trapezoid(density, theta, axis=0)),
+    ):
+        mean = np.trapezoid(axis * marginal, axis)
+        moments.append((mean, np.sqrt(np.trapezoid((axis - mean) ** 2 * marginal, axis))))
+    upper = np.trapezoid(np.trapezoid(density, log_v, axis=1)[theta > 1.13], theta[theta > 1.13])
+    return np.array(moments), upper
+
+
+def test_the_gas_spring_agrees_with_quadrature():
+    problem = gas_spring(relative_sd=0.1, seed=1)
+    log_density = LogDensity(problem)
+    mixture = laplace_mixture(log_density, np.array([[1.2]]))
+    samples = sample(log_density, mixture, seed=2, effective_size=4000, progress=False)
+    moments, _ = grid(problem)
+    within_error(samples, moments[:, 0], moments[:, 1])
+    assert samples.failures == {}
+    np.testing.assert_allclose(
+        log_density.evaluations, samples.evaluations, atol=200
+    )  # the rest went into the mode
+
+
+# Of 60 noise seeds these have the upper mode at 0.22, 0.36, 0.64 and 0.86: both modes matter.
+@pytest.mark.parametrize("noise", [0, 19, 13, 28])
+def test_the_weights_of_both_modes_agree_with_quadrature(noise):
+    problem = gas_spring(relative_sd=0.01, seed=noise)
+    log_density = LogDensity(problem)
+    mixture = laplace_mixture(log_density, np.array([[1.227], [1.04]]))
+    samples = sample(log_density, mixture, seed=3, effective_size=2000, progress=False)
+    _, upper = grid(problem)
+    share = np.mean(samples.theta > 1.13)
+    # theta is hardly more than which mode it is in, so its effective size is that of the share.
+    error = np.sqrt(upper * (1 - upper) / samples.effective_size[0])
+    assert samples.reached
+    assert share == pytest.approx(upper, abs=4 * error)
+
+
+def test_a_seed_gives_the_same_draws_whatever_the_threads():
+    problem = gas_spring(relative_sd=0.1, seed=1)
+    mixture = laplace_mixture(LogDensity(problem), np.array([[1.2]]))
+    runs = [
+        sample(LogDensity(problem, jobs), mixture, seed=5, quick=True, progress=False)
+        for jobs in (None, 3)
+    ]
+    np.testing.assert_array_equal(runs[0].draws, runs[1].draws)
+    other = sample(LogDensity(problem), mixture, seed=6, quick=True, progress=False)
+    assert not np.array_equal(other.draws, runs[0].draws)
+
+
+def test_stopping_early_is_said():
+    samples = sample(
+        Gaussian(np.ones(2)),
+        normal_mixture(np.ones(2)),
+        seed=1,
+        effective_size=1e6,
+        max_evaluations=20_000,
+        progress=False,
+    )
+    assert not samples.reached
+    assert "stopped before 20000 evaluations" in samples.warning
+    assert "of 1000000 asked for" in samples.warning
+    assert samples.evaluations <= 20_000
+
+
+def test_a_limit_that_allows_nothing_is_refused():
+    with pytest.raises(InputError, match="no draw could be kept"):
+        sample(
+            Gaussian(np.ones(2)),
+            normal_mixture(np.ones(2)),
+            seed=1,
+            max_evaluations=100,
+            progress=False,
+        )
+
+
+class Nowhere(Gaussian):
+    def __call__(self, phi):
+        height, by_run = super().__call__(phi)
+        self.failures["inadmissible"] += len(phi)
+        return np.full_like(height, -np.inf), by_run
+
+
+def test_a_start_without_a_finite_walker_is_refused():
+    with pytest.raises(InputError, match=r"found no point of finite log density.*inadmissible"):
+        sample(Nowhere(np.ones(2)), normal_mixture(np.ones(2)), seed=1, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"walkers": 4}, "even number of walkers"),
+        ({"ensembles": 1}, "at least two"),
+        ({"effective_size": 0}, "must be positive"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, match):
+    with pytest.raises(InputError, match=match):
+        sample(Gaussian(np.ones(2)), normal_mixture(np.ones(2)), seed=1, progress=False, **settings)
+    with pytest.raises(InputError, match="another dimension"):
+        sample(Gaussian(np.ones(3)), normal_mixture(np.ones(2)), seed=1, progress=False)
+
+
+def test_a_bar_is_shown(capsys):
+    sample(Gaussian(np.ones(2)), normal_mixture(np.ones(2)), seed=1, quick=True)
+    assert "200/200" in capsys.readouterr().err
+
+
+def test_draws_are_chosen_once_each():
+    samples = sample(
+        Gaussian(np.ones(2)), normal_mixture(np.ones(2)), seed=1, quick=True, progress=False
+    )
+    theta, variance = choose_draws(samples, 50, seed=0)
+    assert theta.shape == (50, 2)
+    assert variance.shape == (50, 0)
+    again, _ = choose_draws(samples, 50, seed=0)
+    np.testing.assert_array_equal(theta, again)
