@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 #: Least correlation between a record and itself one period later, in the channel that repeats best.
 LEAST_CORRELATION = 0.5
 
+#: Highest orders that take part in finding the frequency, step by step: the valley that a harmonic
+#: of order k sees is k times narrower.
+LADDER = (3, 12, 48, np.inf)
+
 
 @dataclass(frozen=True)
 class Frequency:
@@ -217,38 +221,47 @@ def _no_period(scaled: Array, nominal: float, time_step: float) -> CampaignError
 
 
 def _gauss_newton(values: Array, step: float) -> tuple[float, float, int]:
-    """Refine cycles per sample; stops at a thousandth of the standard deviation."""
+    """Refine cycles per sample, first on low harmonics, whose valley is wide, then on all."""
     highest = HarmonicBasis(values.shape[1], step).highest
-    state = _State(values, step, highest)
-    iterations = 0
-    while iterations < 30:
-        iterations += 1
+    steps = 0
+    for limit in LADDER:
+        # The last rung stops at a thousandth of the standard deviation, the others before it.
+        tolerance = 0.3 if limit < highest else 1e-3
+        state, taken = _descend(_State(values, step, highest, limit), values, tolerance)
+        step, steps = state.step, steps + taken
+        if limit >= highest:
+            break
+    return state.step, state.sd, steps
+
+
+def _descend(state: _State, values: Array, tolerance: float) -> tuple[_State, int]:
+    taken = 0
+    while taken < 30 and abs(state.newton) > max(tolerance * state.sd, 1e-14 * state.step):
         change = state.newton
-        trial = _State(values, state.step + change, highest)
         for _ in range(6):
-            if trial.loss <= state.loss * (1 + 1e-12):
+            trial = _State(values, state.step + change, state.highest, state.limit)
+            # The step that is left has to shrink. The sum of squares is no measure of it: the
+            # harmonics that are only noise take part in that, and move its minimum.
+            if abs(trial.newton) < abs(state.newton):
                 break
             change *= 0.5
-            trial = _State(values, state.step + change, highest)
         else:
             break
-        state = trial
-        if abs(change) < 1e-3 * state.sd or abs(change) < 1e-14 * state.step:
-            break
-    return state.step, state.sd, iterations
+        state, taken = trial, taken + 1
+    return state, taken
 
 
 class _State:
-    """Least squares on harmonics at one frequency: loss, next step, standard deviation.
+    """Least squares on harmonics at one frequency: next step, standard deviation.
 
     The derivative of the signal with respect to frequency is time times its rate of change, of the
     significant harmonics only (of the others it would be noise), less what the harmonics themselves
     can absorb.
     """
 
-    def __init__(self, values: Array, step: float, highest: int) -> None:
+    def __init__(self, values: Array, step: float, highest: int, limit: float) -> None:
         samples = values.shape[1]
-        self.step = step
+        self.step, self.highest, self.limit = step, highest, limit
         basis = HarmonicBasis(samples, step, highest)
         coefficients = basis.coefficients(values)
         residual = values - basis.evaluate(coefficients)
@@ -256,11 +269,7 @@ class _State:
         power = np.sum(residual**2, axis=1) / (samples - basis.size)
         # Noise-free records are fitted to rounding; a floor there keeps the weights finite.
         variance = np.maximum(power, (1e-12 * rms) ** 2 + 1e-300)
-        # Sum of the logarithms is the likelihood with each channel's noise unknown: no channel's
-        # unit matters.
-        self.loss = float(np.sum(np.log(variance))) * samples
-        self.loss = float(np.exp(self.loss / (samples * values.shape[0])))
-        rate = _rate(basis, coefficients, residual)
+        rate = _rate(basis, coefficients, residual, limit)
         time = np.arange(samples) - 0.5 * (samples - 1)
         slope = time * rate
         slope -= basis.fit(slope)
@@ -271,21 +280,25 @@ class _State:
         self.newton = float(np.sum(slope * residual / variance[:, None]) / information)
         # The score's variance under the noise's own spectrum: red noise moves the frequency more
         # than white.
-        score = np.sum(_coloured_power(slope, residual) / variance**2)
+        share = basis.size / samples
+        score = np.sum(_coloured_power(slope, residual, share) / variance**2)
         self.sd = float(np.sqrt(max(score, 1e-300)) / information)
 
 
-def _rate(basis: HarmonicBasis, coefficients: NDArray[np.complex128], residual: Array) -> Array:
-    """Derivative per cycle of each channel's significant harmonics, at the samples."""
+def _rate(
+    basis: HarmonicBasis, coefficients: NDArray[np.complex128], residual: Array, limit: float
+) -> Array:
+    """Derivative per cycle of each channel's significant harmonics up to ``limit``."""
     kept = np.zeros_like(coefficients)
     for channel, (amplitudes, rest) in enumerate(zip(coefficients, residual, strict=True)):
         variances, bins = coefficient_variances(basis, rest)
         mask = significant_orders(amplitudes, variances, bins, FALSE_DISCOVERY_RATE)
+        mask &= basis.orders <= limit
         kept[channel, mask] = amplitudes[mask]
     return basis.evaluate(2j * np.pi * basis.orders * kept)
 
 
-def _coloured_power(slope: Array, residual: Array, bins: int = 24) -> Array:
+def _coloured_power(slope: Array, residual: Array, share: float, bins: int = 24) -> Array:
     """Variance of ``slope @ noise`` by channel, the noise having the residual's spectrum."""
     samples = slope.shape[1]
     transfer = np.abs(fft.rfft(slope, axis=1)) ** 2
@@ -298,7 +311,5 @@ def _coloured_power(slope: Array, residual: Array, bins: int = 24) -> Array:
     double[0] = 1.0
     if samples % 2 == 0:
         double[-1] = 1.0
-    # Harmonic bins of the residual are empty by construction; the share of fitted coefficients
-    # makes up for them.
-    freedom = np.sum(double * spectrum, axis=1) / np.maximum(np.sum(residual**2, axis=1), 1e-300)
-    return np.sum(double * transfer * smooth, axis=1) / samples / freedom
+    # Bins on harmonics are empty in the residual; the smoothed spectrum is lower by their share.
+    return np.sum(double * transfer * smooth, axis=1) / samples / (1.0 - share)

@@ -150,8 +150,8 @@ def _fetch(name: str, known: RegisteredSet, wanted: Sequence[str]) -> Path:
             hint=f"it has {', '.join(known.hashes)}",
         )
     folder = Path(pooch.os_cache("bayesoleo")) / name
-    fetcher = pooch.create(path=folder, base_url=known.url, registry=known.hashes)
     try:
+        fetcher = pooch.create(path=folder, base_url=known.url, registry=known.hashes)
         for file in wanted:
             fetcher.fetch(file)
     except (

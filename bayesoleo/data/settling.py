@@ -13,9 +13,9 @@ Array = NDArray[np.float64]
 #: Chance of dropping the first period of a settled channel whose noise is stationary.
 FALSE_ALARM = 1e-4
 
-#: Least excess of a first period's mean square over the noise's. Less than this, half a standard
-#: deviation of the noise, costs less than the period is worth.
-LEAST_EXCESS = 0.25
+#: Least excess of a first period's mean square over the noise's. Less than this, 0.7 standard
+#: deviations of the noise, costs less than the period is worth.
+LEAST_EXCESS = 0.5
 
 
 def whole_periods(samples: int, step: float) -> int:

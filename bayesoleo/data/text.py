@@ -83,12 +83,13 @@ def sniff_delimiter(lines: list[str]) -> str:
     str
         A character, or ``whitespace``.
     """
-    best, most = ",", 1
+    best, most = ",", (0.0, 1)
     for candidate in _SNIFFED:
         counts = {len(_split(line, candidate)) for line in lines}
-        # A decimal comma also splits alike; a candidate that leaves cells numeric is the delimiter.
-        if len(counts) == 1 and max(counts) > most and _numeric_share(lines, candidate) > 0.5:
-            best, most = candidate, max(counts)
+        rank = (_numeric_share(lines, candidate), max(counts))
+        # The one that leaves numbers comes first: a decimal comma, too, splits all lines alike.
+        if len(counts) == 1 and max(counts) > 1 and rank > most:
+            best, most = candidate, rank
     return best
 
 
@@ -108,7 +109,8 @@ def _is_number(cell: str) -> bool:
 
 def _numeric_share(lines: list[str], delimiter: str) -> float:
     cells = [cell for line in lines for cell in _split(line, delimiter)]
-    return sum(_is_number(cell) for cell in cells) / max(len(cells), 1)
+    numbers = sum(_is_number(cell) or bool(_DECIMAL_COMMA.match(cell)) for cell in cells)
+    return numbers / max(len(cells), 1)
 
 
 def _find_header(path: Path) -> tuple[str, int, list[str]]:

@@ -1,0 +1,43 @@
+"""Exact transforms against plain linear algebra."""
+
+import numpy as np
+import pytest
+
+from bayesoleo.data.transforms import ChirpTransform, HarmonicBasis, highest_order
+
+
+@pytest.mark.parametrize("step", [0.0301, -0.2, 1 / 37.3])
+def test_chirp_is_the_sum_it_stands_for(step):
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(2, 50)) + 1j * rng.normal(size=(2, 50))
+    table = np.exp(-2j * np.pi * step * np.outer(np.arange(50), np.arange(70)))
+    np.testing.assert_allclose(ChirpTransform(50, 70, step)(values), values @ table, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("period", "samples"),
+    [(37.3, 149), (40.0, 120), (37.9, 100), (12.5, 25), (20.02, 41), (41, 410)],
+)
+def test_fit_is_least_squares(period, samples):
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=samples) + 5.0
+    basis = HarmonicBasis(samples, 1 / period)
+    phase = 2 * np.pi * np.outer(np.arange(samples) / period, basis.orders)
+    design = np.hstack([np.cos(phase), np.sin(phase[:, 1:])])
+    solution = np.linalg.lstsq(design, values, rcond=None)[0]
+    # 1e-10 is the conjugate gradients' 1e-13 times the worst condition number here.
+    np.testing.assert_allclose(basis.fit(values), design @ solution, atol=1e-10)
+    expected = solution[: basis.highest + 1].astype(complex)
+    expected[1:] -= 1j * solution[basis.highest + 1 :]
+    np.testing.assert_allclose(basis.coefficients(values), expected, atol=1e-10)
+
+
+def test_projection_is_idempotent_and_keeps_harmonics():
+    rng = np.random.default_rng(3)
+    basis = HarmonicBasis(4096, 1 / 1002.3)
+    once = basis.fit(rng.normal(size=4096))
+    np.testing.assert_allclose(basis.fit(once), once, atol=1e-10)
+
+
+def test_highest_order_of_whole_and_fractional_periods():
+    assert [highest_order(1 / period) for period in (1024, 1025, 1025.7, 8)] == [511, 512, 512, 3]

@@ -1,0 +1,213 @@
+"""Loading: what is good reads in SI, what is not is told in one line."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from conftest import TOML, table
+
+from bayesoleo.data import load_campaign
+from bayesoleo.errors import CampaignError
+
+
+def test_good_campaign_is_read_in_si(make_campaign):
+    folder = make_campaign()
+    campaign = load_campaign(folder)
+    run = campaign.run("a")
+    assert campaign.controlled == "displacement"
+    assert campaign.channels["force"].si_unit == "N"
+    assert run.samples["displacement"][0] == pytest.approx(3e-3)
+    assert run.samples["force"][0] == pytest.approx(1200.0)
+    assert run.conditions["initial_pressure"] == pytest.approx(4.9e5)
+    assert run.condition_sd["initial_pressure"] == pytest.approx(1e4)
+    assert run.condition_units["initial_pressure"] == "Pa"
+    assert run.time_step == 0.02
+    assert load_campaign(folder / "campaign.toml").sha256 == campaign.sha256
+
+
+def test_checksum_covers_toml_and_files(make_campaign):
+    folder = make_campaign()
+    whole = hashlib.sha256((folder / "campaign.toml").read_bytes())
+    whole.update(hashlib.sha256((folder / "a.csv").read_bytes()).digest())
+    assert load_campaign(folder).sha256 == whole.hexdigest()
+
+
+def test_samples_cannot_be_changed(make_campaign):
+    run = load_campaign(make_campaign()).runs[0]
+    with pytest.raises(ValueError, match="read-only"):
+        run.samples["force"][0] = 0.0
+
+
+def test_scale_comes_before_offset(make_campaign):
+    folder = make_campaign(
+        {'unit = "mm"': 'unit = "mm"\nscale = -2.0\noffset = 5.0\naccuracy = 0.26'}
+    )
+    campaign = load_campaign(folder)
+    expected = (-2.0 * table()[:, 1] + 5.0) * 1e-3
+    np.testing.assert_allclose(campaign.runs[0].samples["displacement"], expected, atol=1e-8)
+    assert campaign.channels["displacement"].accuracy == pytest.approx(0.26e-3)
+
+
+def test_mean_is_removed_after_the_cut(make_campaign):
+    rows = table()
+    rows[:20, 1] += 1e3
+    folder = make_campaign(
+        {
+            'unit = "mm"': 'unit = "mm"\noffset = "-mean"',
+            "frequency = 1.0": "frequency = 1.0\nstart = 0.4",
+        },
+        rows,
+    )
+    run = load_campaign(folder).runs[0]
+    assert run.time[0] == pytest.approx(0.4)
+    assert run.samples["displacement"].mean() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_sample_rate_and_window(make_campaign):
+    change = "frequency = 1.0\nsample_rate = 100.0\nstart = 0.1\nstop = 1.2\n"
+    folder = make_campaign({"frequency = 1.0": change.replace("1.0\ns", "2.0\ns", 1)})
+    run = load_campaign(folder).runs[0]
+    assert run.time.size == 111
+    assert run.time[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 9])
+def test_rounded_time_stamps_are_forgiven(make_campaign, decimals):
+    rows = table()
+    rows[:, 0] = np.round(np.arange(len(rows)) / 151.7, decimals)
+    rows[:, 1:] = table(3.0, 50)[:, 1:]
+    run = load_campaign(make_campaign({"frequency = 1.0": "frequency = 3.0"}, rows)).runs[0]
+    assert run.time_step == pytest.approx(1 / 151.7, rel=10.0 ** (-decimals))
+    assert np.ptp(np.diff(run.time)) < 1e-12
+
+
+def changed(column, row, value):
+    rows = table()
+    rows[row, column] = value
+    return rows
+
+
+BAD_VALUES = [
+    (changed(1, 30, np.nan), "run a, column x_mm: 1 missing value.* first at 0.6 s"),
+    (changed(1, slice(60, 62), np.inf), "run a, column x_mm: 2 missing value"),
+    (changed(0, 30, 0.1), "run a, column time_s: time does not increase in row 31"),
+    (changed(0, 30, np.nan), "run a, column time_s: no time in row 31"),
+    (np.delete(table(), 30, axis=0), "run a, column time_s: gap of 2 samples at 0.58 s"),
+    (changed(0, 30, 0.607), "run a, column time_s: spacing at .* instead of 0.02 s"),
+    (
+        changed(2, slice(None), 1.0),
+        "run a, column f_kN: channel is constant .got 1.0.; make it a condition",
+    ),
+    (table(1.5), r"run a, key frequency: fewer than two periods .*\(got 1.0\)"),
+    (
+        changed(1, slice(20, None), np.nan),
+        "run a, column x_mm, key delimiter: column is more than half empty",
+    ),
+]
+
+
+@pytest.mark.parametrize(("rows", "message"), BAD_VALUES)
+def test_bad_values(make_campaign, rows, message):
+    with pytest.raises(CampaignError, match=f"file a.csv, {message}") as caught:
+        load_campaign(make_campaign(rows=rows))
+    assert "\n" not in str(caught.value)
+
+
+BAD_TOML = [
+    ({"format = 1": "format = 2"}, r"key format: unknown .* format \(got 2\); write format = 1"),
+    ({"format = 1": ""}, "key format: unknown campaign format .*write format = 1"),
+    ({"format = 1": "format = ="}, "campaign.toml: not valid TOML"),
+    ({'name = "small"': ""}, "key name: missing"),
+    ({'name = "small"': "name = 3"}, r"key name: wrong kind of value \(got 3\)"),
+    (
+        {'controlled = "disp': 'controled = "disp'},
+        "key controled: unknown key; did you mean 'controlled'",
+    ),
+    (
+        {'controlled = "displacement"': 'controlled = "dis"'},
+        "controlled channel is not declared .*one of: displ",
+    ),
+    (
+        {'column = "x_mm"': 'column = "x_m"'},
+        "run a, column x_m: no such column; did you mean 'x_mm'.*f_kN",
+    ),
+    ({'column = "x_mm"': 'colum = "x_mm"'}, "key channels.displacement.colum: unknown key"),
+    (
+        {'unit = "mm"': 'unit = "furlog"'},
+        r"key channels.displacement.unit: unknown unit \(got 'furlog'\)",
+    ),
+    ({'unit = "kN"': 'unit = "lb"'}, "key channels.force.unit: unit does not measure force .*lbf"),
+    (
+        {'unit = "mm"': 'unit = "mm"\nscale = 0.0'},
+        "key channels.displacement.scale: must not be zero",
+    ),
+    ({'unit = "mm"': 'unit = "mm"\noffset = "mean"'}, "displacement.offset: wrong kind .*'-mean'"),
+    (
+        {'file = "a.csv"': 'file = "b.csv"'},
+        "file b.csv, run a: no such file; the folder holds a.csv",
+    ),
+    (
+        {'kind = "periodic"': 'kind = "periodical"'},
+        "key kind: unknown kind .*did you mean 'periodic'",
+    ),
+    ({'kind = "periodic"': 'role = "holdout"'}, "key role: unknown role .*did you mean 'hold-out'"),
+    ({'kind = "periodic"': 'role = "hold-out"'}, "key role: no run to fit"),
+    ({'kind = "periodic"': 'kind = "transient"'}, "transient run with a frequency"),
+    ({"frequency = 1.0": ""}, "run a, key frequency: periodic run without frequency"),
+    ({"frequency = 1.0": "frequency = -1"}, r"key frequency: must be positive \(got -1"),
+    (
+        {"frequency = 1.0": "frequency = 30"},
+        "key frequency: fewer than four samples a period at 50 Hz",
+    ),
+    (
+        {"frequency = 1.0": "frequency = 1.0\nfreq = 2"},
+        "run a, key freq: unknown key; did you mean",
+    ),
+    ({"frequency = 1.0": "frequency = 1.0\ntime = 't'"}, "run a, column t: no such column"),
+    (
+        {"frequency = 1.0": "frequency = 1.0\ntime = 't'\nsample_rate = 1"},
+        "time and sample_rate are both",
+    ),
+    (
+        {"frequency = 1.0": "frequency = 1.0\nstart = 9.0"},
+        "key start: nothing is left .*from 0 to 2.98 s",
+    ),
+    (
+        {"frequency = 1.0": "frequency = 1.0\nstart = 2.0\nstop = 1.0"},
+        "key stop: stop is not after start",
+    ),
+    (
+        {'{ value = 4.9, unit = "bar", sd = 0.1 }': "4.9e5"},
+        "conditions.initial_pressure: malformed condition",
+    ),
+    (
+        {'4.9, unit = "bar"': '4.9, unit = "K"'},
+        "initial_pressure.unit: unit does not measure pressure",
+    ),
+    ({"sd = 0.1": "sd = -0.1"}, "conditions.initial_pressure.sd: must be positive"),
+    ({"sd = 0.1": "std = 0.1"}, "conditions.initial_pressure.std: unknown key"),
+    ({"format = 1": 'format = 1\ndataset = "silverboks"'}, "key dataset: data set is not here"),
+]
+
+
+@pytest.mark.parametrize(("replace", "message"), BAD_TOML)
+def test_bad_declarations(make_campaign, replace, message):
+    with pytest.raises(CampaignError, match=message) as caught:
+        load_campaign(make_campaign(replace))
+    assert "\n" not in str(caught.value)
+
+
+def test_two_runs_of_one_label(make_campaign):
+    run = TOML[TOML.index("[[runs]]") :]
+    with pytest.raises(CampaignError, match="run a, key label: two runs have this label"):
+        load_campaign(make_campaign({run: run + run}))
+
+
+def test_no_campaign(tmp_path):
+    with pytest.raises(CampaignError, match=r"campaign.toml: no such file; a campaign is a folder"):
+        load_campaign(tmp_path)
+
+
+def test_unknown_run(make_campaign):
+    with pytest.raises(CampaignError, match="run b: no such run; one of: a"):
+        load_campaign(make_campaign()).run("b")

@@ -1,0 +1,102 @@
+"""Run files of every kind give the same columns."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import xarray as xr
+
+from bayesoleo.data.files import read_columns
+from bayesoleo.errors import CampaignError
+
+VALUES = np.column_stack([np.arange(8) * 0.5, np.arange(8.0) ** 2, np.linspace(-1, 1, 8)])
+
+
+def text(delimiter, header):
+    lines = [delimiter.join(f"{cell:.9g}" for cell in row) for row in VALUES]
+    return "\n".join([header, *lines]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "options"),
+    [
+        (text(",", "t,a,b"), {}),
+        (text(";", "t;a;b"), {}),
+        (text("\t", "t\ta\tb"), {}),
+        (text("  ", "t a b"), {}),
+        (text("  ", "#t,a,b"), {"delimiter": "whitespace", "header_delimiter": ","}),
+        (text(" ", "# t,a,b"), {}),
+        ("# made by hand\n\n" + text(",", '"t","a","b"'), {}),
+        ("\ufeff" + text(",", "# t, a, b").replace("\n", "\r\n"), {}),
+    ],
+)
+def test_text(tmp_path, content, options):
+    path = tmp_path / "run.exp"
+    path.write_bytes(content.encode())
+    check(read_columns(path, **options))
+
+
+def check(columns):
+    for name, expected in zip(("t", "a", "b"), VALUES.T, strict=True):
+        np.testing.assert_allclose(columns[name], expected, rtol=1e-8)
+
+
+def test_binary_formats(tmp_path):
+    columns = dict(zip(("t", "a", "b"), VALUES.T, strict=True))
+    scipy.io.savemat(tmp_path / "run.mat", columns | {"note": "hand made", "rate": 2.0})
+    pd.DataFrame(columns | {"note": ["x"] * 8}).to_parquet(tmp_path / "run.parquet")
+    data = xr.Dataset({name: ("sample", values) for name, values in columns.items()})
+    data.to_netcdf(tmp_path / "run.nc", engine="h5netcdf")
+    for name in ("run.mat", "run.parquet", "run.nc"):
+        found = read_columns(tmp_path / name)
+        assert set(found) == {"t", "a", "b"}
+        check(found)
+
+
+def test_text_in_a_column_that_is_not_wanted_does_not_matter(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t,a,note\n0,1,good\n1,2,bad\n")
+    assert set(read_columns(path, wanted={"t", "a"})) == {"t", "a"}
+    with pytest.raises(CampaignError, match=r"column note: not a number in row 1 \(got 'good'\)"):
+        read_columns(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "file is empty"),
+        ("t,a\n", "header and no values"),
+        ("1,2\n3,4\n", "file has no header .*name the columns in line 1"),
+        (
+            "t;a\n0,1;2,5\n1,0;3,5\n",
+            r"column t: not a number in row 1 \(got '0,1'\); write decimal points",
+        ),
+        ("t,a,b\n0,1\n1,2\n", "key delimiter: header has 3 columns and the values 2"),
+        ("t,a,a\n0,1,1\n1,2,1\n", "column a: two columns have this name"),
+        (
+            "t,a,b\n0,1,\n1,2,\n2,3,\n",
+            "column b, key delimiter: column is more than half empty when split by ','",
+        ),
+        ("t,a\n0,1\n1,2,3\n", "key delimiter: lines differ in their number of cells"),
+    ],
+)
+def test_bad_text(tmp_path, content, message):
+    path = tmp_path / "run.csv"
+    path.write_text(content)
+    with pytest.raises(CampaignError, match=message):
+        read_columns(path)
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".parquet", ".nc"])
+def test_broken_binary_file(tmp_path, suffix):
+    path = tmp_path / f"run{suffix}"
+    path.write_bytes(b"no such format" * 20)
+    with pytest.raises(CampaignError, match=f"cannot be read as {suffix}|is no|version"):
+        read_columns(path)
+
+
+def test_not_text(tmp_path):
+    path = tmp_path / "run.xls"
+    path.write_bytes(bytes(range(128, 256)))
+    with pytest.raises(CampaignError, match="not a text file"):
+        read_columns(path)

@@ -1,0 +1,67 @@
+"""Units: SI factors and names, pounds per square inch of both kinds, and inverses."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bayesoleo.data.units import check_kind, parse_unit
+from bayesoleo.errors import CampaignError
+
+UNITS = [
+    "mm",
+    "in",
+    "kN",
+    "lbf",
+    "bar",
+    "psi",
+    "psia",
+    "psig",
+    "degC",
+    "K",
+    "mV",
+    "rpm",
+    "1",
+    "m/s",
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "si", "si_name"),
+    [
+        ("mm", 1.0, 1e-3, "m"),
+        ("kN", 2.0, 2000.0, "N"),
+        ("bar", 1.0, 1e5, "Pa"),
+        ("psia", 100.0, 689475.729, "Pa"),
+        ("psig", 100.0, 689475.729, "Pa"),
+        ("degC", 20.0, 293.15, "K"),
+        ("degF", 68.0, 293.15, "K"),
+        ("lbf", 1.0, 4.4482216, "N"),
+        ("V", 1.0, 1.0, "V"),
+        ("Hz", 3.0, 3.0, "Hz"),
+        ("1", 3.0, 3.0, "1"),
+        ("W/K", 1.0, 1.0, "kilogram*meter^2/kelvin/second^3"),
+    ],
+)
+def test_to_si(name, value, si, si_name):
+    unit = parse_unit(name)
+    assert float(unit.to_si(value)) == pytest.approx(si, rel=1e-7)
+    assert unit.si_name == si_name
+
+
+@given(st.sampled_from(UNITS), st.floats(-1e6, 1e6))
+def test_inverse(name, value):
+    unit = parse_unit(name)
+    # A temperature's shift of 273 K costs its absolute rounding.
+    assert np.isclose(unit.from_si(unit.to_si(value)), value, rtol=1e-12, atol=1e-10)
+
+
+def test_unknown_unit():
+    with pytest.raises(CampaignError, match=r"unknown unit \(got 'foo/bar'\)"):
+        parse_unit("foo/bar")
+
+
+def test_kind():
+    check_kind("initial_pressure", parse_unit("psia"))
+    with pytest.raises(CampaignError, match=r"does not measure temperature \(got 'bar'\)"):
+        check_kind("ambient_temperature", parse_unit("bar"))

@@ -1,0 +1,90 @@
+"""What is written reads back."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bayesoleo.data import SimulatedRun, load_campaign, write_campaign
+from bayesoleo.errors import CampaignError
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+NAMES = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=8)
+CHANNELS = {
+    "displacement": ("x", "mm"),
+    "gas_pressure": ("p", "psig"),
+    "gas_temperature": ("T", "degC"),
+}
+
+
+def simulated(label, rng, conditions=None, **more):
+    time = np.arange(40) / 10 + more.pop("start", 0.0)
+    scale = {"displacement": 0.1, "gas_pressure": 1e6, "gas_temperature": 300.0}
+    samples = {name: size * rng.random(40) for name, size in scale.items()}
+    more.setdefault("frequency", 0.6)
+    return SimulatedRun(label, time, samples, conditions=conditions or {}, **more)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    text=TEXT,
+    labels=st.lists(NAMES, min_size=1, max_size=3, unique=True),
+    condition=NAMES.filter(lambda name: not name.endswith(("pressure", "force", "temperature"))),
+    value=st.floats(-1e9, 1e9),
+    start=st.integers(0, 1000),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_round_trip(text, labels, condition, value, start, seed):
+    rng = np.random.default_rng(seed)
+    conditions = {condition: (value, "mm", 0.5)}
+    runs = [simulated(label, rng, conditions, group=text, start=start / 10) for label in labels]
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "made"
+        write_campaign(target, name=text, description=text, channels=CHANNELS, runs=runs)
+        campaign = load_campaign(target)
+    assert (campaign.name, campaign.description, campaign.controlled) == (text, text, None)
+    for written, read in zip(runs, campaign.runs, strict=True):
+        assert (written.label, written.group, written.role) == (read.label, read.group, read.role)
+        assert read.frequency == written.frequency
+        assert read.conditions[condition] == pytest.approx(value * 1e-3, rel=1e-14)
+        assert read.condition_sd[condition] == pytest.approx(5e-4)
+        np.testing.assert_allclose(read.time, written.time, atol=1e-9)
+        for name, values in written.samples.items():
+            np.testing.assert_allclose(read.samples[name], values, rtol=1e-13, atol=1e-13)
+
+
+def test_transient_and_controlled(tmp_path):
+    run = simulated("drop", np.random.default_rng(1), kind="transient", frequency=None)
+    write_campaign(tmp_path, name="d", channels=CHANNELS, runs=[run], controlled="displacement")
+    campaign = load_campaign(tmp_path)
+    assert campaign.controlled == "displacement"
+    assert campaign.runs[0].frequency is None
+    assert (tmp_path / "drop.csv").is_file()
+
+
+def test_files_are_not_overwritten(tmp_path):
+    runs = [simulated("a", np.random.default_rng(1))]
+    write_campaign(tmp_path, name="one", channels=CHANNELS, runs=runs)
+    with pytest.raises(CampaignError, match=r"folder is not empty; .*overwrite=True"):
+        write_campaign(tmp_path, name="two", channels=CHANNELS, runs=runs)
+    write_campaign(tmp_path, name="two", channels=CHANNELS, runs=runs, overwrite=True)
+    assert load_campaign(tmp_path).name == "two"
+
+
+@pytest.mark.parametrize(
+    ("channels", "labels", "message"),
+    [
+        ({"displacement": ("x,y", "mm")}, ["a"], "column x,y: .*without commas"),
+        ({"displacement": ("time_s", "mm")}, ["a"], "column time_s: .*of its own"),
+        ({"displacement": ("x", "furlog")}, ["a"], "unknown unit"),
+        ({"displacement": ("x", "mm")}, ["a", "a"], "run a: two runs have this label"),
+        ({"force": ("f", "N")}, ["a"], "run a, column f: channel 'force' has no sample"),
+    ],
+)
+def test_what_would_not_read_back_is_refused(tmp_path, channels, labels, message):
+    runs = [simulated(label, np.random.default_rng(1)) for label in labels]
+    with pytest.raises(CampaignError, match=message):
+        write_campaign(tmp_path, name="n", channels=channels, runs=runs)
