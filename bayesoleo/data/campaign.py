@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,7 +144,7 @@ def load_campaign(path: str | os.PathLike[str]) -> Campaign:
         description=declaration.description,
         controlled=declaration.controlled,
         path=toml.parent,
-        channels=MappingProxyType(dict(declaration.channels)),
+        channels=dict(declaration.channels),
         runs=runs,
         sha256=_checksum(toml, [folder / run.file for run in declaration.runs]),
     )
@@ -172,11 +171,11 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         wanted |= {declared.time} if declared.time else set(_TIME_COLUMNS)
         file = folder / declared.file
         columns = read_columns(file, declared.delimiter, declared.header_delimiter, wanted)
-        time = _time(declared, columns, channels)
-        part = window(time, declared.start, declared.stop)
-        time = _frozen(time[part])
+        whole = _time(declared, columns, channels)
+        part = window(whole, declared.start, declared.stop)
+        time = _frozen(whole[part])
         samples = {
-            name: _samples(channel, columns, part, time) for name, channel in channels.items()
+            name: _samples(channel, columns, whole, part) for name, channel in channels.items()
         }
         _check_periods(declared, time)
     except CampaignError as error:
@@ -197,10 +196,10 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         kind=declared.kind,
         frequency=declared.frequency,
         time=time,
-        samples=MappingProxyType(samples),
-        conditions=MappingProxyType(dict(declared.conditions)),
-        condition_units=MappingProxyType(dict(declared.condition_units)),
-        condition_sd=MappingProxyType(dict(declared.condition_sd)),
+        samples=samples,
+        conditions=dict(declared.conditions),
+        condition_units=dict(declared.condition_units),
+        condition_sd=dict(declared.condition_sd),
     )
 
 
@@ -234,12 +233,13 @@ def _time(
     )
 
 
-def _samples(channel: Channel, columns: Mapping[str, Array], part: slice, time: Array) -> Array:
-    values = _column(columns, channel.column)[part]
+def _samples(channel: Channel, columns: Mapping[str, Array], time: Array, part: slice) -> Array:
+    values = _column(columns, channel.column)
     if values.size != time.size:
         raise CampaignError(
             f"column has {values.size} samples and time {time.size}", column=channel.column
         )
+    values, time = values[part], time[part]
     missing = np.flatnonzero(~np.isfinite(values))
     if missing.size:
         raise CampaignError(

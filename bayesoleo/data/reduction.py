@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -138,7 +137,7 @@ def reduce_run(run: Run) -> Record:
     time = run.time[first:]
     step = found.value * run.time_step
     basis = HarmonicBasis(time.size, step)
-    kept = {name: _frozen(channel[first:]) for name, channel in zip(names, values, strict=True)}
+    kept = {name: channel[first:] for name, channel in zip(names, values, strict=True)}
     return _record(
         run,
         time,
@@ -146,12 +145,8 @@ def reduce_run(run: Run) -> Record:
         frequency=found.value,
         frequency_sd=found.sd,
         periods=int(np.floor(time.size * step + 0.5)),
-        harmonics=MappingProxyType(
-            {name: significant_harmonics(basis, channel) for name, channel in kept.items()}
-        ),
-        signal_noise=MappingProxyType(
-            {name: average_on(basis, channel).sigma for name, channel in kept.items()}
-        ),
+        harmonics={name: significant_harmonics(basis, channel) for name, channel in kept.items()},
+        signal_noise={name: average_on(basis, channel).sigma for name, channel in kept.items()},
         dropped_periods=dropped,
     )
 
@@ -176,20 +171,15 @@ def _settle(values: Array, time_step: float, nominal: float) -> tuple[Frequency,
     return found, first, dropped
 
 
-def _frozen(values: Array) -> Array:
-    values = np.ascontiguousarray(values)
-    values.setflags(write=False)
-    return values
-
-
 def _record(run: Run, time: Array, samples: Mapping[str, Array], **reduced: Any) -> Record:
     return Record(
         label=run.label,
         group=run.group,
         role=run.role,
         kind=run.kind,
-        time=_frozen(time),
-        samples=MappingProxyType(dict(samples)),
+        # Writable copies: kernels would compile once more for read-only arrays.
+        time=np.array(time),
+        samples={name: np.array(values) for name, values in samples.items()},
         conditions=run.conditions,
         condition_sd=run.condition_sd,
         **reduced,
@@ -204,8 +194,6 @@ def _transient(run: Run) -> Record:
         frequency=float("nan"),
         frequency_sd=float("nan"),
         periods=0,
-        harmonics=MappingProxyType({}),
-        signal_noise=MappingProxyType(
-            {name: innovation_noise(values) for name, values in run.samples.items()}
-        ),
+        harmonics={},
+        signal_noise={name: innovation_noise(values) for name, values in run.samples.items()},
     )

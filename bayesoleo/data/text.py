@@ -8,12 +8,15 @@ import warnings
 from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -172,6 +175,8 @@ def _header_names(
 
 
 def _read_cells(path: Path, skip: int, separator: str, width: int) -> pd.DataFrame:
+    import pandas as pd
+
     try:
         with warnings.catch_warnings():
             # A line longer than the others is no more than a warning to pandas.
@@ -195,6 +200,8 @@ def _read_cells(path: Path, skip: int, separator: str, width: int) -> pd.DataFra
 
 
 def _numbers(path: Path, name: str, column: pd.Series) -> Array:
+    import pandas as pd
+
     if column.dtype.kind in "biuf":
         return column.to_numpy(dtype=float)
     numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)

@@ -4,6 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
+import scipy.io
 from conftest import TOML, table
 
 from bayesoleo.data import load_campaign
@@ -211,3 +212,13 @@ def test_no_campaign(tmp_path):
 def test_unknown_run(make_campaign):
     with pytest.raises(CampaignError, match="run b: no such run; one of: a"):
         load_campaign(make_campaign()).run("b")
+
+
+def test_columns_of_different_length(make_campaign):
+    folder = make_campaign({'"a.csv"': '"a.mat"', "frequency = 1.0": "frequency = 1.0\nstop = 2.0"})
+    time, displacement, force = table().T
+    columns = {"time_s": time[:-1], "x_mm": displacement, "f_kN": force}
+    scipy.io.savemat(folder / "a.mat", columns)
+    message = "run a, column x_mm: column has 150 samples and time 149"
+    with pytest.raises(CampaignError, match=message):
+        load_campaign(folder)

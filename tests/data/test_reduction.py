@@ -1,5 +1,7 @@
 """Runs to records."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,13 @@ def test_threads_and_progress_change_nothing(tmp_path, capsys):
         assert left.frequency == right.frequency
         assert left.signal_noise == right.signal_noise
     assert "reduce" in capsys.readouterr().err
+
+
+def test_records_travel_between_processes(tmp_path):
+    whole = reduced(tmp_path, [simulated(np.random.default_rng(10))])
+    copy = pickle.loads(pickle.dumps(whole))
+    np.testing.assert_array_equal(copy.records[0].time, whole.records[0].time)
+    assert whole.records[0].samples["force"].flags.writeable
 
 
 def test_transient(tmp_path):
