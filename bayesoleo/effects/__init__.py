@@ -10,7 +10,7 @@ A catalogue effect, and one of your own:
 'drag'
 """
 
-from bayesoleo.effects.catalogue import candidates, catalogue, find_effect
+from bayesoleo.effects.catalogue import candidates, catalogue, describe, find_effect
 from bayesoleo.effects.effect import (
     FAMILIES,
     Amplitude,
@@ -33,6 +33,7 @@ __all__ = [
     "State",
     "candidates",
     "catalogue",
+    "describe",
     "find_effect",
     "force_effect",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterable
 from functools import cache
+from typing import Any
 
 from bayesoleo.effects import (
     compliance,
@@ -19,7 +20,7 @@ from bayesoleo.effects import (
     stiffness,
     thermal,
 )
-from bayesoleo.effects.effect import Candidate, Effect, Scales
+from bayesoleo.effects.effect import Amplitude, Candidate, Constant, Effect, Scales, Shape
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 
@@ -92,3 +93,36 @@ def candidates(
         for target in effect.places(model)
         if f"{effect.id} at {target}" not in exclude and not effect.is_in(model, target)
     ]
+
+
+def describe(effect: Effect) -> dict[str, Any]:
+    """What a listing says of an effect, ready for JSON.
+
+    Returns
+    -------
+    dict
+        ``id``, ``family``, ``title``, ``formula`` (LaTeX), ``parameters`` (name to ``unit``,
+        ``latex``, ``description``, ``kind``, ``sign``), ``source``, ``applies_to``. Units are in
+        words of the place: ``force``, ``position``, ``channel``, ``parameter``.
+    """
+    parameters: dict[str, dict[str, Any]] = {}
+    for item in effect.amplitudes:
+        by_run = "amplitude by run" if item.by_run else "amplitude"
+        parameters[item.name] = _entry(item, item.latex, by_run) | {"sign": item.sign, "null": 0.0}
+    for shape in effect.shapes:
+        parameters[shape.name] = _entry(shape, shape.latex, "shape")
+    for constant in effect.constants:
+        parameters[constant.name] = _entry(constant, "", "constant")
+    return {
+        "id": effect.id,
+        "family": effect.family,
+        "title": effect.title,
+        "formula": effect.formula,
+        "parameters": parameters,
+        "source": effect.source,
+        "applies_to": effect.applies_to,
+    }
+
+
+def _entry(item: Amplitude | Shape | Constant, latex: str, kind: str) -> dict[str, Any]:
+    return {"unit": item.unit, "latex": latex, "description": item.description, "kind": kind}

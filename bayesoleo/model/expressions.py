@@ -85,6 +85,7 @@ def parse(
     known: Mapping[str, sp.Expr],
     dynamic: Iterable[str],
     where: str,
+    whole: Mapping[str, sp.Expr] | None = None,
 ) -> sp.Expr:
     """Turn text into an expression over known names.
 
@@ -98,6 +99,9 @@ def parse(
         The names that have time derivatives: dofs and inputs.
     where : str
         Shown in errors: ``equation 'stroke', term 'damping'``.
+    whole : mapping of str to sympy.Expr, optional
+        What stands behind names of definitions; used inside time derivatives only, so that
+        elsewhere a name stays a name and follows when it is redefined.
 
     Raises
     ------
@@ -115,7 +119,8 @@ def parse(
         tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
         raise ModelError(f"{where}: not an expression", value=text, hint=hint) from error
-    built = sp.sympify(_Builder(dict(known), tuple(dynamic), where, text).visit(tree.body))
+    builder = _Builder({**known}, {**known, **(whole or {})}, tuple(dynamic), where, text)
+    built = sp.sympify(builder.visit(tree.body))
     if built.has(sp.nan, sp.zoo, sp.oo, -sp.oo, sp.I):
         raise ModelError(f"{where}: not a finite real number", value=text, hint="mind 1/0 and 0/0")
     return built
@@ -134,9 +139,15 @@ class _Builder(ast.NodeVisitor):
     """Builds an expression from a syntax tree; nothing is evaluated as Python."""
 
     def __init__(
-        self, known: Mapping[str, sp.Expr], dynamic: tuple[str, ...], where: str, text: str
+        self,
+        known: Mapping[str, sp.Expr],
+        whole: Mapping[str, sp.Expr],
+        dynamic: tuple[str, ...],
+        where: str,
+        text: str,
     ):
-        self.known, self.dynamic, self.where, self.text = known, dynamic, where, text
+        self.known, self.whole, self.dynamic = known, whole, dynamic
+        self.where, self.text = where, text
 
     def generic_visit(self, node: ast.AST) -> sp.Expr:
         raise ModelError(
@@ -177,9 +188,9 @@ class _Builder(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> sp.Expr:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
+        if re.fullmatch("d+ot", name) and len(node.args) == 1:
+            return self._time_derivative(node.args[0], len(name) - 2)
         arguments = [sp.sympify(self.visit(argument)) for argument in node.args]
-        if re.fullmatch("d+ot", name) and len(arguments) == 1:
-            return self._time_derivative(arguments[0], len(name) - 2)
         function = FUNCTIONS.get(name)
         if function is None or not callable(function) or node.keywords:
             allowed = ", ".join(sorted(FUNCTIONS))
@@ -194,7 +205,9 @@ class _Builder(ast.NodeVisitor):
             raise ModelError(f"{self.where}: {name} takes {wanted}", value=self.text)
         return function(*arguments)
 
-    def _time_derivative(self, expression: sp.Expr, order: int) -> sp.Expr:
+    def _time_derivative(self, argument: ast.expr, order: int) -> sp.Expr:
+        inside = _Builder(self.whole, self.whole, self.dynamic, self.where, self.text)
+        expression = sp.sympify(inside.visit(argument))
         for _ in range(order):
             expression = total_derivative(expression, self.dynamic)
         return expression

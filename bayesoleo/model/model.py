@@ -151,20 +151,21 @@ class Model:
 
     def _parse(self, text: Text, where: str) -> sp.Expr:
         known = self._known() | {name: symbol(name) for name in self.definitions}
-        if isinstance(text, str) and "dot(" in text:
-            # A derivative of a definition needs what stands behind its name.
-            known |= {name: self.expand(body) for name, body in self.definitions.items()}
-        return parse(text, known, self._dynamic, f"model {self.name!r}, {where}")
+        where = f"model {self.name!r}, {where}"
+        return parse(text, known, self._dynamic, where, self._whole(self.definitions))
+
+    def _whole(self, definitions: Mapping[str, sp.Expr]) -> dict[str, sp.Expr]:
+        """What stands behind the names of definitions: a time derivative needs that."""
+        whole: dict[str, sp.Expr] = {}
+        for name, body in definitions.items():
+            whole[name] = body.xreplace({symbol(other): item for other, item in whole.items()})
+        return whole
 
     def _parse_definitions(self) -> dict[str, sp.Expr]:
         known, parsed = self._known(), dict[str, sp.Expr]()
-        whole = dict(known)
         for name, text in self.definitions.items():
-            # A derivative of a definition needs what stands behind its name.
-            names = whole if isinstance(text, str) and "dot(" in text else known
             where = f"model {self.name!r}, definition {name!r}"
-            parsed[name] = parse(text, names, self._dynamic, where)
-            whole[name] = parsed[name].xreplace({symbol(k): whole[k] for k in parsed if k != name})
+            parsed[name] = parse(text, known, self._dynamic, where, self._whole(parsed))
             known[name] = symbol(name)
         return parsed
 
@@ -223,7 +224,7 @@ class Model:
         """Named terms of an output."""
         terms = self.outputs[name].terms
         assert isinstance(terms, Mapping)  # made so on construction
-        return terms  # type: ignore[return-value]
+        return terms
 
     def order(self, dof: str) -> int:
         """Order of a dof: of its highest derivative in equations and outputs, at least one."""

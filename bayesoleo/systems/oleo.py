@@ -1,29 +1,55 @@
-"""The oleo of Verbeek (1993): gas spring, orifice damping and pressure-dependent friction; mechanical and thermo-mechanical.
+"""The oleo of Verbeek (1993): gas spring, orifice damping and friction; mechanical and thermal.
 
-Parametrised physically, so that a change of the initial volume reaches every coefficient it is in; the thesis's theta are definitions of
-these. Code ``f16nXdZ``: X dofs, Z outputs. Stroke is positive in compression, pressure is gauge.
+Parametrised physically, so that a change of the initial volume reaches every coefficient it is in;
+the thesis's theta are definitions of these. The ``thesis`` variants do as the thesis did: theta_4
+and theta_6 and one more are estimated, the rest of the theta are numbers, although the area and the
+volume are in them. Code ``f16nXdZ``: X dofs, Z outputs. Stroke is positive in compression, pressure
+is gauge.
 """
 
 from __future__ import annotations
 
 from bayesoleo.model import Condition, Dof, Model, Output, Parameter
 
-GAS_CONSTANT = 8.314  # J/(mol K)
-GAS_CONSTANT_NITROGEN = 296.8  # J/(kg K)
+#: Solubility coefficient theta_7 of the tables, in 1/K: the physical sign is positive.
+THETA_7 = 1.42e-4
 
 
 def _common_parameters() -> dict[str, Parameter]:
-    """Nominal values of the thesis, section 6 and tables C.1 and D.1 of the digest."""
+    """Nominal values of Verbeek (1993), tables C.1 and D.1."""
     return {
         "mass": Parameter(25.0, "kg", fixed=True, latex="m"),
         "gravity": Parameter(9.81, "m/s**2", fixed=True, latex="g"),
-        "orifice_damping": Parameter(2897.0, "kg/m", fixed=True, latex="\\theta_3", description="rho/(2 C_d^2) sum A_h^3/A_o^2"),
+        "orifice_damping": Parameter(
+            2897.0,
+            "kg/m",
+            fixed=True,
+            latex="\\theta_3",
+            description="rho/(2 C_d^2) sum A_h^3/A_o^2",
+        ),
         "piston_area": Parameter(3484e-6, "m**2", relative_sd=0.1, latex="A_p"),
         "initial_volume": Parameter(9.20e-4, "m**3", relative_sd=0.1, latex="V_0"),
         "ambient_pressure": Parameter(1.0e5, "Pa", fixed=True, latex="p_a"),
         "friction_base": Parameter(65.0, "N", relative_sd=0.5, latex="\\theta_8"),
         "friction_per_pressure": Parameter(2.0e-5, "m**2", relative_sd=0.5, latex="\\theta_9"),
-        "friction_slope": Parameter(3400.0, "s/m", relative_sd=0.5, bounds=(100.0, 1e5), latex="\\theta_{10}"),
+        "friction_slope": Parameter(
+            3400.0, "s/m", relative_sd=0.5, bounds=(100.0, 1e5), latex="\\theta_{10}"
+        ),
+    }
+
+
+def _gas_constants() -> dict[str, Parameter]:
+    return {
+        "specific_heat": Parameter(743.0, "J/(kg*K)", fixed=True, latex="c_v"),
+        "specific_gas_constant": Parameter(296.8, "J/(kg*K)", fixed=True, latex="R_{N_2}"),
+        "gas_constant": Parameter(8.314, "J/(mol*K)", fixed=True, latex="R"),
+    }
+
+
+def _conditions() -> dict[str, Condition]:
+    return {
+        "initial_pressure": Condition("Pa", 4.9e5, "absolute, at full extension"),
+        "ambient_temperature": Condition("K", 293.0),
     }
 
 
@@ -42,26 +68,35 @@ def _motion() -> dict[str, dict[str, str]]:
     }
 
 
+def _energy() -> dict[str, dict[str, str]]:
+    """Energy balance of the gas, Verbeek (1993), eq. 6.4."""
+    return {
+        "temperature": {
+            "storage": "heat_capacity*dot(temperature)",
+            "conduction": "heat_loss",
+            "compression": "-gas_power",
+        }
+    }
+
+
 def _outputs(number: int) -> dict[str, Output]:
     outputs = {"displacement": Output({"stroke": "stroke"}, "m")}
     if number == 2:
-        outputs["pressure"] = Output({"absolute": "gas_pressure", "atmosphere": "-ambient_pressure"}, "Pa")
+        pressure = {"absolute": "gas_pressure", "atmosphere": "-ambient_pressure"}
+        outputs["pressure"] = Output(pressure, "Pa")
     return outputs
 
 
 def mechanical_oleo(outputs: int = 1) -> Model:
-    """Mechanical model ``f16n1d1`` or ``f16n1d2``: one dof, polytropic gas (Verbeek 1993, eqs. 6.1-6.2)."""
+    """Model ``f16n1d1`` or ``f16n1d2``: one dof, polytropic gas (Verbeek 1993, eqs. 6.1-6.2)."""
+    exponent = Parameter(1.10, "", relative_sd=0.1, bounds=(0.9, 1.7), latex="n")
     return Model(
         name=f"f16n1d{outputs}",
         description="Oleo with a polytropic gas spring, driven by force.",
         inputs={"force": "N"},
         dofs={"stroke": Dof("m", guess="initial_volume/piston_area*0.5")},
-        conditions={
-            "initial_pressure": Condition("Pa", 4.9e5, "absolute, at full extension"),
-            "ambient_temperature": Condition("K", 293.0),
-        },
-        parameters=_common_parameters()
-        | {"gas_exponent": Parameter(1.10, "", relative_sd=0.1, bounds=(0.9, 1.7), latex="n")},
+        conditions=_conditions(),
+        parameters=_common_parameters() | {"gas_exponent": exponent},
         definitions={
             "volume_ratio": "1 - piston_area*stroke/initial_volume",
             "temperature_ratio": "1",
@@ -76,15 +111,15 @@ def mechanical_oleo(outputs: int = 1) -> Model:
 
 
 def thermomechanical_oleo(outputs: int = 1) -> Model:
-    """Thermo-mechanical model ``f16n2d1`` or ``f16n2d2``: gas temperature and solubility (Verbeek 1993, eqs. 6.3-6.4).
+    """Model ``f16n2d1`` or ``f16n2d2``: temperature and solubility (Verbeek 1993, eqs. 6.3-6.4).
 
-    Solubility has the physical sign: gas dissolves as pressure rises, dn/dp < 0 and theta_7 = -(dn/dp) R/V_0 > 0, with theta_5 =
-    p_0 (1/T_0 + theta_7), so that the pressure at rest is p_0.
+    Solubility has the physical sign: gas dissolves as pressure rises, dn/dp < 0 and
+    theta_7 = -(dn/dp) R/V_0 > 0, with theta_5 = p_0 (1/T_0 + theta_7), so that the pressure at rest
+    is p_0.
     """
-    parameters = _common_parameters()
+    parameters = _common_parameters() | _gas_constants()
     parameters["solubility"] = Parameter(-1.570e-8, "mol/Pa", relative_sd=0.5, latex="dn/dp")
     parameters["heat_conduction"] = Parameter(2.567, "W/K", relative_sd=0.5, latex="\\theta_{16}")
-    parameters["specific_heat"] = Parameter(743.0, "J/(kg*K)", fixed=True, latex="c_v")
     return Model(
         name=f"f16n2d{outputs}",
         description="Oleo with gas temperature and solubility, driven by force.",
@@ -93,16 +128,15 @@ def thermomechanical_oleo(outputs: int = 1) -> Model:
             "stroke": Dof("m", guess="initial_volume/piston_area*0.5"),
             "temperature": Dof("K", guess="ambient_temperature"),
         },
-        conditions={
-            "initial_pressure": Condition("Pa", 4.9e5, "absolute, at full extension"),
-            "ambient_temperature": Condition("K", 293.0),
-        },
+        conditions=_conditions(),
         parameters=parameters,
         definitions={
-            "solubility_ratio": f"-solubility*{GAS_CONSTANT}/initial_volume",  # theta_7
-            "gas_stiffness": "initial_pressure*(1/ambient_temperature + solubility_ratio)",  # theta_5
+            "solubility_ratio": "-solubility*gas_constant/initial_volume",  # theta_7
+            # theta_5
+            "gas_stiffness": "initial_pressure*(1/ambient_temperature + solubility_ratio)",
+            # theta_15
             "heat_capacity": "initial_pressure*initial_volume*specific_heat"
-            f"/({GAS_CONSTANT_NITROGEN}*ambient_temperature)",  # theta_15
+            "/(specific_gas_constant*ambient_temperature)",
             "volume_ratio": "1 - piston_area*stroke/initial_volume",
             "temperature_ratio": "temperature/ambient_temperature",
             "free_volume_ratio": "volume_ratio + solubility_ratio*temperature",
@@ -111,14 +145,100 @@ def thermomechanical_oleo(outputs: int = 1) -> Model:
             "heat_loss": "heat_conduction*volume_ratio*(temperature - ambient_temperature)",
             "friction_amplitude": "friction_base + friction_per_pressure*gas_pressure",
         },
-        equations=_motion()
-        | {
-            "temperature": {
-                "storage": "heat_capacity*dot(temperature)",
-                "conduction": "heat_loss",
-                "compression": "-gas_power",
-            }
+        equations=_motion() | _energy(),
+        outputs=_outputs(outputs),
+        admissible=["volume_ratio", "free_volume_ratio", "temperature"],
+    )
+
+
+# -- the thesis's own way --------------------------------------------------------------------------
+
+
+def _thesis_parameters() -> dict[str, Parameter]:
+    """Theta_4 and theta_6 with the thesis's priors, sigma = 0.1 theta; the rest fixed."""
+    fixed = {name: _fixed(item) for name, item in _common_parameters().items()}
+    del fixed["piston_area"]
+    return fixed | {
+        "theta_4": Parameter(3484e-6, "m**2", relative_sd=0.1, latex="\\theta_4"),
+        "theta_6": Parameter(-3.787, "1/m", relative_sd=0.1, latex="\\theta_6"),
+        "theta_11": Parameter(
+            -348.4, "N", fixed=True, latex="\\theta_{11}", description="-p_a A_p"
+        ),
+    }
+
+
+def _fixed(item: Parameter) -> Parameter:
+    return Parameter(
+        item.value, item.unit, fixed=True, latex=item.latex, description=item.description
+    )
+
+
+def _thesis_motion() -> dict[str, dict[str, str]]:
+    terms = _motion()["stroke"]
+    return {"stroke": terms | {"gas_spring": "theta_4*gas_pressure", "atmosphere": "theta_11"}}
+
+
+def mechanical_oleo_thesis(outputs: int = 1) -> Model:
+    """``f16n1dZ`` with theta_4, theta_6 and theta_7 estimated (Verbeek 1993, table 6.2)."""
+    exponent = Parameter(1.10, "", relative_sd=0.1, latex="\\theta_7", description="gas exponent")
+    return Model(
+        name=f"f16n1d{outputs}_thesis",
+        description="Oleo with a polytropic gas spring; the thesis's theta, unlinked.",
+        inputs={"force": "N"},
+        dofs={"stroke": Dof("m", guess=0.132)},
+        conditions=_conditions(),
+        parameters=_thesis_parameters() | {"theta_7": exponent},
+        definitions={
+            "volume_ratio": "1 + theta_6*stroke",
+            "temperature_ratio": "1",
+            "free_volume_ratio": "volume_ratio",
+            "gas_pressure": "initial_pressure*temperature_ratio*free_volume_ratio**(-theta_7)",
+            "friction_amplitude": "friction_base + friction_per_pressure*gas_pressure",
         },
+        equations=_thesis_motion(),
+        outputs=_outputs(outputs),
+        admissible=["free_volume_ratio"],
+    )
+
+
+def thermomechanical_oleo_thesis(outputs: int = 1, printed: bool = False) -> Model:
+    """``f16n2dZ`` with theta_4, theta_6 and theta_16 estimated (Verbeek 1993, table 6.5).
+
+    Parameters
+    ----------
+    outputs : int
+        1: displacement; 2: pressure as well.
+    printed : bool
+        Take theta_7 with the negative sign of the tables, which makes gas appear as pressure rises.
+        The text, and the pressures reached, say the opposite; the printed estimates were found
+        with it. Theta_5 = p_0 (1/T_0 + theta_7) either way.
+    """
+    sign = -1.0 if printed else 1.0
+    parameters = _thesis_parameters() | _gas_constants()
+    del parameters["gas_constant"]
+    parameters["theta_7"] = Parameter(sign * THETA_7, "1/K", fixed=True, latex="\\theta_7")
+    parameters["theta_16"] = Parameter(2.567, "W/K", relative_sd=0.1, latex="\\theta_{16}")
+    note = ", theta_7 with the printed sign" if printed else ""
+    return Model(
+        name=f"f16n2d{outputs}_thesis" + ("_printed" if printed else ""),
+        description=f"Oleo with gas temperature; the thesis's theta, unlinked{note}.",
+        inputs={"force": "N"},
+        dofs={"stroke": Dof("m", guess=0.1), "temperature": Dof("K", guess="ambient_temperature")},
+        conditions=_conditions(),
+        parameters=parameters,
+        definitions={
+            "theta_5": "initial_pressure*(1/ambient_temperature + theta_7)",
+            "heat_capacity": "initial_pressure*initial_volume*specific_heat"
+            "/(specific_gas_constant*ambient_temperature)",
+            "volume_ratio": "1 + theta_6*stroke",
+            "temperature_ratio": "temperature/ambient_temperature",
+            "free_volume_ratio": "volume_ratio + theta_7*temperature",
+            "gas_pressure": "theta_5*temperature/free_volume_ratio",
+            "gas_power": "(theta_4*gas_pressure + theta_11)*dot(stroke)",
+            "heat_loss": "theta_16*volume_ratio*(temperature - ambient_temperature)",
+            "friction_amplitude": "friction_base + friction_per_pressure*gas_pressure",
+        },
+        equations=_thesis_motion() | _energy(),
         outputs=_outputs(outputs),
         admissible=["volume_ratio", "free_volume_ratio", "temperature"],
     )

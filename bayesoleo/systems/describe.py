@@ -1,0 +1,126 @@
+"""A model in words: equations as text and as LaTeX, parameters with units and priors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy as sp
+from sympy.printing.latex import LatexPrinter
+from sympy.printing.str import StrPrinter
+
+from bayesoleo.model import Model, Parameter
+from bayesoleo.model.expressions import split_derivative
+
+
+class _Text(StrPrinter):
+    """Prints what :func:`bayesoleo.model.expressions.parse` reads."""
+
+    def _print_Abs(self, expr: sp.Abs) -> str:
+        return f"abs({self._print(expr.args[0])})"
+
+    def _print_Heaviside(self, expr: sp.Heaviside) -> str:
+        return f"step({self._print(expr.args[0])})"
+
+    def _print_Max(self, expr: sp.Max) -> str:
+        return f"max({', '.join(self._print(item) for item in expr.args)})"
+
+    def _print_Min(self, expr: sp.Min) -> str:
+        return f"min({', '.join(self._print(item) for item in expr.args)})"
+
+
+def as_text(expression: sp.Expr) -> str:
+    """Text of an expression, as it would be declared."""
+    return str(_Text().doprint(expression))
+
+
+def as_latex(expression: sp.Expr, model: Model) -> str:
+    """LaTeX of an expression, with the parameters' own symbols and dots for time derivatives."""
+    names = {item: _latex_symbol(item, model) for item in expression.free_symbols}
+    return str(LatexPrinter({"symbol_names": names, "ln_notation": True}).doprint(expression))
+
+
+def _latex_symbol(item: sp.Symbol, model: Model) -> str:
+    name, order = split_derivative(item)
+    parameter = model.parameters.get(name)
+    upright = "\\mathrm{" + name.replace("_", "\\_") + "}"
+    base = parameter.latex if parameter is not None and parameter.latex else upright
+    return base if order == 0 else f"\\{'d' * order}ot{{{base}}}"
+
+
+def equations(model: Model) -> dict[str, str]:
+    """Definitions, equations and outputs as text, by name."""
+    lines = {name: f"{name} = {as_text(body)}" for name, body in model.definitions.items()}
+    for name, terms in model.equations.items():
+        lines[name] = f"{_sum_text(terms)} = 0"
+    for name in model.outputs:
+        lines[f"output {name}"] = f"{name} = {_sum_text(model.output_terms(name))}"
+    return lines
+
+
+def equations_latex(model: Model) -> list[str]:
+    """The same as a list of LaTeX equations."""
+
+    def total(terms: Mapping[str, sp.Expr]) -> str:
+        parts = [as_latex(term, model) for term in terms.values()]
+        return " + ".join(parts).replace("+ -", "-")
+
+    def upright(name: str) -> str:
+        return "\\mathrm{" + name.replace("_", "\\_") + "}"
+
+    lines = [f"{upright(k)} = {as_latex(body, model)}" for k, body in model.definitions.items()]
+    lines += [f"{total(terms)} = 0" for terms in model.equations.values()]
+    lines += [f"{upright(k)} = {total(model.output_terms(k))}" for k in model.outputs]
+    return lines
+
+
+def _sum_text(terms: Mapping[str, sp.Expr]) -> str:
+    return " + ".join(as_text(term) for term in terms.values()).replace("+ -", "- ")
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """Everything that a model declares, ready for JSON.
+
+    Returns
+    -------
+    dict
+        ``name``, ``description``, ``equations`` (name to text), ``equations_latex`` (list),
+        ``inputs``, ``dofs``, ``outputs`` and ``conditions`` (name to unit, or to a mapping with
+        ``unit`` and ``default``), ``parameters`` (name to ``value``, ``unit``, ``fixed``,
+        ``by_run``, ``prior``, ``description``).
+    """
+    return {
+        "name": model.name,
+        "description": model.description,
+        "inputs": dict(model.inputs),
+        "outputs": {name: output.unit for name, output in model.outputs.items()},
+        "dofs": {name: dof.unit for name, dof in model.dofs.items()},
+        "conditions": {
+            name: {"unit": item.unit, "default": item.default, "description": item.description}
+            for name, item in model.conditions.items()
+        },
+        "parameters": {name: _parameter(item) for name, item in model.parameters.items()},
+        "equations": equations(model),
+        "equations_latex": equations_latex(model),
+    }
+
+
+def _parameter(item: Parameter) -> dict[str, Any]:
+    prior = None
+    if item.prior is not None and not item.fixed:
+        low, high = (value if abs(value) < float("inf") else None for value in item.prior.support)
+        prior = {
+            "kind": type(item.prior).__name__,
+            "mean": item.prior.mean,
+            "sd": item.prior.sd,
+            "low": low,
+            "high": high,
+        }
+    return {
+        "value": item.value,
+        "unit": item.unit,
+        "fixed": item.fixed,
+        "by_run": item.by_run,
+        "prior": prior,
+        "description": item.description,
+    }

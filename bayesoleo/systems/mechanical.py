@@ -1,0 +1,121 @@
+"""Springs, dampers and oscillators: the smallest systems that each idea needs."""
+
+from __future__ import annotations
+
+from bayesoleo.model import Dof, Model, Output, Parameter
+
+
+def gas_spring() -> Model:
+    r"""Ideal gas spring, :math:`y = (1/(1-x))^\theta` (Verbeek 1993, section 3.4.2); no dof.
+
+    The truth of the example is :math:`\theta = 1.2`, its start 1.0 with a prior of 10 %.
+    """
+    return Model(
+        name="gas_spring",
+        description="Ideal gas spring, dimensionless: pressure ratio against compression.",
+        inputs={"compression": ""},
+        parameters={"exponent": Parameter(1.0, "", relative_sd=0.1, latex="\\theta")},
+        outputs={"pressure_ratio": Output({"gas": "(1/(1 - compression))**exponent"}, "")},
+        admissible=["1 - compression"],
+    )
+
+
+def viscous_damper() -> Model:
+    """Force law of a damper: proportional to velocity, with an offset of each run's own."""
+    return Model(
+        name="viscous_damper",
+        description="Viscous damper with a force offset by run, driven by displacement.",
+        inputs={"displacement": "m"},
+        parameters={
+            "damping": Parameter(1000.0, "N*s/m", relative_sd=1.0, latex="c"),
+            "force_offset": Parameter(
+                0.0, "N", sd=1000.0, by_run=True, latex="F_0", description="preload and sensor"
+            ),
+        },
+        outputs={
+            "force": Output({"damping": "damping*dot(displacement)", "offset": "force_offset"}, "N")
+        },
+    )
+
+
+def _oscillator() -> dict[str, Parameter]:
+    return {
+        "mass": Parameter(1.0, "kg", fixed=True, latex="m"),
+        "damping": Parameter(0.5, "N*s/m", relative_sd=0.5, latex="c"),
+        "stiffness": Parameter(100.0, "N/m", relative_sd=0.3, latex="k"),
+    }
+
+
+_LINEAR = {
+    "inertia": "mass*ddot(position)",
+    "damping": "damping*dot(position)",
+    "stiffness": "stiffness*position",
+    "excitation": "-force",
+}
+
+
+def linear_oscillator() -> Model:
+    """Mass, damper and spring, driven by a force."""
+    return Model(
+        name="linear_oscillator",
+        description="Linear oscillator driven by force.",
+        inputs={"force": "N"},
+        dofs={"position": Dof("m")},
+        parameters=_oscillator(),
+        equations={"position": _LINEAR},
+        outputs={"displacement": Output({"position": "position"}, "m")},
+    )
+
+
+def duffing() -> Model:
+    """The linear oscillator with a cubic spring (Duffing 1918)."""
+    cubic = Parameter(1.0e4, "N/m**3", relative_sd=0.5, latex="k_3")
+    return Model(
+        name="duffing",
+        description="Duffing oscillator driven by force.",
+        inputs={"force": "N"},
+        dofs={"position": Dof("m")},
+        parameters=_oscillator() | {"cubic_spring": cubic},
+        equations={"position": _LINEAR | {"cubic": "cubic_spring*position**3"}},
+        outputs={"displacement": Output({"position": "position"}, "m")},
+    )
+
+
+def end_stop() -> Model:
+    r"""Oleo-like oscillator with an end stop (Verbeek 1993, section 4.3.3).
+
+    :math:`\ddot q + \dot q|\dot q| + 10 (1/(1-q))^{1.2} + k(q) q - F = 0` with
+    :math:`k = \theta` for :math:`q < 0`, else 0. The thesis forces it by
+    :math:`F = 23 + 20 \cos 2 \pi t`.
+    """
+
+    def number(value: float, unit: str, latex: str) -> Parameter:
+        return Parameter(value, unit, fixed=True, latex=latex)
+
+    return Model(
+        name="end_stop",
+        description="Gas spring with an end stop at zero, driven by force.",
+        inputs={"force": "N"},
+        dofs={"stroke": Dof("m", guess=0.5)},
+        parameters={
+            "mass": number(1.0, "kg", "m"),
+            "orifice_damping": number(1.0, "kg/m", "c_2"),
+            "gas_force": number(10.0, "N", "F_g"),
+            "full_stroke": number(1.0, "m", "L"),
+            "gas_exponent": number(1.2, "", "n"),
+            "stop_stiffness": Parameter(
+                100.0, "N/m", relative_sd=0.5, bounds=(0.0, 1e12), latex="\\theta"
+            ),
+        },
+        equations={
+            "stroke": {
+                "inertia": "mass*ddot(stroke)",
+                "damping": "orifice_damping*dot(stroke)*abs(dot(stroke))",
+                "gas_spring": "gas_force*(1/(1 - stroke/full_stroke))**gas_exponent",
+                "end_stop": "stop_stiffness*min(stroke, 0)",
+                "excitation": "-force",
+            }
+        },
+        outputs={"displacement": Output({"stroke": "stroke"}, "m")},
+        admissible=["1 - stroke/full_stroke"],
+    )
