@@ -50,6 +50,12 @@ def _reach(distance: Array) -> Array:
     return np.where(distance <= _ON_LIMIT, 0.0, _PART * distance)
 
 
+def is_cut(step: Array, room: tuple[Array, Array]) -> bool:
+    """Whether an unknown was stopped on its way to a limit that it does not lie on yet."""
+    reach = _reach(np.where(step < 0, *room))
+    return bool(np.any((reach > 0) & np.isfinite(reach) & (np.abs(step) >= reach)))
+
+
 def on_limit(room: tuple[Array, Array]) -> NDArray[np.bool_]:
     """Which unknowns, shape (l,), lie on a limit of their support."""
     return np.minimum(*room) <= _ON_LIMIT

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.estimation.bounded import is_cut
 from bayesoleo.estimation.equations import Equations
 from bayesoleo.estimation.linearise import Linearised
 from bayesoleo.estimation.objectives import (
@@ -29,9 +30,12 @@ from bayesoleo.solvers.status import Status
 
 # 2**-30 of a step moves nothing that another thirty iterations could use.
 _MAX_HALVINGS = 30
-# Where no step helps: an expected gain of the log density below this means nothing in statistics
-# (0.0014 sd), but may lie below the noise of a solver's own tolerance.
+# Rounding of the merit function, by sample: a step that is worse by less is not worse.
+_ROUNDING = 1e-13
+# Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
+# this means nothing in statistics (0.0014 sd), but may lie below the noise of a solver's tolerance.
 _NEGLIGIBLE_GAIN = 1e-6
+_MANY_HALVINGS = 4
 # Distance to the fixed point, in standard deviations, up to which a small step means convergence.
 _NEAR = 0.1
 
@@ -193,19 +197,20 @@ class _Loop:
                 return Status.NOT_FINITE
             proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
             small = self.is_small(proposal, equations, tolerance)
+            before = self.point
             trial, halvings = self.shorten(proposal, equations, variance)
-            if trial.status.ok and trial is not self.point:
+            if halvings >= _MANY_HALVINGS:
+                gain = 0.5 * float(proposal @ equations.gradient)
+                small = small or gain <= _NEGLIGIBLE_GAIN
+            if trial.status.ok and trial is not before:
                 self.move(trial, halvings)
             elif not small:
-                gain = 0.5 * float(proposal @ equations.gradient)
-                if gain > _NEGLIGIBLE_GAIN:
-                    return Status.NO_CONVERGENCE if trial.status.ok else trial.status
-                small = True
+                return Status.NO_CONVERGENCE if trial.status.ok else trial.status
             if small:
                 self.distance = self.equations(self.variance()).distance()
                 if self.distance <= _NEAR:
                     return Status.CONVERGED
-                if self.step.locks or trial is self.point:
+                if self.step.locks or self.point is before:
                     return Status.NO_CONVERGENCE
             self.state = self.step.accept(self.state, equations.jacobian)
         return Status.NO_CONVERGENCE
@@ -215,7 +220,7 @@ class _Loop:
 
         If there is none: the last that failed, or the current point.
         """
-        merit = self.merit(self.point, variance)
+        merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
         trial = self.point
         for halvings in range(_MAX_HALVINGS + 1):
             trial = self.look(self.point.theta + self.scale.sd * proposal)
@@ -250,6 +255,8 @@ class _Loop:
         return Equations(*rows, slope, self.scale.room(theta))
 
     def is_small(self, proposal: Array, equations: Equations, tolerance: float) -> bool:
+        if is_cut(proposal, equations.room):
+            return False
         size = np.abs(self.scale.sd * proposal)
         unit = np.maximum(np.abs(self.point.theta), self.scale.sd * equations.sd())
         return bool(np.all(size <= tolerance * unit))

@@ -35,7 +35,7 @@ def gas_spring():
 
 @pytest.fixture(scope="session")
 def data_folder():
-    """Find a folder below ``BAYESOLEO_DATA``; without it skip, or fail in continuous integration."""
+    """Find a folder below ``BAYESOLEO_DATA``; without it skip, or fail where ``CI=true``."""
 
     def find(name):
         root = os.environ.get("BAYESOLEO_DATA")

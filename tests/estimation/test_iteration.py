@@ -1,0 +1,158 @@
+"""What the loop promises whatever the problem: it never ends worse, outside or by raising."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bayesoleo.errors import InputError
+from bayesoleo.estimation import METHODS, FunctionProblem, estimate, multistart
+from bayesoleo.model.priors import Normal, TruncatedNormal, Uniform
+from bayesoleo.solvers.status import Status
+
+TIME = np.linspace(0.0, 3.0, 60)
+
+
+def decay(x, theta):
+    return theta[0] * np.exp(-theta[1] * x)
+
+
+def decay_problem(priors, start=None, unit=1.0, seed=4):
+    """A decay whose rate is expressed in any unit: rate[unit] = rate / unit."""
+    y = decay(TIME, [2.0, 1.5]) + np.random.default_rng(seed).normal(0.0, 0.05, TIME.size)
+    return FunctionProblem(
+        lambda x, t: decay(x, [t[0], t[1] * unit]), TIME, y, priors, ["height", "rate"], start
+    )
+
+
+@settings(deadline=None, max_examples=25)
+@given(decades=st.floats(-12, 12), method=st.sampled_from(["be", "mve", "mmve", "mbe"]))
+def test_the_unit_of_a_parameter_does_not_matter(decades, method):
+    unit = 10.0**decades
+    plain = estimate(decay_problem([Normal(1, 1), Normal(1, 1)]), method)
+    other = estimate(decay_problem([Normal(1, 1), Normal(1 / unit, 1 / unit)], unit=unit), method)
+    assert other.iterations == plain.iterations
+    # differences of the two runs are rounding, 1e-16, amplified by the derivative step of 1e-3
+    np.testing.assert_allclose(other.theta * [1, unit], plain.theta, rtol=1e-9)
+    np.testing.assert_allclose(other.sd * [1, unit], plain.sd, rtol=1e-7)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    start=st.tuples(st.floats(-20, 20), st.floats(-4, 20)),
+    method=st.sampled_from(sorted(METHODS)),
+)
+def test_an_estimate_is_never_worse_than_its_start(start, method):
+    point = estimate(decay_problem([Normal(1, 3), Normal(1, 3)]), method, start=start)
+    # a step within rounding, 1e-13 a sample, is not worse
+    assert (np.diff(point.history_objective) >= -1e-10).all()
+    assert np.isfinite(point.theta).all()
+    np.testing.assert_array_equal(point.history[0], start)
+    np.testing.assert_array_equal(point.history[-1], point.theta)
+
+
+@pytest.mark.parametrize("method", ["be", "mbe", "mmve", "levenberg-marquardt"])
+def test_an_estimate_stays_inside_the_support_and_names_the_limit(method):
+    priors = [Normal(1, 1), Uniform(0.0, 1.2)]  # the truth, 1.5, is outside
+    point = estimate(decay_problem(priors), method)
+    assert point.status is Status.CONVERGED
+    assert point.on_limit == ("rate",)
+    assert (point.history[:, 1] <= 1.2).all()
+    # the other unknown is at its optimum given the limit
+    shape = np.exp(-point["rate"] * TIME)
+    y = decay_problem(priors).evaluate(np.zeros(2)).residual[0]
+    expected = shape @ y / (shape @ shape)
+    if method == "be":  # the normal prior of the height pulls towards one
+        weight = shape @ shape / point.variance[0]
+        expected = (weight * expected + 1.0) / (weight + 1.0)
+    assert point["height"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_step_into_failure_is_halved():
+    def root(x, theta):
+        return np.sqrt(theta[0] - x)  # not a number for theta < 3
+
+    y = root(TIME, [3.05])
+    problem = FunctionProblem(root, TIME, y, [Normal(10.0, 100.0)], jacobian=None)
+    point = estimate(problem, tolerance=1e-8, max_iterations=200)
+    assert point.halvings > 0
+    assert point.status is Status.CONVERGED
+    assert point.theta[0] == pytest.approx(3.05, rel=1e-6)
+
+
+def test_a_start_that_cannot_be_evaluated_is_a_status():
+    problem = FunctionProblem(lambda x, t: np.log(t[0]) + x, TIME, TIME, [Normal(-1.0, 1.0)])
+    point = estimate(problem)
+    assert point.status is Status.NOT_FINITE
+    assert point.iterations == 0
+    assert np.isnan(point.covariance).all()
+    assert "not finite" in str(point)
+
+
+def test_an_unknown_without_effect_keeps_its_prior():
+    problem = FunctionProblem(
+        lambda x, t: t[0] * x, TIME, 2 * TIME + np.cos(9 * TIME), [Normal(1, 1), Normal(5, 0.5)]
+    )
+    point = estimate(problem)
+    assert point.status is Status.CONVERGED
+    assert point.theta[1] == 5.0
+    assert point.sd[1] == pytest.approx(0.5)
+    assert np.isnan(point.covariance_likelihood).all()
+
+
+def test_exact_data_do_not_break_the_staged_variance():
+    y = decay(TIME, [2.0, 1.5])
+    problem = FunctionProblem(decay, TIME, y, [Normal(1, 1), Normal(1, 1)])
+    point = estimate(problem)
+    np.testing.assert_allclose(point.theta, [2.0, 1.5], rtol=1e-9)
+    assert np.isfinite(point.objective)
+
+
+def test_too_few_iterations_are_reported():
+    point = estimate(decay_problem([Normal(1, 1), Normal(1, 1)]), max_iterations=2)
+    assert point.status is Status.NO_CONVERGENCE
+    assert point.iterations == 2
+
+
+def test_progress_sees_every_iteration():
+    seen = []
+    point = estimate(decay_problem([Normal(1, 1), Normal(1, 1)]), progress=seen.append)
+    assert [line.number for line in seen] == list(range(point.iterations + 1))
+    np.testing.assert_array_equal([line.theta for line in seen], point.history)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "newton"}, "there is no such estimator .got 'newton'.; use be, mve, mmve, mbe"),
+        ({"start": [1.0]}, "one finite number per unknown.*height, rate"),
+        ({"start": [1.0, np.nan]}, "one finite number per unknown"),
+        ({"start": [1.0, -1.0]}, "key rate: start lies outside.*use a value between 0 and 4"),
+    ],
+)
+def test_bad_input_says_what_to_write(options, message):
+    problem = decay_problem([Normal(1, 1), TruncatedNormal(1, 1, 0, 4)])
+    with pytest.raises(InputError, match=message):
+        estimate(problem, **options)
+
+
+def test_a_bias_correction_needs_samples():
+    problem = FunctionProblem(lambda x, t: t[0] * x, TIME[:1], [1.0], [Normal(1, 1)])
+    with pytest.raises(InputError, match="too few samples"):
+        estimate(problem, bias_corrected=True)
+
+
+def test_drawing_starts_needs_a_generator():
+    with pytest.raises(InputError, match=r"needs a generator.*default_rng"):
+        multistart(decay_problem([Normal(1, 1), Normal(1, 1)]), 2)
+
+
+def test_given_starts_are_used_in_any_number_of_threads():
+    problem = decay_problem([Normal(1, 1), Normal(1, 1)])
+    starts = [[0.5, 0.5], [3.0, 2.0]]
+    one, two = multistart(problem, starts), multistart(problem, starts, jobs=2)
+    assert len(one) == len(two) == 1
+    assert one.hits == two.hits == (6,)
+    np.testing.assert_array_equal(one[0].theta, two[0].theta)
