@@ -35,7 +35,10 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
 
     names = chosen(tree, MOST) if parameters is None else list(parameters)
     values = [draws(tree, name).ravel() for name in names]
-    scales = [engineering(unit_of(tree, n), style.magnitude(v)) for n, v in zip(names, values, strict=True)]
+    scales = [
+        engineering(unit_of(tree, n), style.magnitude(v))
+        for n, v in zip(names, values, strict=True)
+    ]
     shown = np.column_stack([s.factor * v for s, v in zip(scales, values, strict=True)])
     point = point_table(tree)
     truths = [
@@ -61,7 +64,10 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
     )
     _arrange(figure, len(names))
     _tidy(figure, names, scales, shown)
-    handles = [style.band(style.AFTER, "posterior"), style.line(style.BEFORE, "point estimate", 1.2)]
+    handles = [
+        style.band(style.AFTER, "posterior"),
+        style.line(style.BEFORE, "point estimate", 1.2),
+    ]
     if len(names) > 1:
         figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=style.TEXT)
     return figure

@@ -37,7 +37,9 @@ def chosen(tree: xr.DataTree, most: int) -> list[str]:
         In the order of the posterior.
     """
     posterior = tree[schema.POSTERIOR].to_dataset()
-    names = [str(n) for n in posterior.data_vars if posterior[n].dims == (schema.CHAIN, schema.DRAW)]
+    names = [
+        str(n) for n in posterior.data_vars if posterior[n].dims == (schema.CHAIN, schema.DRAW)
+    ]
     new = _new_parameters(tree)
 
     def rank(name: str) -> tuple[bool, bool, int]:

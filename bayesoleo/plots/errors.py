@@ -15,7 +15,7 @@ from bayesoleo import schema
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
-LEFT, TOP, BOTTOM, ROW = 1.9, 0.85, 0.6, 0.3
+LEFT, TOP, BOTTOM, ROW = 2.4, 0.85, 0.6, 0.3
 
 
 def error(tree: xr.DataTree) -> Figure:
@@ -76,15 +76,16 @@ def _column(
         axes.axvline(1.0, color=style.INK, lw=1.0, zorder=0.5)
         values.append(1.0)
     for row, label in enumerate(labels):
-        pair = [factor * runs[label][key] if runs.get(label, {}).get(key) else None for runs in (first, last)]
+        pair = [
+            factor * runs[label][key] if runs.get(label, {}).get(key) else None
+            for runs in (first, last)
+        ]
         _dumbbell(axes, row, pair[0], pair[1], two)
     _logarithmic(axes, factor * np.array(values or [1.0]))
     axes.set_xlabel(text, fontsize=style.TEXT)
 
 
-def _dumbbell(
-    axes: Axes, row: int, before: float | None, after: float | None, two: bool
-) -> None:
+def _dumbbell(axes: Axes, row: int, before: float | None, after: float | None, two: bool) -> None:
     """One run: where it was, where it is, and the way between."""
     if before is None or after is None:
         place = axes.get_yaxis_transform()
@@ -122,7 +123,6 @@ def _bracket(axes: Axes, role: str, middle: float, colour: str) -> None:
         (12 - LEFT * 72, 0),
         xycoords=("axes fraction", "data"),
         textcoords="offset points",
-        rotation=90,
         va="center",
         fontsize=style.SMALL,
         color=colour,
@@ -157,7 +157,9 @@ def _unit(tree: xr.DataTree, output: str) -> str:
 def _handles(two: bool) -> list[style.Artist]:
     """What the marks mean."""
     point = {"marker": "o", "ls": "", "ms": 6.5}
-    hollow = Line2D([], [], mfc="white", mec=style.BEFORE, mew=1.6, label="before", **point)  # type: ignore[arg-type]
-    full = Line2D([], [], color=style.AFTER, label="after" if two else "error", **point)  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    hollow = Line2D([], [], mfc="white", mec=style.BEFORE, mew=1.6, label="before", **point)
+    # type: ignore[arg-type]
+    full = Line2D([], [], color=style.AFTER, label="after" if two else "error", **point)
     floor = Line2D([], [], color=style.INK, lw=1.0, label="noise floor")
     return [hollow, full, floor] if two else [full, floor]

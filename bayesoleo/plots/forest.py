@@ -53,9 +53,7 @@ def point_against_posterior(tree: xr.DataTree) -> Figure:
     return figure
 
 
-def _row(
-    axes: Axes, row: int, values: np.ndarray, point: tuple[float, float, str]
-) -> float:
+def _row(axes: Axes, row: int, values: np.ndarray, point: tuple[float, float, str]) -> float:
     """One parameter; gives how far it reaches."""
     estimate, linear_sd, unit = point
     mean, sd = float(values.mean()), float(values.std()) or 1.0

@@ -51,6 +51,8 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)
     axes.set_xlim(0.0, max(1.02 * largest, 10.0))
     axes.set_xlabel("share of the excess error explained in %", fontsize=style.TEXT)
+    if not shown:
+        axes.text(0.2, 0.5, "no candidate was scored", va="center", color=style.FAINT)
     _explain(figure, entry, len(candidates) - len(shown))
     return figure
 
@@ -78,18 +80,28 @@ def format_p(value: float | None) -> str:
     """A p-value; None, where it was not computed, gives nothing."""
     if value is None:
         return ""
-    return "p < 0.001" if value < 1e-3 else f"p = {value:.3f}" if value < 0.1 else f"p = {value:.2f}"
+    return (
+        "p < 0.001" if value < 1e-3 else f"p = {value:.3f}" if value < 0.1 else f"p = {value:.2f}"
+    )
 
 
-def _bar(axes: Axes, row: int, candidate: dict[str, Any], accepted: str | None, letter: str) -> None:
+def _bar(
+    axes: Axes, row: int, candidate: dict[str, Any], accepted: str | None, letter: str
+) -> None:
     """One candidate: bar, share, p-value and class."""
     first = candidate["effect"] == accepted
     similar = accepted is not None and accepted in candidate["indistinguishable_from"]
     colour = style.AFTER if first else style.SIMILAR if similar else style.NEUTRAL
     axes.barh(row, max(100 * candidate["gain"], 0.0), 0.68, color=colour)
-    texts = (f"{100 * candidate['gain']:.1f} %".replace("-", "−"), format_p(candidate["p_value"]), letter)
+    texts = (
+        f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
+        format_p(candidate["p_value"]),
+        letter,
+    )
     weight = "bold" if first else "normal"
-    for inches, text, side in zip((0.7, 1.55, 1.75), texts, ("right", "right", "left"), strict=True):
+    for inches, text, side in zip(
+        (0.7, 1.55, 1.75), texts, ("right", "right", "left"), strict=True
+    ):
         place = 1 + inches / (style.WIDTH - LEFT - RIGHT)
         axes.text(
             place,

@@ -54,7 +54,11 @@ def outputs(tree: xr.DataTree) -> list[str]:
     """Output channels, in the order of the prediction."""
     data = group(tree, schema.PREDICTION)
     end = schema.before("")
-    return [] if data is None else [str(n)[: -len(end)] for n in data.data_vars if str(n).endswith(end)]
+    return (
+        []
+        if data is None
+        else [str(n)[: -len(end)] for n in data.data_vars if str(n).endswith(end)]
+    )
 
 
 def channels(tree: xr.DataTree) -> list[str]:

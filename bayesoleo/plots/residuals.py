@@ -71,7 +71,9 @@ def _curve(
     if against == "phase":
         if run.periodic and mean in data and np.isfinite(data[mean].values[run.index]).any():
             return reading.thin(_phases(data), data[mean].values[run.index])
-        return reading.fold(reading.abscissa(tree, run), data[name].values[run.index], 2 * reading.BINS)
+        return reading.fold(
+            reading.abscissa(tree, run), data[name].values[run.index], 2 * reading.BINS
+        )
     position, e = reading.abscissa(tree, run), data[name].values[run.index]
     coordinate = data[against].values[run.index]
     if reading.is_resolved(position, coordinate):

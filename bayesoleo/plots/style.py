@@ -113,7 +113,9 @@ def title(axes: Axes, run: Run) -> None:
     label = plain(run.label, 18)
     axes.set_title(label, loc="left", fontsize=SMALL, pad=3, color=INK, fontweight="bold")
     text = f"hold-out · {run.remark}" if held_out else run.remark
-    axes.set_title(text, loc="right", fontsize=SMALL - 0.5, pad=3, color=AFTER if held_out else FAINT)
+    axes.set_title(
+        text, loc="right", fontsize=SMALL - 0.5, pad=3, color=AFTER if held_out else FAINT
+    )
 
 
 def label_outside(figure: Figure, x: str, y: str) -> None:
@@ -139,9 +141,7 @@ def legend(figure: Figure, handles: Sequence[Artist], remark: str = "") -> None:
         handlelength=1.8,
         borderaxespad=0.2,
     )
-    figure.text(
-        0.985, 1 - 0.15 / height, remark, ha="right", va="top", fontsize=SMALL, color=FAINT
-    )
+    figure.text(0.985, 1 - 0.15 / height, remark, ha="right", va="top", fontsize=SMALL, color=FAINT)
 
 
 def line(colour: str, text: str, width: float = 1.6, style: str = "-") -> Line2D:

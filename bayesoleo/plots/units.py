@@ -17,7 +17,9 @@ ALLOWED = {
     "mol": (*SMALL, ""),
 } | dict.fromkeys(("N", "Pa", "V", "A", "W", "J", "Hz"), ALL)
 ALLOWED_POWERS = {"m": (*SMALL, "c", "")}
-LEADING = re.compile(r"^(mol|Pa|Hz|[NmsVAWJK])(?![A-Za-zµ])\s*(?:(?:\*\*|\^)\s*)?([23²³])?(?=$|\D)(.*)$")
+LEADING = re.compile(
+    r"^(mol|Pa|Hz|[NmsVAWJK])(?![A-Za-zµ])\s*(?:(?:\*\*|\^)\s*)?([23²³])?(?=$|\D)(.*)$"
+)
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DIMENSIONLESS = ("", "1", "-", "dimensionless")
 

@@ -137,7 +137,9 @@ def _tree(runs, roles, time, phase, inputs, outputs, missing, noise, after=True)
         "group": (schema.RUN, ["middle"] * len(runs)),
         "initial_pressure": _variable(np.full(len(runs), 4.9e5), "Pa", schema.RUN),
     }
-    sd = {name: _variable(np.nanstd(noise[name], axis=1), UNITS[name], schema.RUN) for name in noise}
+    sd = {
+        name: _variable(np.nanstd(noise[name], axis=1), UNITS[name], schema.RUN) for name in noise
+    }
     sd |= {name: _variable(np.full(len(runs), 5e-5), "m", schema.RUN) for name in inputs}
     prediction, residual = {}, {}
     for name in outputs:
@@ -232,7 +234,11 @@ def _add_predictive(tree, rng, runs, roles):
         )
         wave = np.sin(2 * np.pi * (PHASES + rng.random((4, 30, 14, 1))))
         spread = 0.15 * NOISE[output] * rng.normal(size=(4, 30, 14, 1)) * wave
-        values[output] = (("chain", "draw", "run", "phase"), mean + spread, {"units": UNITS[output]})
+        values[output] = (
+            ("chain", "draw", "run", "phase"),
+            mean + spread,
+            {"units": UNITS[output]},
+        )
     coords = {"run": runs, "phase": PHASES}
     tree["posterior_predictive"] = xr.DataTree(xr.Dataset(values, coords=coords))
 
@@ -304,6 +310,7 @@ def _summary(rounds, effects, verdict, parameters=None):
         "seed": 7,
         "hold_out": "runs marked hold-out in campaign.toml",
         "re_estimated": 0,
+        "units": {output: UNITS[output] for output in rounds[0]["error"]},
         "rounds": rounds,
         "effects": effects,
         "parameters": parameters,

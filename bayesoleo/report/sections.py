@@ -1,0 +1,132 @@
+"""The figures of the page with what is said below each; those without data are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from bayesoleo import plots, schema
+from bayesoleo.plots import reading
+from bayesoleo.report.images import Image, encode_figure
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A figure on the page."""
+
+    image: Image
+    caption: str
+
+
+Draw = Callable[[], Figure]
+
+
+def data_figures(tree: xr.DataTree) -> list[Shown]:
+    """The records."""
+    caption = (
+        "The records as measured, averaged over the periods of each run. All runs of a channel "
+        "share its scale."
+    )
+    return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
+
+
+def fit_figures(tree: xr.DataTree) -> list[Shown]:
+    """Measurement and prediction of each output."""
+    entries: list[tuple[Draw, str]] = []
+    for output in reading.outputs(tree):
+        caption = f"Measured {output} and what the model predicts."
+        # type: ignore[misc]
+        entries.append((lambda output=output: plots.fit(tree, output), caption))
+    return _drawn(entries)
+
+
+def residual_figures(tree: xr.DataTree) -> list[Shown]:
+    """The residual of each output against phase, velocity and stroke."""
+    if schema.RESIDUAL not in tree.children:
+        return []
+    return _drawn(list(_residuals(tree)))
+
+
+def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
+    loops = (
+        "A cycle is a loop; where it closes to a line the residual is a function of the {}, and "
+        "the line is the shape of what is missing."
+    )
+    for output in reading.outputs(tree):
+        yield (
+            lambda output=output: plots.residual(tree, output),  # type: ignore[misc]
+            f"Residual of {output} against phase, averaged over the periods of each run.",
+        )
+        for against in ("velocity", "stroke"):
+            if against in tree[schema.RESIDUAL]:
+                yield (
+                    # type: ignore[misc]
+                    lambda output=output, a=against: plots.residual(tree, output, a),
+                    f"Residual of {output} against {against}. {loops.format(against)}",
+                )
+
+
+def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
+    """The candidates of one round."""
+    caption = (
+        f"Candidates of round {number + 1}: the share of the excess over the noise that each would "
+        "explain, and the probability of such a share if it were not there. Effects with the same "
+        "letter cannot be told apart by these data."
+    )
+    entry = reading.summary(tree)["rounds"][number]
+    return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
+
+
+def error_figure(tree: xr.DataTree) -> list[Shown]:
+    """The error of each run."""
+    caption = (
+        "Repeating error of each run over the noise of its average, on a logarithmic axis. At 1 "
+        "nothing is missing."
+    )
+    return _drawn([(lambda: plots.error(tree), caption)])
+
+
+def posterior_figures(tree: xr.DataTree) -> list[Shown]:
+    """Pairs, and the point against the posterior."""
+    if schema.POSTERIOR not in tree.children:
+        return []
+    pairs = (
+        "Posterior of the parameters, pair by pair; contours hold 39 and 86 % of the draws, as one "
+        "and two standard deviations of a normal density do. Lines: the point estimate."
+    )
+    forest = (
+        "Point estimate and its linearised standard deviation against the posterior. Where both "
+        "agree, the problem is as good as linear within its uncertainty."
+    )
+    entries: list[tuple[Draw, str]] = [(lambda: plots.corner(tree), pairs)]
+    if schema.POINT in tree.children:
+        entries.append((lambda: plots.point_against_posterior(tree), forest))
+    return _drawn(entries)
+
+
+def predictive_figures(tree: xr.DataTree) -> list[Shown]:
+    """The posterior prediction of each output."""
+    if schema.POSTERIOR_PREDICTIVE not in tree.children:
+        return []
+    entries: list[tuple[Draw, str]] = []
+    for output in reading.outputs(tree):
+        if output in tree[schema.POSTERIOR_PREDICTIVE]:
+            caption = f"Measured {output} about the prediction, with the posterior's 95 % band."
+            # type: ignore[misc]
+            entries.append((lambda output=output: plots.predictive(tree, output), caption))
+    return _drawn(entries)
+
+
+def trace_figures(tree: xr.DataTree) -> list[Shown]:
+    """The chains."""
+    if schema.POSTERIOR not in tree.children:
+        return []
+    caption = "Some walkers of each ensemble, one colour an ensemble: colours must not keep apart."
+    return _drawn([(lambda: plots.trace(tree), caption)])
+
+
+def _drawn(entries: list[tuple[Draw, str]]) -> list[Shown]:
+    return [Shown(encode_figure(draw()), caption) for draw, caption in entries]

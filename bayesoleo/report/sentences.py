@@ -1,0 +1,104 @@
+"""What the result says, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayesoleo import schema
+from bayesoleo.plots.rankings import format_p, name
+from bayesoleo.plots.units import Scale
+from bayesoleo.report.tables import error_scale, format_short
+
+FLOOR = 1.15
+"""A ratio of repeating error to noise below which a run is taken to be explained."""
+
+
+def role_shown(summary: Mapping[str, Any]) -> str:
+    """The runs that count: those held out, if there are any."""
+    return schema.HOLD_OUT if summary["error_after"].get(schema.HOLD_OUT) else schema.FIT
+
+
+def headline(summary: Mapping[str, Any]) -> str:
+    """The verdict as a sentence."""
+    effects = " and ".join(summary["effects"])
+    count = (
+        "The model lacked an effect" if len(summary["effects"]) == 1 else "The model lacked effects"
+    )
+    return {
+        schema.NOTHING_MISSING: "Nothing is missing: the model explains the measurements down to "
+        "their noise.",
+        schema.EFFECT_ADDED: f"{count}: {effects} found, added and confirmed.",
+        schema.UNEXPLAINED: f"{count}: {effects} added, but an error remains that no effect
+        explains." if effects else "Something is missing that no effect in the catalogue explains.",
+    }[summary["verdict"]]
+
+
+def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:
+    """For each output the numbers that matter: the error on the runs not used, before and after."""
+    role = role_shown(summary)
+    two = len(summary["rounds"]) > 1
+    shown = []
+    for output, last in summary["error_after"].get(role, {}).items():
+        first = summary["error_before"].get(role, {}).get(output, last)
+        key = "rms" if last["repeating"] is None else "repeating"
+        scale = error_scale(units.get(output, ""), (first, last))
+        ratio = [format_short(e["ratio_to_noise"]) for e in (first, last)]
+        known = last["ratio_to_noise"] is not None
+        shown.append(
+            {
+                "title": f"{output}, {role} runs",
+                "before": _number(first[key], scale) if two else "",
+                "after": _number(last[key], scale),
+                "unit": scale.unit,
+                "what": "repeating error" if key == "repeating" else "rms error",
+                "ratio": f"{' → '.join(ratio) if two else ratio[1]} × the noise" if known else "",
+                "change": _change(first[key], last[key]) if two else "",
+            }
+        )
+    return shown
+
+
+def remainder(summary: Mapping[str, Any]) -> list[str]:
+    """What is still unexplained, sentence by sentence."""
+    last = summary["rounds"][-1]
+    lines = [_above_floor(output, runs) for output, runs in last["error"].items()]
+    if last["candidates"]:
+        best = max(last["candidates"], key=lambda candidate: candidate["gain"])
+        p = format_p(best["p_value"])
+        share = f"{100 * best['gain']:.1f} %".replace("-", "−")
+        text = f"The best remaining candidate, {name(best)}, would explain {share} of the excess"
+        lines.append(f"{text} ({p})." if p else f"{text}.")
+    if last["reason"]:
+        reason = last["reason"].rstrip(".")
+        lines.append(f"The search ended because {reason}." if len(reason) > 1 else "")
+    return [line for line in lines if line]
+
+
+def _above_floor(output: str, runs: Mapping[str, Any]) -> str:
+    """How many runs of an output lie above their noise, and the worst of them."""
+    ratios = {
+        run: e["ratio_to_noise"] for run, e in runs.items() if e["ratio_to_noise"] is not None
+    }
+    if not ratios:
+        return f"No run has a noise floor for {output}: only the rms of the residual is known."
+    worst = max(ratios, key=lambda run: ratios[run])
+    above = sum(ratio > FLOOR for ratio in ratios.values())
+    largest = f"the largest ratio is {format_short(ratios[worst])}, in {worst}"
+    of = f"of {len(ratios)} runs"
+    lead = "no run" if above == 0 else f"{above} {of}"
+    verb = "has" if above <= 1 else "have"
+    text = f"{lead} {verb} a repeating {output} error above {FLOOR} times its noise; {largest}."
+    return text[0].upper() + text[1:]
+
+
+def _number(value: float | None, scale: Scale) -> str:
+    return format_short(None if value is None else scale.factor * value)
+
+
+def _change(before: float | None, after: float | None) -> str:
+    """How much the error fell or rose."""
+    if not before or after is None:
+        return ""
+    change = 100 * (after / before - 1)
+    return f"{change:+.0f} %".replace("-", "−")

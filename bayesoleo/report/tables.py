@@ -1,0 +1,281 @@
+"""The tables of the page: rows of text, in units an engineer reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import schema
+from bayesoleo.plots import reading
+from bayesoleo.plots.rankings import classes, format_p, name
+from bayesoleo.plots.units import Scale, engineering, format_number, format_value
+
+KNOWN_CONSTANTS = (
+    schema.FREQUENCY,
+    schema.FREQUENCY_SD,
+    schema.PERIODS,
+    schema.ROLE,
+    schema.RUN_GROUP,
+)
+DIAGNOSTICS = {
+    "acceptance": "acceptance fraction",
+    "autocorrelation_time": "integrated autocorrelation time, draws",
+    "effective_sample_size": "effective sample size",
+    "rhat_nested": "nested R̂ over ensembles",
+    "evaluations": "evaluations of the posterior",
+}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Head and rows of text; ``words`` leading columns hold words, the others numbers."""
+
+    head: list[str]
+    rows: list[list[str]]
+    words: int = 1
+    marked: frozenset[int] = frozenset()
+
+
+def output_units(tree: xr.DataTree, summary: Mapping[str, Any]) -> dict[str, str]:
+    """SI unit of each channel."""
+    data = reading.group(tree, schema.OBSERVED_DATA)
+    found = {} if data is None else {str(n): reading.unit(v) for n, v in data.data_vars.items()}
+    return {**dict(summary.get("units", {})), **found}
+
+
+def error_scale(unit: str, entries: Iterable[Mapping[str, Any]]) -> Scale:
+    """One unit for a table of errors: that of its median."""
+    values = [e[key] for e in entries for key in ("rms", "repeating") if e.get(key) is not None]
+    return engineering(unit, float(np.median(values)) if values else 0.0)
+
+
+def noise_of(entry: Mapping[str, Any]) -> float | None:
+    """Noise of the averaged residual, from the ratio where it is not said."""
+    ratio = entry.get("ratio_to_noise")
+    if entry.get("noise") is None and ratio:
+        return float(entry["repeating"] / ratio)
+    return entry.get("noise")
+
+
+def arrow(before: float | None, after: float | None, factor: float = 1.0, two: bool = True) -> str:
+    """``12.3 → 4.56``; one number where nothing was added."""
+    texts = [format_short(None if v is None else factor * v) for v in (before, after)]
+    return " → ".join(texts) if two else texts[1]
+
+
+def format_short(value: float | None) -> str:
+    """Three digits: an error is not known better."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value == 0.0 or not 1e-3 <= abs(value) < 1e4:
+        return f"{value:.3g}"
+    return f"{value:#.3g}".rstrip(".")
+
+
+def error_by_role(summary: Mapping[str, Any], units: Mapping[str, str]) -> Table:
+    """Error before and after, pooled over the hold-out and over the fitted runs."""
+    before, after = summary["error_before"], summary["error_after"]
+    two = len(summary["rounds"]) > 1
+    rows = []
+    for role in (schema.HOLD_OUT, schema.FIT):
+        for output, first in before.get(role, {}).items():
+            last = after.get(role, {}).get(output, first)
+            scale = error_scale(units.get(output, ""), (first, last))
+            pairs = [arrow(first[k], last[k], scale.factor, two) for k in ("rms", "repeating")]
+            noise = noise_of(last)
+            floor = format_short(None if noise is None else scale.factor * noise)
+            ratio = arrow(first["ratio_to_noise"], last["ratio_to_noise"], two=two)
+            rows.append([role, output, *pairs, floor, scale.unit, ratio])
+    head = ["runs", "output", "rms", "repeating", "noise", "unit", "repeating / noise"]
+    return Table(head, rows, 2, frozenset(i for i, row in enumerate(rows) if row[0] != schema.FIT))
+
+
+def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Table]:
+    """Error before and after of every run, a table for each output."""
+    rounds = summary["rounds"]
+    two = len(rounds) > 1
+    tables = {}
+    for output, first in rounds[0]["error"].items():
+        last = rounds[-1]["error"].get(output, first)
+        scale = error_scale(units.get(output, ""), [*first.values(), *last.values()])
+        rows = []
+        for run in sorted(first, key=lambda label: first[label]["role"] == schema.HOLD_OUT):
+            a, b = first[run], last.get(run, first[run])
+            pairs = [arrow(a[k], b[k], scale.factor, two) for k in ("rms", "repeating", "noise")]
+            ratio = arrow(a["ratio_to_noise"], b["ratio_to_noise"], two=two)
+            rows.append([run, a["role"], *pairs, ratio])
+        unit = f" [{scale.unit}]" if scale.unit else ""
+        head = [
+            "run",
+            "role",
+            f"rms{unit}",
+            f"repeating{unit}",
+            f"noise{unit}",
+            "repeating / noise",
+        ]
+        marked = frozenset(i for i, row in enumerate(rows) if row[1] == schema.HOLD_OUT)
+        tables[output] = Table(head, rows, 2, marked)
+    return tables
+
+
+def candidates(entry: Mapping[str, Any]) -> Table:
+    """All candidates of a round, the best first."""
+    ranked = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
+    letters = classes(ranked)
+    rows = [
+        [
+            name(candidate),
+            candidate["family"],
+            f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
+            format_p(candidate["p_value"]).removeprefix("p ").removeprefix("= "),
+            ", ".join(f"{k} = {format_number(v)}" for k, v in candidate["expected"].items()),
+            letters.get(candidate["effect"], ""),
+            ", ".join(candidate["indistinguishable_from"]),
+        ]
+        for candidate in ranked
+    ]
+    head = ["effect", "family", "share", "p", "expected (SI)", "class", "not distinguishable from"]
+    accepted = entry["accepted"]
+    marked = frozenset(i for i, c in enumerate(ranked) if c["effect"] == accepted)
+    return Table(head, rows, 2, marked)
+
+
+def parameters(summary: Mapping[str, Any]) -> Table:
+    """Estimate and posterior of every parameter, each row in its own unit."""
+    rows = []
+    for label, entry in summary["parameters"].items():
+        sizes = [abs(entry[k]) for k in ("estimate", "mean", "sd") if entry[k] is not None]
+        scale = engineering(entry["unit"], max(sizes, default=0.0))
+        sd = None if entry["sd"] is None else scale.factor * entry["sd"]
+        values = [_scaled(entry[key], scale, sd) for key in ("estimate", "mean", "sd")]
+        interval = entry["interval"]
+        text = "–"
+        if interval is not None:
+            text = " … ".join(_scaled(bound, scale, sd) for bound in interval)
+        rows.append([label, *values, text, scale.unit or "1"])
+    return Table(["parameter", "estimate", "mean", "sd", "95 % interval", "unit"], rows)
+
+
+def records(tree: xr.DataTree) -> Table:
+    """The runs: role, frequency, periods, conditions, noise of each channel."""
+    constant = reading.group(tree, schema.CONSTANT_DATA)
+    noise = reading.group(tree, schema.NOISE)
+    columns: dict[str, list[str]] = {}
+    if constant is not None:
+        columns |= _constants(constant)
+    if noise is not None:
+        for channel, data in noise.data_vars.items():
+            scale = engineering(reading.unit(data), _median(data.values))
+            unit = f" [{scale.unit}]" if scale.unit else ""
+            shown = [format_short(scale.factor * float(v)) for v in data.values]
+            columns[f"noise of {channel}{unit}"] = shown
+    labels = [run.label for run in reading.runs(tree)]
+    roles = [run.role for run in reading.runs(tree)]
+    rows = [[label, *(column[i] for column in columns.values())] for i, label in enumerate(labels)]
+    marked = frozenset(i for i, role in enumerate(roles) if role == schema.HOLD_OUT)
+    return Table(["run", *columns], rows, 2, marked)
+
+
+def diagnostics(tree: xr.DataTree) -> Table | None:
+    """How the sampler did; None where nothing was sampled."""
+    if schema.SAMPLE_STATS not in tree.children:
+        return None
+    attributes = tree[schema.SAMPLE_STATS].attrs
+    rows = []
+    posterior = reading.group(tree, schema.POSTERIOR)
+    if posterior is not None:
+        sizes = posterior.sizes
+        rows.append(["walkers × draws", f"{sizes[schema.CHAIN]} × {sizes[schema.DRAW]}"])
+    for key, value in attributes.items():
+        if key != "failures":
+            rows.append([DIAGNOSTICS.get(str(key), str(key).replace("_", " ")), _plain(value)])
+    failures = _decoded(attributes.get("failures"))
+    if failures is not None:
+        counted = [f"{count} {reason}" for reason, count in failures.items() if count]
+        rows.append(["failed evaluations", ", ".join(counted) or "none"])
+    return Table(["sampler", ""], rows)
+
+
+def point_status(tree: xr.DataTree) -> Table | None:
+    """How the estimate ended; None without one."""
+    if schema.POINT not in tree.children or not tree[schema.POINT].attrs:
+        return None
+    rows = [[str(k).replace("_", " "), _plain(v)] for k, v in tree[schema.POINT].attrs.items()]
+    return Table(["point estimate", ""], rows)
+
+
+def provenance(tree: xr.DataTree) -> Table:
+    """The root attributes that are shown nowhere else."""
+    shown = (schema.SUMMARY, schema.EQUATIONS, schema.EQUATIONS_LATEX, schema.CAMPAIGN_DESCRIPTION)
+    rows = [
+        [str(key).replace("_", " "), _plain(value)]
+        for key, value in tree.attrs.items()
+        if key not in shown
+    ]
+    return Table(["", ""], rows)
+
+
+def _constants(constant: xr.Dataset) -> dict[str, list[str]]:
+    """Role, group, frequency, periods and conditions, as columns."""
+    columns = {"role": [str(role) for role in constant[schema.ROLE].values]}
+    groups = (
+        [str(g) for g in constant[schema.RUN_GROUP].values] if schema.RUN_GROUP in constant else []
+    )
+    if any(groups):
+        columns["group"] = groups
+    sd = constant.get(schema.FREQUENCY_SD)
+    columns["frequency [Hz]"] = [
+        format_number(float(f), None if sd is None else float(sd.values[i]))
+        for i, f in enumerate(constant[schema.FREQUENCY].values)
+    ]
+    if schema.PERIODS in constant:
+        columns["periods"] = [f"{int(n)}" for n in constant[schema.PERIODS].values]
+    for condition, data in constant.data_vars.items():
+        if condition not in KNOWN_CONSTANTS and data.dims == (schema.RUN,):
+            columns |= _condition(str(condition), data)
+    return columns
+
+
+def _condition(label: str, data: xr.DataArray) -> dict[str, list[str]]:
+    """A condition by run: numbers in one unit, or words."""
+    if data.dtype.kind not in "fiu":
+        return {label.replace("_", " "): [str(value) for value in data.values]}
+    scale = engineering(reading.unit(data), _median(data.values))
+    unit = f" [{scale.unit}]" if scale.unit else ""
+    shown = [format_number(scale.factor * float(value)) for value in data.values]
+    return {f"{label.replace('_', ' ')}{unit}": shown}
+
+
+def _median(values: Any) -> float:
+    """Median magnitude, 0 where there is none."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.median(finite)) if finite.size else 0.0
+
+
+def _scaled(value: float | None, scale: Scale, sd: float | None) -> str:
+    return format_number(None if value is None else scale.factor * value, sd)
+
+
+def _plain(value: Any) -> str:
+    """An attribute as text; a JSON list without its brackets."""
+    decoded = _decoded(value)
+    if isinstance(decoded, list):
+        return ", ".join(map(str, decoded)) or "none"
+    if isinstance(value, float | np.floating):
+        return format_value(float(value))
+    return str(value)
+
+
+def _decoded(value: Any) -> Any:
+    """What a JSON attribute holds, None if it is not JSON of a list or an object."""
+    if not isinstance(value, str) or not value.startswith(("[", "{")):
+        return None
+    try:
+        return json.loads(value)
+    except ValueError:
+        return None

@@ -1,0 +1,73 @@
+"""The result in a few lines of a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from bayesoleo import schema
+from bayesoleo.plots.rankings import format_p, name
+from bayesoleo.report import sentences, tables
+
+COLOURS = {
+    schema.NOTHING_MISSING: "green",
+    schema.EFFECT_ADDED: "blue",
+    schema.UNEXPLAINED: "yellow",
+}
+
+
+def print_summary(summary: Mapping[str, Any], console: Console) -> None:
+    """Print verdict, error before and after, the effects found and where the files are.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``; its optional ``units`` and ``files`` are used.
+    console : rich.console.Console
+        Where to print. Labels of users are printed as they are, not as markup.
+    """
+    console.print()
+    console.print(Text(sentences.headline(summary), style=f"bold {COLOURS[summary['verdict']]}"))
+    console.print(_errors(summary))
+    for number, entry in enumerate(summary["rounds"], start=1):
+        if entry["accepted"]:
+            console.print(_accepted(number, entry))
+    for line in sentences.remainder(summary):
+        console.print(Text(line, style="dim"))
+    files = summary.get("files", {})
+    if files:
+        console.print()
+    for what, path in files.items():
+        console.print(Text.assemble((f"{what:<10}", "dim"), path), soft_wrap=True)
+
+
+def _errors(summary: Mapping[str, Any]) -> RichTable:
+    """Error by role and output; what was held out is bright."""
+    content = tables.error_by_role(summary, summary.get("units", {}))
+    table = RichTable(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    for column, text in enumerate(content.head):
+        table.add_column(text, justify="left" if column < content.words else "right")
+    for number, row in enumerate(content.rows):
+        style = "" if number in content.marked else "dim"
+        table.add_row(*(Text(cell) for cell in row), style=style)
+    return table
+
+
+def _accepted(number: int, entry: Mapping[str, Any]) -> Text:
+    """The effect that a round added, and what cannot be told from it."""
+    chosen = next((c for c in entry["candidates"] if c["effect"] == entry["accepted"]), None)
+    if chosen is None:
+        return Text(f"Round {number}: {entry['accepted']} added")
+    p = format_p(chosen["p_value"])
+    share = f"{100 * chosen['gain']:.0f} % of the excess"
+    text = Text.assemble(f"Round {number}: ", (name(chosen), "bold"), f" explains {share}")
+    if p:
+        text.append(f", {p}")
+    others = chosen["indistinguishable_from"]
+    if others:
+        text.append(f"; these data cannot tell it from {', '.join(others)}", style="dim")
+    return text
