@@ -10,7 +10,7 @@ from bayesoleo.plots import reading
 
 
 def point_table(tree: xr.DataTree) -> dict[str, tuple[float, float, str]]:
-    """Estimate, linearised standard deviation and unit of every parameter; empty without a point."""
+    """Estimate, linearised sd and unit of every parameter; empty without a point."""
     point = reading.group(tree, schema.POINT)
     if point is None or schema.ESTIMATE not in point:
         return {}

@@ -10,6 +10,8 @@ from bayesoleo import schema
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
+BAND = "#8cbbd9"
+
 
 def predictive(tree: xr.DataTree, output: str) -> Figure:
     """Measured average about the prediction, with the 95 % band of the posterior prediction.
@@ -39,14 +41,14 @@ def predictive(tree: xr.DataTree, output: str) -> Figure:
         phase, low, high, measured = rows[run.label]
         low, high = scale.factor * low, scale.factor * high
         axes.axhline(0.0, color=style.FAINT, lw=0.6, zorder=0)
-        axes.plot(phase, scale.factor * measured, ".", ms=2.5, color=style.MEASURED)
-        axes.fill_between(phase, low, high, color=style.AFTER, alpha=0.45, lw=0)
+        axes.fill_between(phase, low, high, color=BAND, lw=0)
+        axes.plot(phase, scale.factor * measured, color=style.INK, lw=0.7)
         style.cycles(axes)
     spans = [2 * style.magnitude(*rows[run.label][1:]) for run in runs]
     style.share_y(grid.axes, spans, symmetric=True)
-    dots = style.Line2D([], [], marker=".", ls="", color=style.MEASURED, label="measured average")
-    band = style.band("#8cbbd9", "95 % of the posterior prediction")
-    style.legend(grid.figure, [dots, band], remark)
+    average = style.line(style.INK, "measured average", 0.9)
+    band = style.band(BAND, "95 % of the posterior prediction")
+    style.legend(grid.figure, [average, band], remark)
     text = scale.label(f"{output} − prediction")
     style.label_outside(grid.figure, style.x_name(runs), text)
     return grid.figure

@@ -127,7 +127,7 @@ def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array
 
 
 def is_resolved(position: Array, values: Array) -> bool:
-    """Whether bins of phase show a signal; a multisine with hundreds of harmonics they average out."""
+    """Whether bins of phase show a signal; hundreds of harmonics they would average out."""
     means = fold(position, values)[1]
     variance = np.nanvar(values)
     return bool(variance == 0.0 or np.nanvar(means) > 0.9 * variance)

@@ -115,7 +115,7 @@ def _noise(axes: Axes, data: xr.Dataset, output: str, run: reading.Run, scale: S
     """The band of the standard error, and zero."""
     axes.axhline(0.0, color=style.FAINT, lw=0.6, zorder=0)
     name = schema.noise(output)
-    if name in data and np.isfinite(data[name].values[run.index]):
+    if run.periodic and name in data and np.isfinite(data[name].values[run.index]):
         half = scale.factor * float(data[name].values[run.index])
         axes.axhspan(-half, half, color=style.NOISE, lw=0, zorder=-1)
 

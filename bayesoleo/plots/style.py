@@ -61,7 +61,7 @@ def blank(width: float, height: float) -> Figure:
 
 
 def dress(axes: Axes, ticks: int = 4) -> None:
-    """Remove what is not data; at most ``ticks`` intervals on each axis, numbers without offsets."""
+    """Remove what is not data; at most ``ticks`` intervals an axis, numbers without offsets."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
     axes.tick_params(labelsize=SMALL, color=FAINT, labelcolor=INK, length=3)

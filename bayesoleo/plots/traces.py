@@ -13,7 +13,7 @@ from bayesoleo.plots.draws import chosen, draws, unit_of
 from bayesoleo.plots.units import engineering
 
 LEFT, TOP, BOTTOM, HIGH, GAP = 1.0, 0.6, 0.6, 0.75, 0.32
-WALKERS = 3
+WALKERS = 2
 POINTS = 250
 
 
@@ -30,7 +30,7 @@ def trace(tree: xr.DataTree, most: int = 7) -> Figure:
     Returns
     -------
     Figure
-        Three walkers of each ensemble, one colour an ensemble: colours that keep apart show
+        Two walkers of each ensemble, one colour an ensemble: colours that keep apart show
         ensembles that do not agree.
     """
     names = chosen(tree, most)

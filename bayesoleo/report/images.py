@@ -1,4 +1,4 @@
-"""Figures and formulas as addresses that hold the picture itself, so that a page needs no other file.
+"""Figures and formulas as addresses that hold the picture itself; a page needs no other file.
 
 Pictures are put in ``<img>`` elements: SVG inside the page would share its ids between figures.
 """
@@ -17,9 +17,9 @@ from matplotlib import mathtext
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 
-LARGEST_SVG = 400_000
+LARGEST_SVG = 300_000
 """Bytes above which a figure is stored as pixels instead; a page stays below some megabytes."""
-DPI = 140
+DPI = 130
 FORMULA_SIZE = 12.0
 
 # Matplotlib's settings are global; two reports may be written at once.

@@ -21,17 +21,16 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 
 def headline(summary: Mapping[str, Any]) -> str:
     """The verdict as a sentence."""
-    effects = " and ".join(summary["effects"])
-    count = (
-        "The model lacked an effect" if len(summary["effects"]) == 1 else "The model lacked effects"
-    )
-    return {
-        schema.NOTHING_MISSING: "Nothing is missing: the model explains the measurements down to "
-        "their noise.",
-        schema.EFFECT_ADDED: f"{count}: {effects} found, added and confirmed.",
-        schema.UNEXPLAINED: f"{count}: {effects} added, but an error remains that no effect
-        explains." if effects else "Something is missing that no effect in the catalogue explains.",
-    }[summary["verdict"]]
+    found = " and ".join(summary["effects"])
+    lacked = "an effect" if len(summary["effects"]) == 1 else "effects"
+    if summary["verdict"] == schema.NOTHING_MISSING:
+        return "Nothing is missing: the model explains the measurements down to their noise."
+    if summary["verdict"] == schema.EFFECT_ADDED:
+        return f"The model lacked {lacked}: {found} found, added and confirmed."
+    if found:
+        rest = "an error remains that no effect in the catalogue explains"
+        return f"The model lacked {lacked}: {found} added, but {rest}."
+    return "Something is missing that no effect in the catalogue explains."
 
 
 def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:

@@ -178,7 +178,8 @@ def records(tree: xr.DataTree) -> Table:
     roles = [run.role for run in reading.runs(tree)]
     rows = [[label, *(column[i] for column in columns.values())] for i, label in enumerate(labels)]
     marked = frozenset(i for i, role in enumerate(roles) if role == schema.HOLD_OUT)
-    return Table(["run", *columns], rows, 2, marked)
+    words = 1 + sum(column in columns for column in (schema.ROLE, schema.RUN_GROUP))
+    return Table(["run", *columns], rows, words, marked)
 
 
 def diagnostics(tree: xr.DataTree) -> Table | None:

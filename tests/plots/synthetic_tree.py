@@ -83,6 +83,7 @@ def two_run_tree() -> xr.DataTree:
     one["reason"] = "every ratio is below 1.15 and no candidate explains 10 % of the excess"
     parameters = {"stiffness": _parameter(1.0e3, 0.4, "N/m", sampled=False)}
     summary = _summary([one], [], schema.NOTHING_MISSING, parameters)
+    tree["residual/voltage_noise"][1] = np.nan
     _add_point(tree, {"stiffness": (1.0e3, 0.4, "N/m")}, rng)
     _finish(tree, summary, "")
     return tree
