@@ -64,10 +64,10 @@ def test_moves_are_stationary(kind, dimension, scale):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dimension", [2, 4, 9])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_moves_are_stationary_to_half_a_percent(kind, dimension, scale):
-    groups = 6000 // dimension
+def test_moves_are_stationary_to_a_few_percent(kind, dimension, scale):
+    groups = 1500 // dimension
     move = make(kind, dimension, scale, groups)
-    moment = second_moment(move, dimension, scale, groups=groups, steps=150)
+    moment = second_moment(move, dimension, scale, groups=groups, steps=100)
     assert moment == pytest.approx(1.0, abs=tolerance(dimension, groups))
 
 
