@@ -242,6 +242,10 @@ class Model:
         """Names of the parameters that are not fixed."""
         return tuple(name for name, parameter in self.parameters.items() if not parameter.fixed)
 
+    def uncertain(self) -> tuple[str, ...]:
+        """Names of the parameters that are fixed, but known to a tolerance only."""
+        return tuple(name for name, item in self.parameters.items() if item.fixed and item.prior is not None)
+
     def nominal(self) -> dict[sp.Symbol, float]:
         """Values of parameters and of conditions that have a default, for substitution."""
         values = {symbol(name): parameter.value for name, parameter in self.parameters.items()}
@@ -333,4 +337,10 @@ class Model:
         """Fix parameters at their nominal values."""
         return self.with_parameters(
             **{name: replace(self.parameters[name], fixed=True) for name in names}
+        )
+
+    def freeing(self, *names: str) -> Model:
+        """Estimate parameters that were fixed; they need a prior by now."""
+        return self.with_parameters(
+            **{name: replace(self.parameters[name], fixed=False) for name in names}
         )

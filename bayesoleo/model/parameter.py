@@ -31,7 +31,8 @@ class Parameter:
     prior : Prior, optional
         Any other prior, instead of ``sd``, ``relative_sd`` and ``bounds``.
     fixed : bool
-        Not estimated: keeps ``value``.
+        Not estimated: keeps ``value``. With a prior it is known to that tolerance only: effects are scored with its uncertainty
+        counted, and it is freed when a lack of fit remains that it may explain.
     by_run : bool
         One independent value for every run.
     description : str
@@ -62,8 +63,11 @@ class Parameter:
         stated = [self.sd is not None, self.relative_sd is not None, self.prior is not None]
         if sum(stated) > 1:
             raise ModelError("prior stated twice", hint="give one of sd, relative_sd, prior")
-        if self.prior is None and not self.fixed:
+        if self.prior is None:
             object.__setattr__(self, "prior", self._stated_prior())
+        # The prior is what counts from here on; a copy with another value keeps it.
+        for name in ("sd", "relative_sd", "bounds"):
+            object.__setattr__(self, name, None)
         if self.prior is not None and not self.fixed:
             low, high = self.prior.support
             if not low <= self.value <= high:

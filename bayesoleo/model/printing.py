@@ -37,6 +37,9 @@ class _Printer(PythonCodePrinter):
     def _print_NumberSymbol(self, expr: sp.NumberSymbol) -> str:
         return repr(float(expr))
 
+    _print_Pi = _print_NumberSymbol
+    _print_Exp1 = _print_NumberSymbol
+
     def _print_Heaviside(self, expr: sp.Heaviside) -> str:
         return f"(0.5 + 0.5*np.sign({self._print(expr.args[0])}))"
 

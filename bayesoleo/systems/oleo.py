@@ -9,7 +9,7 @@ is gauge.
 
 from __future__ import annotations
 
-from bayesoleo.model import Condition, Dof, Model, Output, Parameter
+from bayesoleo.model import Condition, Dof, LogNormal, Model, Output, Parameter
 
 #: Solubility coefficient theta_7 of the tables, in 1/K: the physical sign is positive.
 THETA_7 = 1.42e-4
@@ -24,6 +24,7 @@ def _common_parameters() -> dict[str, Parameter]:
             2897.0,
             "kg/m",
             fixed=True,
+            relative_sd=0.1,
             latex="\\theta_3",
             description="rho/(2 C_d^2) sum A_h^3/A_o^2",
         ),
@@ -33,7 +34,7 @@ def _common_parameters() -> dict[str, Parameter]:
         "friction_base": Parameter(65.0, "N", relative_sd=0.5, latex="\\theta_8"),
         "friction_per_pressure": Parameter(2.0e-5, "m**2", relative_sd=0.5, latex="\\theta_9"),
         "friction_slope": Parameter(
-            3400.0, "s/m", relative_sd=0.5, bounds=(100.0, 1e5), latex="\\theta_{10}"
+            3400.0, "s/m", prior=LogNormal(3400.0, 0.7), latex="\\theta_{10}"
         ),
     }
 
