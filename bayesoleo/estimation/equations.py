@@ -44,6 +44,11 @@ class Equations:
         target = np.concatenate((self.residual, pull))
         return bounded_step(np.vstack((self.jacobian, rows)), target, self.room)
 
+    def expected_gain(self, step: Array) -> float:
+        """Rise of the merit function that the linearisation promises for a step, shape (l,)."""
+        change = self.jacobian @ step
+        return float(step @ self.gradient - 0.5 * (change @ change))
+
     def distance(self) -> float:
         """Newton decrement: the way to the fixed point in linearised standard deviations."""
         step = self.solve(np.eye(len(self.slope)))

@@ -190,6 +190,7 @@ class _Loop:
             self.progress(iteration)
 
     def run(self, tolerance: float, max_iterations: int) -> Status:
+        """Iterate until a step is small and the fixed point near, or nothing helps."""
         for _ in range(max_iterations):
             variance = self.variance()
             equations = self.equations(variance)
@@ -198,7 +199,7 @@ class _Loop:
             proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
             small = self.is_small(proposal, equations, tolerance)
             before = self.point
-            trial, halvings = self.shorten(proposal, equations, variance)
+            trial, halvings, taken = self.shorten(proposal, equations, variance)
             if halvings >= _MANY_HALVINGS:
                 gain = 0.5 * float(proposal @ equations.gradient)
                 small = small or gain <= _NEGLIGIBLE_GAIN
@@ -212,27 +213,33 @@ class _Loop:
                     return Status.CONVERGED
                 if self.step.locks or self.point is before:
                     return Status.NO_CONVERGENCE
-            self.state = self.step.accept(self.state, equations.jacobian)
+            won = self.merit(self.point, variance) - self.merit(before, variance)
+            expected = equations.expected_gain(taken)
+            ratio = won / expected if expected > 0 else 1.0
+            self.state = self.step.accept(self.state, equations.jacobian, ratio)
         return Status.NO_CONVERGENCE
 
-    def shorten(self, proposal: Array, equations: Equations, variance: Array) -> tuple[_Point, int]:
+    def shorten(
+        self, proposal: Array, equations: Equations, variance: Array
+    ) -> tuple[_Point, int, Array]:
         """First point along ever shorter steps that is not worse than the current one.
 
-        If there is none: the last that failed, or the current point.
+        With the number of halvings and the step that led there. If there is none: the last point
+        that failed, or the current one.
         """
         merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
         trial = self.point
         for halvings in range(_MAX_HALVINGS + 1):
             trial = self.look(self.point.theta + self.scale.sd * proposal)
             if trial.status.ok and self.merit(trial, variance) >= merit:
-                return trial, halvings
+                return trial, halvings, proposal
             softer = self.step.refuse(self.state)
             if softer is None:
                 proposal = proposal / 2
             else:
                 self.state = softer
                 proposal = equations.solve(self.step.rows(softer, equations.jacobian))
-        return (self.point if trial.status.ok else trial), _MAX_HALVINGS
+        return (self.point if trial.status.ok else trial), _MAX_HALVINGS, proposal
 
     def variance(self) -> Array:
         unknowns = len(self.scale.sd)

@@ -6,7 +6,8 @@ are carried on, and of whether the prior pulls: ``r`` is its slope for BE and ze
 
 References
 ----------
-Verbeek (1993), eqs. 3.19-3.23; Hendriks for the MMVE; Marquardt (1963) for the damping.
+Verbeek (1993), eqs. 3.19-3.23, with Hendriks's MMVE; Marquardt (1963), Moré (1978) and Nielsen
+(1999, IMM-REP-1999-05) for the damping.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ class Step:
         """Rows ``P``, shape (l, l), for whitened sensitivities of shape (k, l)."""
         return state
 
-    def accept(self, state: Array, jacobian: Array) -> Array:
-        """State after a step was taken with these sensitivities."""
+    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
+        """State after a step with these sensitivities, and its ratio of real to expected gain."""
         return state
 
     def refuse(self, state: Array) -> Array | None:
@@ -82,7 +83,7 @@ class MinimumVarianceStep(Step):
     name: ClassVar[str] = "mve"
     locks: ClassVar[bool] = True
 
-    def accept(self, state: Array, jacobian: Array) -> Array:
+    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
         return np.linalg.qr(np.vstack((jacobian, state)), mode="r")
 
 
@@ -104,7 +105,7 @@ class ModifiedMinimumVarianceStep(Step):
         identity = np.eye(len(state))
         return solve_triangular(cholesky(state + identity, lower=True), identity, lower=True)
 
-    def accept(self, state: Array, jacobian: Array) -> Array:
+    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
         triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")
         root = solve_triangular(triangle, np.eye(len(state)))
         return root @ root.T
@@ -124,24 +125,31 @@ class GaussNewtonStep(Step):
 class LevenbergMarquardtStep(Step):
     """Levenberg-Marquardt: like MBE, but the weight follows success instead of the prior.
 
-    The state is the damping, relative to the sensitivities' squared column lengths, shape (1,).
+    The state is the damping, the factor by which it grows when a step fails, and the longest
+    columns of the sensitivities so far, shape (2 + l,).
     """
 
     name: ClassVar[str] = "levenberg-marquardt"
     smallest: ClassVar[float] = 1e-14
 
     def begin(self, unknowns: int) -> Array:
-        return np.array([1e-3])
+        return np.concatenate(([1e-3, 2.0], np.zeros(unknowns)))
 
     def rows(self, state: Array, jacobian: Array) -> Array:
-        length = np.linalg.norm(jacobian, axis=0)
-        return np.sqrt(state[0]) * np.diag(np.maximum(length, np.finfo(float).tiny))
+        return np.sqrt(state[0]) * np.diag(self._length(state, jacobian))
 
-    def accept(self, state: Array, jacobian: Array) -> Array:
-        return np.maximum(state / 10, self.smallest)
+    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
+        # a step as good as promised divides the damping by three, a useless one doubles it
+        factor = max(1 / 3, 1 - (2 * min(max(ratio, 0.0), 1.0) - 1) ** 3)
+        damping = max(state[0] * factor, self.smallest)
+        return np.concatenate(([damping, 2.0], self._length(state, jacobian)))
 
     def refuse(self, state: Array) -> Array | None:
-        return 4 * state
+        return np.concatenate(([state[0] * state[1], 2 * state[1]], state[2:]))
+
+    @staticmethod
+    def _length(state: Array, jacobian: Array) -> Array:
+        return np.maximum(state[2:], np.linalg.norm(jacobian, axis=0))
 
 
 METHODS: dict[str, Step] = {
