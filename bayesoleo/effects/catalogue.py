@@ -67,7 +67,7 @@ def candidates(
     effects: Iterable[Effect] | None = None,
     exclude: Collection[str] = (),
 ) -> list[Candidate]:
-    """Every effect at every place of a model where it applies and is not in yet.
+    """Every effect at every place of a model where it applies, matters and is not in yet.
 
     Parameters
     ----------
@@ -86,13 +86,24 @@ def candidates(
         In the order of the effects, then of their places.
     """
     chosen = catalogue() if effects is None else tuple(effects)
-    return [
+    found = (
         effect.extend(model, target, scales)
         for effect in chosen
         if effect.id not in exclude
         for target in effect.places(model)
         if f"{effect.id} at {target}" not in exclude and not effect.is_in(model, target)
-    ]
+    )
+    return [candidate for candidate in found if _is_felt(candidate)]
+
+
+def _is_felt(candidate: Candidate) -> bool:
+    """Whether anything depends on the new amplitudes: a constant offset of a velocity does not."""
+    model = candidate.model
+    expressions = [*model.definitions.values()]
+    expressions += [term for terms in model.equations.values() for term in terms.values()]
+    expressions += [term for name in model.outputs for term in model.output_terms(name).values()]
+    felt = set[str]().union(*({item.name for item in e.free_symbols} for e in expressions))
+    return felt.issuperset(candidate.parameters)
 
 
 def describe(effect: Effect) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from bayesoleo.effects.places import (
     moving_places,
     spring_force,
 )
-from bayesoleo.errors import InputError, ModelError
+from bayesoleo.errors import InputError
 from bayesoleo.model import Coordinate, Dof, Model
 from bayesoleo.model.expressions import FUNCTIONS, parse, symbol
 
@@ -256,7 +256,8 @@ def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.E
         known["pressure"] = pressure
     if place.velocity is not None:
         known |= {"velocity": place.velocity, "acceleration": acceleration(place)}
-        known["direction"] = smooth_sign(model, place.velocity, names)
+        if FRICTION_SLOPE in model.parameters or "smoothing" in names:
+            known["direction"] = smooth_sign(model, place.velocity, names)
     return known | dict(names)
 
 
@@ -267,6 +268,4 @@ def smooth_sign(model: Model, velocity: sp.Expr, names: Names) -> sp.Expr:
     """
     if FRICTION_SLOPE in model.parameters:
         return 2 / sp.pi * sp.atan(symbol(FRICTION_SLOPE) * velocity)
-    if "smoothing" not in names:
-        raise ModelError("no smooth sign here", hint="use direction in the force, not in a state")
     return 2 / sp.pi * sp.atan(velocity / names["smoothing"])

@@ -25,7 +25,7 @@ COULOMB = force_effect(
             velocity_grid(1 / 512, 1 / 4),
         ),
     ),
-    formula=r"F_c \, \tfrac{2}{\pi} \arctan(\dot q / v_0)",
+    formula=r"F_c \, \frac{2}{\pi} \arctan(\dot q / v_0)",
     title="Coulomb friction",
     source="Verbeek (1993), eq. 6.1",
 )

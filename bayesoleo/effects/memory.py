@@ -35,6 +35,7 @@ DAHL = force_effect(
     source="Dahl (1968), Aerospace Corporation TOR-0158(3107-18)-1",
 )
 
+# With exponent one: a higher one leaves the state's equation singular where the state is zero.
 BOUC_WEN = force_effect(
     "bouc_wen_friction",
     "friction",
@@ -43,14 +44,12 @@ BOUC_WEN = force_effect(
     shapes=(_STIFFNESS,),
     states={
         "memory": State(
-            "dot(memory) - rate*(velocity"
-            " - (abs(velocity)*memory*abs(memory) + velocity*memory**2)/2)",
+            "dot(memory) - rate*(velocity - (abs(velocity)*memory + velocity*abs(memory))/2)",
             description="hysteretic force over yield force",
         )
     },
-    formula=r"F_B w, \quad"
-    r" \dot w = \rho (\dot q - \tfrac12 |\dot q| w |w| - \tfrac12 \dot q w^2)",
-    title="Bouc-Wen hysteresis (exponent two, equal coefficients)",
+    formula=r"F_B w, \quad \dot w = \rho (\dot q - \frac{1}{2} (|\dot q| w + \dot q |w|))",
+    title="Bouc-Wen hysteresis (exponent one, equal coefficients)",
     source="Wen (1976), J. Eng. Mech. Div. ASCE 102(2), 249-263",
 )
 
@@ -77,7 +76,7 @@ LUGRE = force_effect(
         )
     },
     formula=r"F_L w, \quad \dot w = \rho"
-    r" \left(\dot q - \frac{|\dot q| w}{1 + \tfrac12 e^{-(\dot q / v_s)^2}}\right)",
+    r" \left(\dot q - \frac{|\dot q| w}{1 + \frac{1}{2} e^{-(\dot q / v_s)^2}}\right)",
     title="LuGre friction (memory and breakaway, half as much again)",
     source="Canudas de Wit et al. (1995), IEEE Trans. Automatic Control 40(3), 419-425",
 )

@@ -1,0 +1,132 @@
+"""What the catalogue lists, finds and refuses."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from matplotlib.mathtext import MathTextParser
+
+from bayesoleo.effects import (
+    FAMILIES,
+    Amplitude,
+    Effect,
+    candidates,
+    catalogue,
+    describe,
+    find_effect,
+    force_effect,
+)
+from bayesoleo.errors import InputError, ModelError
+from bayesoleo.systems import system
+
+
+def test_ids_are_unique():
+    ids = [effect.id for effect in catalogue()]
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("effect", catalogue(), ids=lambda effect: effect.id)
+def test_every_effect_is_described_and_its_formulas_render(effect):
+    listed = json.loads(json.dumps(describe(effect)))
+    assert listed["family"] in FAMILIES
+    assert all(listed[key] for key in ("title", "formula", "applies_to", "parameters"))
+    parser = MathTextParser("path")
+    parser.parse(f"${effect.formula}$")
+    for parameter in listed["parameters"].values():
+        parser.parse(f"${parameter['latex'] or 'c'}$")
+
+
+def test_every_effect_applies_to_some_system(scales):
+    names = ("f16n1d2", "f16n2d2", "viscous_damper", "duffing")
+    used = {c.effect for name in names for c in candidates(system(name), scales)}
+    assert used == {effect.id for effect in catalogue()}
+
+
+def test_unknown_effect_names_the_closest():
+    with pytest.raises(InputError, match="did you mean cubic_stiffness"):
+        find_effect("cubic_stifness")
+
+
+def test_effect_where_it_does_not_apply(scales):
+    with pytest.raises(ModelError, match="heat_exchange does not apply to 'position'"):
+        find_effect("heat_exchange").extend(system("duffing"), "position", scales)
+
+
+def test_own_effect_in_a_few_lines(scales):
+    drag = force_effect(
+        "drag", "damping", "k*velocity**3", {"k": "force/(position/s)**3"}, formula="k v^3"
+    )
+    (candidate,) = candidates(system("duffing"), scales, [drag])
+    assert candidate.parameters == ("drag_k",)
+    assert candidate.model.parameters["drag_k"].unit == "N/(m/s)**3"
+    assert "drag" in candidate.model.equations["position"]
+
+
+def test_excluded_effects_are_left_out(scales):
+    model = system("duffing")
+    everything = candidates(model, scales)
+    fewer = candidates(model, scales, exclude=("coulomb_friction", "sensor_gain at force"))
+    gone = {(c.effect, c.target) for c in everything} - {(c.effect, c.target) for c in fewer}
+    assert gone == {("coulomb_friction", "position"), ("sensor_gain", "force")}
+
+
+@pytest.mark.parametrize("name", ["f16n1d2", "viscous_damper"])
+def test_an_effect_that_is_in_is_no_candidate_again(name, scales):
+    """Whatever is accepted, its place is not offered a second time."""
+    model = system(name)
+    for candidate in candidates(model, scales):
+        again = candidates(candidate.model, scales, [find_effect(candidate.effect)])
+        assert candidate.target not in {c.target for c in again}, candidate.effect
+
+
+def test_effects_add_up(scales):
+    """Heat exchange, then solubility, then the wall: each is offered once the other is in."""
+    model = system("f16n1d2")
+    for id_ in ("heat_exchange", "gas_solubility", "wall_heat_capacity", "dahl_friction"):
+        (candidate,) = candidates(model, scales, [find_effect(id_)])
+        model = candidate.model
+    assert set(model.dofs) == {"stroke", "temperature", "wall_excess", "dahl_friction_memory"}
+
+
+def test_names_do_not_collide(scales):
+    taken = system("duffing").with_parameters(
+        coulomb_friction=system("duffing").parameters["damping"]
+    )
+    candidate = find_effect("coulomb_friction").extend(taken, "position", scales)
+    assert candidate.parameters == ("coulomb_friction_2",)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("drag", "damping", "k*velocty", {"k": ""}), "unknown name.*velocty.*mean velocity"),
+        (("drag", "dampng", "k*velocity", {"k": ""}), "unknown family.*dampng"),
+        (("a drag", "damping", "k*velocity", {"k": ""}), "not an identifier.*a drag"),
+        (("drag", "damping", "k*", {"k": ""}), r"not an expression.*k\*"),
+        (("drag", "damping", "velocity", {}), "no parameters"),
+    ],
+)
+def test_bad_effects_are_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        force_effect(*arguments)
+
+
+def test_effect_of_ones_own_that_changes_a_definition(scales):
+    """The general form: any function from model to model."""
+
+    def warm(model, target, names):
+        return model.with_definition(target, model.definitions[target] * (1 + names["share"]))
+
+    effect = Effect(
+        id="warm_gas",
+        family="gas",
+        title="Warm gas",
+        formula="p (1 + s)",
+        amplitudes=(Amplitude("share", "", "s", "share"),),
+        places=lambda model: ("gas_pressure",) if "gas_pressure" in model.definitions else (),
+        change=warm,
+    )
+    (candidate,) = candidates(system("f16n1d2"), scales, [effect])
+    assert candidate.model.output("pressure").has(*candidate.model.output("pressure").free_symbols)
+    assert candidates(system("duffing"), scales, [effect]) == []

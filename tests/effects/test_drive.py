@@ -1,0 +1,30 @@
+"""Extended models can be driven by the channels that the plain ones can."""
+
+from __future__ import annotations
+
+import pytest
+
+from bayesoleo.effects import candidates, find_effect
+from bayesoleo.model import driven_by
+from bayesoleo.systems import system
+
+
+@pytest.mark.parametrize("name", ["f16n1d2", "f16n2d2", "duffing"])
+def test_every_candidate_can_be_driven_by_displacement(name, scales):
+    model = system(name)
+    for candidate in candidates(model, scales):
+        driven = driven_by(candidate.model, "displacement")
+        assert "displacement" in driven.inputs, candidate.effect
+        assert "force" in driven.outputs, candidate.effect
+        assert set(candidate.parameters) <= set(driven.parameters)
+
+
+def test_compliant_frame_keeps_the_dof_when_driven(scales):
+    candidate = find_effect("frame_compliance").extend(system("f16n2d2"), "stroke", scales)
+    assert "stroke" in driven_by(candidate.model, "displacement").dofs
+
+
+def test_lagging_force_becomes_a_state_when_driven(scales):
+    candidate = find_effect("sensor_lag").extend(system("f16n1d1"), "force", scales)
+    driven = driven_by(candidate.model, "displacement")
+    assert set(driven.dofs) == {"force_answer"}

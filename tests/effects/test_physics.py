@@ -1,0 +1,119 @@
+"""Effects say what the physics says: against closed forms and against the fuller model."""
+
+from __future__ import annotations
+
+import pytest
+import sympy as sp
+
+from bayesoleo.effects import find_effect
+from bayesoleo.effects.places import damping_terms, force_places
+from bayesoleo.model import Model, Parameter
+from bayesoleo.model.expressions import symbol
+from bayesoleo.systems import system
+
+
+def test_solubility_and_heat_exchange_make_the_thermomechanical_gas_law(scales):
+    """Exponent one, kappa one and sigma = theta_7 T_0 turn f16n1 into f16n2, by algebra."""
+    full, model = system("f16n2d2"), system("f16n1d2")
+    for id_ in ("heat_exchange", "gas_solubility"):
+        effect = find_effect(id_)
+        model = effect.extend(model, effect.places(model)[0], scales).model
+    names = ("initial_volume", "ambient_temperature", "gas_constant", "solubility")
+    volume, ambient, constant, solubility = map(symbol, names)
+    table = {
+        symbol("gas_exponent"): sp.Integer(1),
+        symbol("heat_exchange"): sp.Integer(1),
+        symbol("gas_solubility"): -solubility * constant * ambient / volume,
+        symbol("heat_exchange_conduction"): symbol("heat_conduction"),
+        symbol("heat_exchange_specific_heat"): symbol("specific_heat"),
+        symbol("heat_exchange_gas_constant"): symbol("specific_gas_constant"),
+    }
+    for name in ("stroke", "temperature"):
+        difference = model.equation(name).subs(table) - full.equation(name)
+        assert sp.simplify(difference) == 0
+
+
+def test_absolute_work_is_p_dv(scales):
+    model = system("f16n2d2")
+    extended = find_effect("absolute_pressure_work").extend(model, "gas_power", scales).model
+    power = extended.expand(symbol("gas_power")).subs(symbol("absolute_pressure_work"), 1)
+    work = symbol("piston_area") * model.expand(symbol("gas_pressure")) * symbol("dot(stroke)")
+    assert sp.simplify(power - work) == 0
+
+
+def test_wall_keeps_the_energy(scales):
+    """tau = r C makes the wall's equation r times C dT/dt = Q - (T_w - T_0)/r."""
+    extended = find_effect("wall_heat_capacity").extend(system("f16n2d2"), "heat_loss", scales)
+    equation = extended.model.equations["wall_excess"]
+    resistance, capacity = symbol("wall_heat_capacity"), symbol("C")
+    total = sp.Add(*equation.values()) / resistance
+    total = total.subs(symbol("wall_heat_capacity_time_constant"), resistance * capacity)
+    wall = symbol("wall_excess")
+    expected = capacity * symbol("dot(wall_excess)") + wall / resistance - symbol("heat_loss")
+    assert sp.simplify(total - expected) == 0
+
+
+def test_only_orifice_damping_counts_as_damping():
+    model = system("f16n2d2")
+    place = force_places(model)["stroke"]
+    assert set(damping_terms(model, place)) == {"damping"}
+
+
+def test_direction_dependent_damping_acts_in_extension_only(scales):
+    effect = find_effect("direction_dependent_damping")
+    model = effect.extend(system("f16n1d1"), "stroke", scales).model
+    term = model.equations["stroke"]["damping"].subs(symbol("direction_dependent_damping"), 0.6)
+    velocity, coefficient = symbol("dot(stroke)"), symbol("orifice_damping")
+    assert term.subs(velocity, 2).subs(coefficient, 1) == pytest.approx(4.0)
+    assert term.subs(velocity, -2).subs(coefficient, 1) == pytest.approx(-6.4)
+
+
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_end_stop_pushes_back(side, scales):
+    effect = find_effect(f"end_stop_{side}")
+    model = effect.extend(system("duffing"), "position", scales).model
+    term = model.equations["position"][effect.id].subs(
+        {symbol(n): p.value for n, p in model.parameters.items() if n != effect.id}
+    )
+    force = term.subs(symbol(effect.id), 1.0)
+    inside, outside = (0.13, 0.0) if side == "lower" else (0.13, 0.26)
+    assert force.subs(symbol("position"), inside) == 0
+    # A resisting force: negative below the lower stop, positive above the upper one.
+    assert (force.subs(symbol("position"), outside) < 0) == (side == "lower")
+
+
+def test_sign_of_the_inertia_carries_over(scales):
+    """A balance written the other way round gets the resisting force the other way round."""
+    model = Model(
+        "reversed",
+        inputs={"force": "N"},
+        dofs={"q": "m"},
+        parameters={"m": Parameter(1.0, "kg", fixed=True)},
+        equations={"q": {"force": "force", "inertia": "-m*ddot(q)"}},
+        outputs={"y": "q"},
+    )
+    extended = find_effect("linear_stiffness").extend(model, "q", scales).model
+    assert extended.equations["q"]["linear_stiffness"] == -symbol("linear_stiffness") * symbol("q")
+
+
+def test_first_order_systems_get_effects_of_position_only(scales):
+    lorenz = system("lorenz")
+    assert find_effect("cubic_stiffness").places(lorenz) == ("x", "y", "z")
+    assert find_effect("viscous_damping").places(lorenz) == ()
+
+
+def test_memory_and_temperature_are_no_places_for_forces(scales):
+    assert find_effect("cubic_stiffness").places(system("f16n2d2")) == ("stroke",)
+    damper = find_effect("dahl_friction").extend(system("viscous_damper"), "force", scales).model
+    assert find_effect("cubic_stiffness").places(damper) == ("force",)
+
+
+def test_series_compliance_of_a_damper_is_a_maxwell_element(scales):
+    """x = z + c F(dz/dt) with F = d dz/dt."""
+    effect = find_effect("frame_compliance")
+    model = effect.extend(system("viscous_damper"), "force", scales).model
+    inner, rate = symbol("displacement_inside"), symbol("dot(displacement_inside)")
+    law = symbol("damping") * rate + symbol("force_offset")
+    expected = inner + symbol("frame_compliance") * law - symbol("displacement")
+    assert sp.expand(model.equation("displacement_inside") - expected) == 0
+    assert model.output("force") == law
