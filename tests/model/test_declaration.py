@@ -1,0 +1,108 @@
+"""A model says what is wrong with it, and changes without changing the original."""
+
+from __future__ import annotations
+
+import pytest
+import sympy as sp
+
+from bayesoleo.errors import ModelError
+from bayesoleo.model import Condition, LogNormal, Model, Normal, Output, Parameter
+from bayesoleo.model.expressions import derivative_symbol, symbol
+
+
+def declare(**changes):
+    """A spring and a mass, with changes."""
+    parts = {
+        "inputs": {"force": "N"},
+        "dofs": {"q": "m"},
+        "parameters": {"k": Parameter(2.0, "N/m", sd=1.0), "m": Parameter(1.0, "kg", fixed=True)},
+        "conditions": {"preload": Condition("N", 0.5)},
+        "definitions": {"spring": "k*q + preload"},
+        "equations": {"q": {"inertia": "m*ddot(q)", "spring": "spring", "drive": "-force"}},
+        "outputs": {"displacement": Output("q", "m")},
+    }
+    return Model("test", **(parts | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"outputs": {}}, "no outputs"),
+        ({"outputs": {"force": "q"}}, "'force' is both input and output"),
+        ({"conditions": {"k": "N"}}, "'k' is both parameter and condition"),
+        ({"inputs": {"the force": "N"}}, "input 'the force' is not usable.*underscores"),
+        ({"inputs": {"lambda": "N"}}, "input 'lambda' is not usable.*reserved"),
+        ({"parameters": {"k": 2.0}}, "parameter 'k' is not a Parameter.*2.0"),
+        ({"equations": {}}, "dofs and equations do not match at q"),
+        ({"equations": {"q": "q", "p": "1"}}, "dofs and equations do not match at p"),
+        ({"definitions": {"spring": "later", "later": "q"}}, "definition 'spring'.*later"),
+        ({"equations": {"q": {"a": "kk*q"}}}, "equation 'q', term 'a': unknown name kk"),
+        ({"admissible": ["1 - p"]}, "admissible region: unknown name p"),
+    ],
+)
+def test_what_is_wrong_is_named(changes, message):
+    with pytest.raises(ModelError, match=message):
+        declare(**changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"value": float("nan")}, "finite value"),
+        ({"value": 1.0, "sd": 1.0, "relative_sd": 0.1}, "prior stated twice"),
+        ({"value": 0.0, "relative_sd": 0.1}, "value of zero is no prior"),
+        ({"value": 3.0, "bounds": (0.0, 2.0)}, "bounds exclude the start.*between 0 and 2"),
+        ({"value": 1.0, "sd": -1.0}, "positive, finite standard deviation"),
+        ({"value": 1.0, "bounds": (2.0, 0.0)}, "low < high"),
+    ],
+)
+def test_bad_parameters_are_refused(arguments, message):
+    with pytest.raises(ModelError, match=message):
+        Parameter(**arguments)
+
+
+def test_priors_follow_from_what_is_stated():
+    assert Parameter(2.0, relative_sd=0.1).prior == Normal(2.0, 0.2)
+    assert Parameter(2.0, prior=LogNormal(2.0, 0.5)).prior == LogNormal(2.0, 0.5)
+    assert Parameter(2.0, fixed=True).prior is None
+
+
+def test_changes_leave_the_original_alone():
+    model = declare()
+    extended = model.with_parameters(c=Parameter(0.0, sd=1.0)).with_term(
+        "equation", "q", "damping", "c*dot(q)"
+    )
+    assert "damping" not in model.equations["q"]
+    assert extended.equation("q").has(derivative_symbol("q", 1))
+    assert model.digest() != extended.digest()
+    assert declare().digest() == model.digest()
+
+
+def test_redefinition_reaches_every_term():
+    """Also those beside a time derivative."""
+    model = declare(
+        equations={"q": {"inertia": "m*ddot(q)", "mixed": "spring*dot(q)", "drive": "-force"}}
+    )
+    changed = model.with_definition("spring", "k*q**3")
+    expected = symbol("k") * symbol("q") ** 3 * derivative_symbol("q", 1)
+    assert changed.expand(changed.equations["q"]["mixed"]) == expected
+
+
+def test_rate_of_a_definition_inside_a_definition():
+    model = declare(definitions={"spring": "k*q", "power": "dot(spring)*q"})
+    expected = symbol("k") * symbol("q") * derivative_symbol("q", 1)
+    assert model.definitions["power"] == expected
+
+
+def test_coordinates_know_where_forces_act():
+    (place,) = declare().coordinates()
+    assert (place.name, place.kind, place.target, place.sign) == ("q", "equation", "q", 1)
+    law = Model("law", {"force": Output("3*dot(x)", "N")}, inputs={"x": "m"})
+    (place,) = law.coordinates()
+    assert (place.kind, place.target, place.velocity) == ("output", "force", symbol("dot(x)"))
+
+
+def test_one_expression_becomes_numbered_terms():
+    model = declare(equations={"q": "m*ddot(q) + k*q - force"})
+    assert sorted(model.equations["q"]) == ["term 1", "term 2", "term 3"]
+    assert sp.expand(model.equation("q") - sp.Add(*model.equations["q"].values())) == 0

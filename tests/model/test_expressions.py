@@ -1,0 +1,84 @@
+"""Text becomes expressions over declared names, and nothing else."""
+
+from __future__ import annotations
+
+import pytest
+import sympy as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bayesoleo.errors import ModelError
+from bayesoleo.model.expressions import (
+    derivative_symbol,
+    parse,
+    partial,
+    split_derivative,
+    symbol,
+    total_derivative,
+)
+
+KNOWN = {name: symbol(name) for name in ("q", "stiffness", "force")}
+
+
+def read(text):
+    return parse(text, KNOWN, ("q", "force"), "here")
+
+
+def test_reads_what_an_engineer_writes():
+    q, k = symbol("q"), symbol("stiffness")
+    assert read("stiffness*q**3 - 2") == k * q**3 - 2
+    assert read("positive(-q)") == sp.Max(-q, 0)
+    assert read("ddot(q)") == derivative_symbol("q", 2)
+    assert read(3) == 3
+
+
+def test_time_derivative_follows_the_chain_rule():
+    q, rate = symbol("q"), derivative_symbol("q", 1)
+    assert read("dot(q**2)") == 2 * q * rate
+    assert read("ddot(q**2)") == 2 * rate**2 + 2 * q * derivative_symbol("q", 2)
+    assert read("dot(stiffness)") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stifness*q", "here: unknown name stifness.*'stifness[*]q'.*did you mean stiffness"),
+        ("q +", "here: not an expression.*k[*]q[*][*]3"),
+        ("exec('1')", "here: Constant has no place|unknown function exec"),
+        ("q.real", "here: Attribute has no place"),
+        ("[q]", "here: List has no place"),
+        ("q if q else 1", "here: IfExp has no place"),
+        ("cosh(q)", "here: unknown function cosh.*there are dot, ddot, abs"),
+        ("atan(q, q)", "here: atan takes one argument"),
+        ("max(q)", "here: max takes two arguments"),
+        ("1/0", "here: not a finite real number"),
+        ("sqrt(-1)", "here: not a finite real number"),
+        ("True", "here: Constant has no place"),
+        ("q % 2", "here: BinOp has no place"),
+        ("not q", "here: UnaryOp has no place"),
+        (None, "here: not an expression"),
+        ("", "here: not an expression"),
+    ],
+)
+def test_what_is_no_expression_is_refused(text, message):
+    with pytest.raises(ModelError, match=message):
+        read(text)
+
+
+@pytest.mark.parametrize("text", ["abs(q)", "sign(q)", "max(q, 0)", "step(q)", "q*abs(q)"])
+def test_derivatives_at_kinks_have_no_impulses(text):
+    assert not partial(read(text), symbol("q")).has(sp.DiracDelta)
+
+
+@given(st.sampled_from(["q", "stroke_2", "x"]), st.integers(0, 5))
+def test_derivative_symbols_split_into_what_made_them(name, order):
+    assert split_derivative(derivative_symbol(name, order)) == (name, order)
+
+
+@given(st.integers(1, 4), st.integers(1, 4))
+def test_time_derivative_of_a_product(m, n):
+    """Leibniz' rule."""
+    left, right = symbol("q") ** m, sp.sin(symbol("q")) * n
+    whole = total_derivative(left * right, ["q"])
+    parts = total_derivative(left, ["q"]) * right + left * total_derivative(right, ["q"])
+    assert sp.expand(whole - parts) == 0
