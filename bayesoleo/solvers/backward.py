@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.sweep import close_and_sweep, eliminate, jit
+from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 
 Array = NDArray[np.float64]
 
@@ -111,50 +111,59 @@ class BackwardDifferences:
         return dx, monodromy, ok
 
 
+#: Nodes whose equations are solved together, innermost in memory.
+BLOCK = 32
+
+
 @jit
 def _linear(gz, right, lanes, h, orders, first, second, initial, dx, monodromy, ok):
     d, n, k = orders.size, gz.shape[3], right.shape[2]
     D = 3 * d
-    transfer = np.empty((n, D, D + k))
-    states = np.empty((n, D, k))
+    work, scale = np.empty((d, d + D + k, BLOCK)), np.empty((d, BLOCK))
+    transfer = np.zeros((D, D + k, n))
+    for i in range(2 * d):
+        transfer[d + i, i] = 1.0
+    states = np.empty((D, k, n))
     for lane in lanes:
         good = True
-        for m in range(n):
-            good = _condense(gz[lane], right[lane], m, h, orders, first, second, transfer[m])
-            if not good:
-                break
+        for begin in range(0, n, BLOCK):
+            count = min(BLOCK, n - begin)
+            _assemble(gz[lane], right[lane], begin, count, h, orders, first, second, work)
+            if not eliminate_together(work, scale, count, d):
+                _assemble(gz[lane], right[lane], begin, count, h, orders, first, second, work)
+                good = good and eliminate_each(work, count, d)
+            for j in range(d):
+                for column in range(D + k):
+                    for t in range(count):
+                        transfer[j, column, begin + t] = work[j, d + column, t]
         if good:
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:
             for m in range(n):
+                after = m + 1 if m + 1 < n else 0
                 for j in range(d):
                     for column in range(k):
                         # The state before step m + 1 leads with the unknowns of node m.
-                        dx[lane, m, j, column] = states[(m + 1) % n, j, column]
+                        dx[lane, m, j, column] = states[j, column, after]
 
 
 @jit
-def _condense(gz, right, m, h, orders, first, second, transfer):
-    """Unknowns of node ``m`` from the three nodes before it, as a companion matrix ``(3 d, 3 d + k)``."""
-    d = orders.size
-    D, k = 3 * d, right.shape[1]
-    matrix = np.zeros((d, d))
-    solution = np.zeros((d, D + k))
+def _assemble(gz, right, begin, count, h, orders, first, second, work):
+    """Equations of ``count`` nodes: ``work (d, d + 3 d + k, block)`` is [node | three nodes before it | right side]."""
+    d, k = orders.size, right.shape[1]
     for e in range(d):
         row = 0
         for j in range(d):
-            low, mid = gz[e, row, m], gz[e, row + 1, m] / h
-            top = gz[e, row + 2, m] / (h * h) if orders[j] == 2 else 0.0
-            matrix[e, j] = low + first[0] * mid + second[0] * top
-            for past in range(1, 4):
-                solution[e, (past - 1) * d + j] = -(first[past] * mid + second[past] * top)
+            for past in range(4):
+                sign = 1.0 if past == 0 else -1.0
+                value, rate = sign if past == 0 else 0.0, sign * first[past] / h
+                bend = sign * second[past] / (h * h)
+                for t in range(count):
+                    m = begin + t
+                    total = value * gz[e, row, m] + rate * gz[e, row + 1, m]
+                    work[e, past * d + j, t] = total + (bend * gz[e, row + 2, m] if orders[j] == 2 else 0.0)
             row += orders[j] + 1
         for column in range(k):
-            solution[e, D + column] = -right[e, column, m]
-    good = eliminate(matrix, solution)
-    transfer[:] = 0.0
-    transfer[:d] = solution
-    for i in range(2 * d):
-        transfer[d + i, i] = 1.0
-    return good
+            for t in range(count):
+                work[e, 4 * d + column, t] = -right[e, column, begin + t]

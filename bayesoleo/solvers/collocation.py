@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.sweep import close_and_sweep, eliminate, jit
+from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 from bayesoleo.solvers.tableau import Tableau
 
 Array = NDArray[np.float64]
@@ -88,10 +88,8 @@ class Collocation:
 
     def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
-        n = x.shape[1]
-        index = np.repeat(np.arange(n), self.method.stages)
-        weights = (np.tile(w, (n, 1)) for w in self.method.weights(self.method.c))
-        _sample(x[..., None], lanes, index, np.tile(self.method.c, n), *weights, step, self._orders, z[:, :, None])
+        method = self.method
+        _rows(x, lanes, step, method.a, method.a @ method.a, method.c, self._orders, z)
 
     def plan(self, phase: Array, n: int) -> SamplePlan:
         """Where in the mesh given phases (cycles) lie, with their interpolation weights; worth keeping for fixed samples."""
@@ -203,23 +201,63 @@ def _sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
 
 
 @jit
+def _rows(x, lanes, h, a, aa, c, orders, z):
+    """``z (L, nz, n s)`` at the stages."""
+    d, s, n = orders.size, c.size, x.shape[1]
+    D = orders.sum()
+    for lane in lanes:
+        row = state = 0
+        for j in range(d):
+            for i in range(s):
+                for m in range(n):
+                    once = twice = 0.0
+                    for stage in range(s):
+                        value = x[lane, m, D + stage * d + j]
+                        once += a[i, stage] * value
+                        twice += aa[i, stage] * value
+                    low, point = x[lane, m, state], m * s + i
+                    if orders[j] == 1:
+                        z[lane, row, point] = low + h * once
+                        z[lane, row + 1, point] = x[lane, m, D + i * d + j]
+                    else:
+                        rate = x[lane, m, state + 1]
+                        z[lane, row, point] = low + h * (c[i] * rate + h * twice)
+                        z[lane, row + 1, point] = rate + h * once
+                        z[lane, row + 2, point] = x[lane, m, D + i * d + j]
+            row += orders[j] + 1
+            state += orders[j]
+
+
+#: Steps of the mesh whose stages are eliminated together, innermost in memory.
+BLOCK = 32
+
+
+@jit
 def _linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok):
     """Eliminate every step's stages, close the period, and recover the stages."""
     d, s = orders.size, b.size
     D, n, k = orders.sum(), dx.shape[1], right.shape[2]
-    stages = np.empty((n, s * d, D + k))
-    transfer = np.empty((n, D, D + k))
-    states = np.empty((n, D, k))
+    size = s * d
+    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((size, BLOCK))
+    stages = np.empty((size, D + k, n))
+    transfer = np.empty((D, D + k, n))
+    states = np.empty((D, k, n))
     for lane in lanes:
         good = True
-        for m in range(n):
-            good = _condense(gz[lane], right[lane], m, h, a, aa, c, orders, stages[m])
-            if not good:
-                break
-            _transfer(stages[m], h, b, ba, orders, transfer[m])
-            if newton:
-                _add_jump(x[lane], m, h, b, ba, orders, transfer[m])
+        for first in range(0, n, BLOCK):
+            count = min(BLOCK, n - first)
+            _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+            if not eliminate_together(work, scale, count, size):
+                _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+                good = good and eliminate_each(work, count, size)
+            for line in range(size):
+                for column in range(D + k):
+                    for t in range(count):
+                        stages[line, column, first + t] = work[line, size + column, t]
         if good:
+            _transfer(stages, h, b, ba, orders, transfer)
+            if newton:
+                _add_jumps(x[lane], h, b, ba, orders, transfer)
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:
@@ -227,41 +265,46 @@ def _linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx
 
 
 @jit
-def _condense(gz, right, m, h, a, aa, c, orders, solution):
-    """Stage unknowns of step ``m`` as an affine function of its left state: ``solution (s d, D + k)``."""
+def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
+    """Equations at the stages of ``count`` steps: ``work (s d, s d + D + k, block)`` is [stage unknowns | left state | right side]."""
     d, s = orders.size, c.size
     D, k = orders.sum(), right.shape[1]
-    matrix = np.zeros((s * d, s * d))
-    solution[:] = 0.0
+    size = s * d
     for i in range(s):
-        point = m * s + i
+        begin = first * s + i
         for e in range(d):
             line = i * d + e
             row = state = 0
             for j in range(d):
-                low, mid = gz[e, row, point], gz[e, row + 1, point]
-                if orders[j] == 1:
-                    for stage in range(s):
-                        matrix[line, stage * d + j] += h * a[i, stage] * low
-                    matrix[line, i * d + j] += mid
-                    solution[line, state] -= low
-                else:
-                    for stage in range(s):
-                        matrix[line, stage * d + j] += h * (h * aa[i, stage] * low + a[i, stage] * mid)
-                    matrix[line, i * d + j] += gz[e, row + 2, point]
-                    solution[line, state] -= low
-                    solution[line, state + 1] -= h * c[i] * low + mid
+                for stage in range(s):
+                    once, twice, own = h * a[i, stage], h * h * aa[i, stage], 1.0 if stage == i else 0.0
+                    column = stage * d + j
+                    if orders[j] == 1:
+                        for t in range(count):
+                            point = begin + t * s
+                            work[line, column, t] = once * gz[e, row, point] + own * gz[e, row + 1, point]
+                    else:
+                        for t in range(count):
+                            point = begin + t * s
+                            total = twice * gz[e, row, point] + once * gz[e, row + 1, point]
+                            work[line, column, t] = total + own * gz[e, row + 2, point]
+                for t in range(count):
+                    work[line, size + state, t] = -gz[e, row, begin + t * s]
+                if orders[j] == 2:
+                    for t in range(count):
+                        point = begin + t * s
+                        work[line, size + state + 1, t] = -(h * c[i] * gz[e, row, point] + gz[e, row + 1, point])
                 row += orders[j] + 1
                 state += orders[j]
             for column in range(k):
-                solution[line, D + column] = -right[e, column, point]
-    return eliminate(matrix, solution)
+                for t in range(count):
+                    work[line, size + D + column, t] = -right[e, column, begin + t * s]
 
 
 @jit
-def _transfer(solution, h, b, ba, orders, transfer):
-    """State at the right end of a step from that at the left: ``transfer (D, D + k)``."""
-    d, s = orders.size, b.size
+def _transfer(stages, h, b, ba, orders, transfer):
+    """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
+    d, s, n = orders.size, b.size, transfer.shape[2]
     transfer[:] = 0.0
     state = 0
     for j in range(d):
@@ -272,43 +315,49 @@ def _transfer(solution, h, b, ba, orders, transfer):
             transfer[state, last] = h
         for stage in range(s):
             for column in range(transfer.shape[1]):
-                value = solution[stage * d + j, column]
-                transfer[last, column] += h * b[stage] * value
+                for m in range(n):
+                    transfer[last, column, m] += h * b[stage] * stages[stage * d + j, column, m]
                 if orders[j] == 2:
-                    transfer[state, column] += h * h * ba[stage] * value
+                    for m in range(n):
+                        transfer[state, column, m] += h * h * ba[stage] * stages[stage * d + j, column, m]
         state += orders[j]
 
 
 @jit
-def _add_jump(x, m, h, b, ba, orders, transfer):
-    """Add the jump between the end of step ``m`` and the next node, periodically, to the right-hand side (one column)."""
+def _add_jumps(x, h, b, ba, orders, transfer):
+    """Add the jump between the end of each step and the next node, periodically, to the right-hand side (one column)."""
     d, s, n = orders.size, b.size, x.shape[0]
     D = orders.sum()
-    following = (m + 1) % n
     state = 0
     for j in range(d):
-        once = twice = 0.0
-        for stage in range(s):
-            value = x[m, D + stage * d + j]
-            once += b[stage] * value
-            twice += ba[stage] * value
         last = state + orders[j] - 1
-        transfer[last, D] += x[m, last] + h * once - x[following, last]
-        if orders[j] == 2:
-            transfer[state, D] += x[m, state] + h * (x[m, last] + h * twice) - x[following, state]
+        for m in range(n):
+            following = m + 1 if m + 1 < n else 0
+            once = twice = 0.0
+            for stage in range(s):
+                value = x[m, D + stage * d + j]
+                once += b[stage] * value
+                twice += ba[stage] * value
+            transfer[last, D, m] += x[m, last] + h * once - x[following, last]
+            if orders[j] == 2:
+                transfer[state, D, m] += x[m, state] + h * (x[m, last] + h * twice) - x[following, state]
         state += orders[j]
 
 
 @jit
 def _recover(stages, states, dx):
     """Stage unknowns from the node states: ``dx (n, w, k)``."""
-    n, D, k = states.shape
-    for m in range(n):
-        for column in range(k):
+    D, k, n = states.shape
+    total = np.empty(n)
+    for column in range(k):
+        for i in range(D):
+            for m in range(n):
+                dx[m, i, column] = states[i, column, m]
+        for line in range(stages.shape[0]):
+            for m in range(n):
+                total[m] = stages[line, D + column, m]
             for i in range(D):
-                dx[m, i, column] = states[m, i, column]
-            for line in range(stages.shape[1]):
-                total = stages[m, line, D + column]
-                for i in range(D):
-                    total += stages[m, line, i] * states[m, i, column]
-                dx[m, D + line, column] = total
+                for m in range(n):
+                    total[m] += stages[line, i, m] * states[i, column, m]
+            for m in range(n):
+                dx[m, D + line, column] = total[m]

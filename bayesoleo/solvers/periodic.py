@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.solvers import measures
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
@@ -144,10 +145,13 @@ class _Newton:
         d, points = len(scheme.orders), problem.inputs.shape[1]
         nz = scheme.state_size + d
         self.step = problem.step(n)
-        self.z = np.zeros((lanes, nz, points))
-        self.g = np.zeros((lanes, d, points))
-        self.gz = np.zeros((lanes, d, nz, points))
-        self.a = np.ones((lanes, problem.conditions, points))
+        self.base = np.empty_like(x)
+        self.z = np.empty((lanes, nz, points))
+        self.g = np.empty((lanes, d, points))
+        self.gz = np.empty((lanes, d, nz, points))
+        self.a = np.empty((lanes, problem.conditions, points))
+        self.squares, self.terms = np.empty((lanes, d)), np.empty((lanes, d))
+        self.inside = np.ones(lanes, dtype=np.bool_)
         self.status = np.full(lanes, Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(lanes, dtype=np.int64)
         self.merit = np.full(lanes, np.inf)
@@ -155,26 +159,24 @@ class _Newton:
 
     def run(self) -> Solution:
         lanes = np.arange(self.x.shape[0])
-        lanes = self._drop(lanes, self._evaluate(lanes), None)
+        good = self._evaluate(lanes)
+        outside = np.where(self.inside, Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
+        lanes = self._drop(lanes, good, outside)
+        size = np.empty(self.x.shape[0])
         for _ in range(self.max_iterations):
             if lanes.size == 0:
                 break
             self.iterations[lanes] += 1
             dx, _, ok = self.problem.scheme.linear(self.gz, self.g[:, :, None], self.x, lanes, self.step)
-            ok = ok[lanes] & np.isfinite(dx[lanes]).all(axis=(1, 2, 3))
-            lanes = self._drop(lanes, ok, Status.SINGULAR)
-            size = self._relative_step(dx[..., 0], lanes)
-            lanes, kept = self._advance(lanes, dx[..., 0], size)
-            lanes = self._finish(lanes, size[kept])
+            measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
+            lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
+            lanes = self._finish(lanes, dx, size)
+            lanes = self._advance(lanes, dx, size)
         return Solution(self.x, self.status, self.iterations)
 
-    def _drop(self, lanes: Lanes, good: NDArray[np.bool_], reason: Status | None) -> Lanes:
-        if reason is None:
-            inadmissible = (self.a[lanes] <= 0).any(axis=(1, 2)) & ~good
-            self.status[lanes[~good]] = Status.NOT_FINITE.value
-            self.status[lanes[inadmissible]] = Status.INADMISSIBLE.value
-        else:
-            self.status[lanes[~good]] = reason.value
+    def _drop(self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]) -> Lanes:
+        bad = lanes[~good]
+        self.status[bad] = reason if isinstance(reason, int) else reason[bad]
         return lanes[good]
 
     def _evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
@@ -183,58 +185,57 @@ class _Newton:
         self.problem.scheme.rows(self.x, lanes, self.step, self.z)
         with np.errstate(all="ignore"):
             equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
-            equations.admissible(self.z, u, self.p, lanes, self.a)
-        finite = np.isfinite(self.g[lanes]).all(axis=(1, 2)) & np.isfinite(self.gz[lanes]).all(axis=(1, 2, 3))
-        return finite & (self.a[lanes] > 0).all(axis=(1, 2))
+            if self.problem.conditions:
+                equations.admissible(self.z, u, self.p, lanes, self.a)
+        measures.positive(self.a, lanes, self.inside)
+        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
+        return self.inside[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
 
-    def _term_size(self, lanes: Lanes) -> Array:
-        """Size of the equations' terms at the present unknowns, the unit of residuals; shape (lanes, d)."""
-        g, gz, z = self.g[lanes], self.gz[lanes], self.z[lanes]
-        terms = np.sum((gz * z[:, None]) ** 2, axis=2) + g**2
-        return np.sqrt(np.mean(terms, axis=2)) + 1e-300
-
-    def _merit(self, lanes: Lanes, size: Array) -> Array:
+    def _merit(self, lanes: Lanes, unit: Array) -> Array:
         """Residual in a given unit; Newton's direction reduces it if the unit is kept during a step."""
-        return np.sqrt(np.sum(np.mean(self.g[lanes] ** 2, axis=2) / size**2, axis=1))
+        with np.errstate(all="ignore"):
+            return np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
 
-    def _relative_step(self, dx: Array, lanes: Lanes) -> Array:
-        D = self.problem.scheme.state_size
-        scale = np.max(np.abs(self.x[lanes, :, :D]), axis=1) + 1e-300
-        return np.max(np.max(np.abs(dx[lanes, :, :D]), axis=1) / scale, axis=1, initial=0.0)
+    def _finish(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
+        """Take the last step where it is small enough that what it leaves is round-off."""
+        sizes = size[lanes]
+        done = ((sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])) | (sizes < SMALL_STEP)
+        finished = lanes[done]
+        measures.keep(self.x, finished, self.base)
+        measures.take(self.base, dx, finished, np.ones(finished.size), self.x)
+        self.status[finished] = Status.CONVERGED.value
+        self.last[lanes] = sizes
+        return lanes[~done]
 
-    def _advance(self, lanes: Lanes, dx: Array, size: Array) -> tuple[Lanes, NDArray[np.bool_]]:
+    def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
         """Take the steps, halving those that leave the admissible region or do not reduce the residual."""
-        base, fraction = self.x[lanes].copy(), np.ones(lanes.size)
-        unit = self._term_size(lanes)
-        before = self._merit(lanes, unit)
+        measures.keep(self.x, lanes, self.base)
+        # The unit of residuals is the size of the equations' terms before the step.
+        unit = self.terms[lanes] + 1e-300
+        before, fraction = self._merit(lanes, unit), np.ones(lanes.size)
         pending = np.arange(lanes.size)
         for _ in range(MAXIMUM_HALVINGS):
+            if pending.size == 0:
+                break
             chosen = lanes[pending]
-            self.x[chosen] = base[pending] + fraction[pending, None, None] * dx[chosen]
+            measures.take(self.base, dx, chosen, fraction[pending], self.x)
             good = self._evaluate(chosen)
             merit = self._merit(chosen, unit[pending])
             # Close to the solution round-off keeps the residual from falling; the step's own size then decides.
-            good &= (merit < before[pending]) | (size[pending] < 1e-5) | (not self.monotone)
+            good &= (merit < before[pending]) | (size[chosen] < 1e-5) | (not self.monotone)
             self.merit[chosen[good]] = merit[good]
             pending = pending[~good]
-            if pending.size == 0:
-                break
             fraction[pending] *= 0.5
+        stuck = lanes[pending]
+        outside = np.where(self.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value)
+        self.status[stuck] = outside
+        measures.keep(self.base, stuck, self.x)
+        self.last[lanes[fraction < 1.0]] = np.inf
         kept = np.ones(lanes.size, dtype=bool)
         kept[pending] = False
-        self.x[lanes[pending]] = base[pending]
-        stuck = lanes[pending]
-        inadmissible = (self.a[stuck] <= 0).any(axis=(1, 2))
-        self.status[stuck] = np.where(inadmissible, Status.INADMISSIBLE.value, Status.NO_CONVERGENCE.value)
-        size[fraction < 1.0] = np.maximum(size[fraction < 1.0], 1.0)
-        return lanes[kept], kept
-
-    def _finish(self, lanes: Lanes, size: Array) -> Lanes:
-        contracting = size < 0.1 * self.last[lanes]
-        done = ((size < LAST_STEP) & contracting) | (size < SMALL_STEP)
+        lanes = lanes[kept]
         # A linear problem is solved by its first step.
-        done |= (self.merit[lanes] < 1e-14) & (self.iterations[lanes] > 1)
-        self.last[lanes] = size
+        done = (self.merit[lanes] < 1e-14) & (self.iterations[lanes] > 1)
         self.status[lanes[done]] = Status.CONVERGED.value
         return lanes[~done]
 

@@ -61,50 +61,96 @@ def eliminate(matrix, right):
     return True
 
 
-@jit
-def close_and_sweep(transfer, monodromy, states, initial):
-    """Close the period and run through it once more.
+#: A pivot this small against the largest entry of its row asks for the elimination that exchanges rows.
+SMALL_PIVOT = 1e-3
 
-    Parameters: ``transfer (n, D, D + k)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is the product of all ``M_m`` and
-    ``states (n, D, k)`` the solution at the nodes. With ``initial`` true the first state is held (an initial value problem)
-    instead of being closed. Returns False if the closure is singular.
+
+@jit
+def eliminate_together(work, scale, count, m):
+    """Solve ``count`` systems at once, without exchanging rows: ``work (m, m + k, block)`` holds ``[matrix | right]``, systems last.
+
+    The right-hand columns become the solutions. Returns False, with ``work`` spoilt, where a pivot is too small for that.
     """
-    n, D, width = transfer.shape
-    k = width - D
-    product = np.zeros((D, width))
-    for i in range(D):
-        product[i, i] = 1.0
-    for m in range(n):
-        product = _advance(transfer[m], product, D)
-    monodromy[:] = product[:, :D]
-    first = np.zeros((D, k))
-    if not initial:
-        closure = np.eye(D) - product[:, :D]
-        first[:] = product[:, D:]
-        if not eliminate(closure, first):
+    width = work.shape[1]
+    for i in range(m):
+        for t in range(count):
+            scale[i, t] = abs(work[i, 0, t])
+        for j in range(1, m):
+            for t in range(count):
+                scale[i, t] = max(scale[i, t], abs(work[i, j, t]))
+    for column in range(m):
+        bad = 0
+        for t in range(count):
+            pivot = abs(work[column, column, t])
+            bad += not (pivot > SMALL_PIVOT * scale[column, t] and pivot < np.inf)
+        if bad > 0:
             return False
-    for m in range(n):
-        states[m] = first
-        following = np.empty((D, k))
-        for i in range(D):
-            for j in range(k):
-                total = transfer[m, i, D + j]
-                for l in range(D):
-                    total += transfer[m, i, l] * first[l, j]
-                following[i, j] = total
-        first = following
+        for t in range(count):
+            work[column, column, t] = 1.0 / work[column, column, t]
+        for i in range(column + 1, m):
+            for t in range(count):
+                work[i, column, t] *= work[column, column, t]
+            for j in range(column + 1, width):
+                for t in range(count):
+                    work[i, j, t] -= work[i, column, t] * work[column, j, t]
+    for i in range(m - 1, -1, -1):
+        for j in range(m, width):
+            for l in range(i + 1, m):
+                for t in range(count):
+                    work[i, j, t] -= work[i, l, t] * work[l, j, t]
+            for t in range(count):
+                work[i, j, t] *= work[i, i, t]
     return True
 
 
 @jit
-def _advance(step, product, D):
-    """``[M | r]`` of one step applied to the accumulated ``[P | c]``."""
-    width = product.shape[1]
-    result = np.empty((D, width))
-    for i in range(D):
-        for j in range(width):
-            total = step[i, j] if j >= D else 0.0
-            for l in range(D):
-                total += step[i, l] * product[l, j]
-            result[i, j] = total
-    return result
+def eliminate_each(work, count, m):
+    """The same system by system, with exchange of rows; returns False where one is singular."""
+    width = work.shape[1]
+    matrix, right = np.empty((m, m)), np.empty((m, width - m))
+    for t in range(count):
+        matrix[:] = work[:, :m, t]
+        right[:] = work[:, m:, t]
+        if not eliminate(matrix, right):
+            return False
+        work[:, m:, t] = right
+    return True
+
+
+@jit
+def close_and_sweep(transfer, monodromy, states, initial):
+    """Close the period and run through it once more.
+
+    Parameters: ``transfer (D, D + k, n)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is the product of all ``M_m`` and
+    ``states (D, k, n)`` the solution at the nodes. With ``initial`` true the first state is held (an initial value problem)
+    instead of being closed. Returns False if the closure is singular.
+    """
+    D, width, n = transfer.shape
+    k = width - D
+    product, following = np.eye(D, width), np.empty((D, width))
+    for m in range(n):
+        for i in range(D):
+            for j in range(width):
+                total = transfer[i, j, m] if j >= D else 0.0
+                for l in range(D):
+                    total += transfer[i, l, m] * product[l, j]
+                following[i, j] = total
+        product, following = following, product
+    monodromy[:] = product[:, :D]
+    state = np.zeros((D, k))
+    if not initial:
+        closure = np.eye(D) - product[:, :D]
+        state[:] = product[:, D:]
+        if not eliminate(closure, state):
+            return False
+    after = np.empty((D, k))
+    for m in range(n):
+        for i in range(D):
+            for j in range(k):
+                states[i, j, m] = state[i, j]
+                total = transfer[i, D + j, m]
+                for l in range(D):
+                    total += transfer[i, l, m] * state[l, j]
+                after[i, j] = total
+        state, after = after, state
+    return True
