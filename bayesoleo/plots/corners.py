@@ -57,12 +57,11 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
         plot_density=False,
         fill_contours=True,
         color=style.AFTER,
-        truths=truths,
-        truth_color=style.BEFORE,
         max_n_ticks=3,
         quiet=True,
     )
-    _arrange(figure, len(names))
+    _arrange(figure)
+    _mark(figure, truths)
     _tidy(figure, names, scales, shown)
     handles = [
         style.band(style.AFTER, "posterior"),
@@ -84,7 +83,20 @@ def _range(values: reading.Array, truth: float | None) -> tuple[float, float]:
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
-def _arrange(figure: Figure, count: int) -> None:
+def _mark(figure: Figure, truths: list[float | None]) -> None:
+    """Lines at the point estimate; corner's own marks fail on a single parameter."""
+    count = len(truths)
+    axes = np.array(figure.axes).reshape(count, count)
+    for row in range(count):
+        for column in range(row + 1):
+            x, y = truths[column], truths[row]
+            if x is not None:
+                axes[row, column].axvline(x, color=style.BEFORE, lw=1.0)
+            if y is not None and column < row:
+                axes[row, column].axhline(y, color=style.BEFORE, lw=1.0)
+
+
+def _arrange(figure: Figure) -> None:
     """Margins in inches, as everywhere."""
     size = figure.get_figwidth()
     figure.subplots_adjust(
@@ -106,9 +118,6 @@ def _tidy(figure: Figure, names: list[str], scales: list[Scale], shown: reading.
             _axis(axes[i, 0], "y", _label(names[i], scales[i]))
     for panel in axes.ravel():
         panel.tick_params(length=2.5, color=style.FAINT)
-        for line in panel.lines:
-            if line.get_color() == style.BEFORE:
-                line.set(linewidth=1.0, markersize=3.0)
         for spine in panel.spines.values():
             spine.set_color(style.NEUTRAL)
 

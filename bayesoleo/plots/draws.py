@@ -51,14 +51,20 @@ def chosen(tree: xr.DataTree, most: int) -> list[str]:
 
 def draws(tree: xr.DataTree, name: str) -> reading.Array:
     """Draws of one parameter, shape (chain, draw)."""
-    values = tree[schema.POSTERIOR][name].transpose(schema.CHAIN, schema.DRAW).values
+    values = (
+        reading.variable(tree, schema.POSTERIOR, name).transpose(schema.CHAIN, schema.DRAW).values
+    )
     return np.asarray(values, dtype=float)
 
 
 def unit_of(tree: xr.DataTree, name: str) -> str:
     """Unit from the point, or from the posterior itself."""
     table = point_table(tree)
-    return table[name][2] if name in table else reading.unit(tree[schema.POSTERIOR][name])
+    return (
+        table[name][2]
+        if name in table
+        else reading.unit(reading.variable(tree, schema.POSTERIOR, name))
+    )
 
 
 def _new_parameters(tree: xr.DataTree) -> set[str]:

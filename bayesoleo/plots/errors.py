@@ -156,10 +156,10 @@ def _unit(tree: xr.DataTree, output: str) -> str:
 
 def _handles(two: bool) -> list[style.Artist]:
     """What the marks mean."""
-    point = {"marker": "o", "ls": "", "ms": 6.5}
-    # type: ignore[arg-type]
-    hollow = Line2D([], [], mfc="white", mec=style.BEFORE, mew=1.6, label="before", **point)
-    # type: ignore[arg-type]
-    full = Line2D([], [], color=style.AFTER, label="after" if two else "error", **point)
+
+    hollow = Line2D([], [], marker="o", ls="", ms=6.5, mfc="white", mec=style.BEFORE, mew=1.6)
+    hollow.set_label("before")
+    full = Line2D([], [], marker="o", ls="", ms=6.5, color=style.AFTER)
+    full.set_label("after" if two else "error")
     floor = Line2D([], [], color=style.INK, lw=1.0, label="noise floor")
     return [hollow, full, floor] if two else [full, floor]

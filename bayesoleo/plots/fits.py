@@ -31,7 +31,7 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
         Averages over the periods of a run. A signal with too many harmonics for that is shown by a
         stretch of raw samples from the middle of its record.
     """
-    measured = tree[schema.OBSERVED_DATA][output]
+    measured = reading.variable(tree, schema.OBSERVED_DATA, output)
     scale = engineering(reading.unit(measured), style.magnitude(measured.values))
     names = [schema.before(output), schema.after(output)]
     shown = [name for name in names if name in tree[schema.PREDICTION]]
@@ -40,7 +40,9 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
     spans = []
     for axes, run in zip(grid.axes, runs, strict=True):
         curves = [measured.values[run.index]]
-        curves += [tree[schema.PREDICTION][name].values[run.index] for name in shown]
+        curves += [
+            reading.variable(tree, schema.PREDICTION, name).values[run.index] for name in shown
+        ]
         position = reading.abscissa(tree, run)
         _draw(axes, position, [scale.factor * np.asarray(curve) for curve in curves])
         spans.append(np.ptp(axes.get_ylim()))

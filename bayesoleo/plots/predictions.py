@@ -28,13 +28,13 @@ def predictive(tree: xr.DataTree, output: str) -> Figure:
     Figure
         The prediction is subtracted: at full scale band and measurement are one line.
     """
-    data = tree[schema.POSTERIOR_PREDICTIVE][output]
+    data = reading.variable(tree, schema.POSTERIOR_PREDICTIVE, output)
     labels = [str(label) for label in data[schema.RUN].values] if schema.RUN in data.coords else []
     runs = [r for r in reading.runs(tree) if r.periodic and (not labels or r.label in labels)]
     runs, remark = style.omitted(runs)
     rows = {run.label: _row(tree, data, output, run, labels) for run in runs}
     largest = style.magnitude(*(part for row in rows.values() for part in row[1:]))
-    observed = tree[schema.OBSERVED_DATA][output]
+    observed = reading.variable(tree, schema.OBSERVED_DATA, output)
     scale = engineering(reading.unit(data) or reading.unit(observed), largest)
     grid = style.panels(runs)
     for axes, run in zip(grid.axes, runs, strict=True):
@@ -67,9 +67,9 @@ def _row(
     if schema.PHASE in data.coords:
         grid = np.asarray(data[schema.PHASE].values, dtype=float)
     # At the samples the prediction is exact; between points of the grid the median is not.
-    predicted = tree[schema.PREDICTION]
+    predicted = tree[schema.PREDICTION].to_dataset()
     last = schema.after(output) if schema.after(output) in predicted else schema.before(output)
-    observed = tree[schema.OBSERVED_DATA][output].values[run.index]
+    observed = reading.variable(tree, schema.OBSERVED_DATA, output).values[run.index]
     e = observed - predicted[last].values[run.index]
     centres, measured = reading.fold(reading.abscissa(tree, run), e)
     below, above = (np.interp(centres, grid, part - median, period=1.0) for part in (low, high))

@@ -27,21 +27,24 @@ class Run:
     role: str
     frequency: float
     duration: float
-
-    @property
-    def periodic(self) -> bool:
-        """Whether the run has a phase."""
-        return bool(np.isfinite(self.frequency))
+    periodic: bool
 
     @property
     def remark(self) -> str:
         """Frequency of a periodic run, duration of a transient one."""
-        return f"{self.frequency:.3g} Hz" if self.periodic else f"transient, {self.duration:.3g} s"
+        if not self.periodic:
+            return f"transient, {self.duration:.3g} s"
+        return f"{self.frequency:.3g} Hz" if np.isfinite(self.frequency) else ""
 
 
 def group(tree: xr.DataTree, name: str) -> xr.Dataset | None:
     """A group as a Dataset, or None."""
     return tree[name].to_dataset() if name in tree.children else None
+
+
+def variable(tree: xr.DataTree, name: str, variable: str) -> xr.DataArray:
+    """A variable of a group that is there."""
+    return tree[name].to_dataset()[variable]
 
 
 def summary(tree: xr.DataTree) -> dict[str, Any]:
@@ -82,9 +85,19 @@ def runs(tree: xr.DataTree) -> list[Run]:
         roles = [str(role) for role in constant[schema.ROLE].values]
         frequencies = constant[schema.FREQUENCY].values.astype(float)
     time = data[schema.TIME].values
+    periodic = np.zeros(count, dtype=bool)
+    if schema.PHASE in data:
+        periodic = np.isfinite(data[schema.PHASE].values).any(axis=1)
     duration = np.nanmax(time, axis=1) - np.nanmin(time, axis=1)
     return [
-        Run(i, str(labels[i]), roles[i], float(frequencies[i]), float(duration[i]))
+        Run(
+            i,
+            str(labels[i]),
+            roles[i],
+            float(frequencies[i]),
+            float(duration[i]),
+            bool(periodic[i]),
+        )
         for i in range(count)
     ]
 
@@ -96,11 +109,11 @@ def unit(data: xr.DataArray) -> str:
 
 def abscissa(tree: xr.DataTree, run: Run) -> Array:
     """Phase modulo 1 of every sample; of a transient the fraction of its duration; NaN padded."""
-    data = tree[schema.OBSERVED_DATA]
-    if run.periodic and schema.PHASE in data:
-        return np.asarray(data[schema.PHASE].values[run.index] % 1.0, dtype=float)
-    time = np.asarray(data[schema.TIME].values[run.index], dtype=float)
-    return (time - np.nanmin(time)) / max(run.duration, np.finfo(float).tiny)
+    data = tree[schema.OBSERVED_DATA].to_dataset()
+    if run.periodic:
+        return np.asarray(data[schema.PHASE].values[run.index] % 1.0, dtype=np.float64)
+    time = np.asarray(data[schema.TIME].values[run.index], dtype=np.float64)
+    return np.asarray((time - np.nanmin(time)) / max(run.duration, float(np.finfo(float).tiny)))
 
 
 def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:

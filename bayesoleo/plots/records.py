@@ -56,7 +56,7 @@ def _channel(
     """One channel of one run; all runs of a channel share its scale."""
     axes = figure.add_axes(box)
     style.dress(axes, ticks=2)
-    data = tree[schema.OBSERVED_DATA][name]
+    data = reading.variable(tree, schema.OBSERVED_DATA, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     position, values = reading.abscissa(tree, run), scale.factor * data.values[run.index]
     if reading.is_resolved(position, values):
@@ -80,7 +80,7 @@ def _limits(values: reading.Array) -> tuple[float, float]:
 
 def _head(figure: Figure, tree: xr.DataTree, name: str, x: float, height: float) -> None:
     """Name and unit of a channel above its column."""
-    data = tree[schema.OBSERVED_DATA][name]
+    data = reading.variable(tree, schema.OBSERVED_DATA, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     text = style.plain(scale.label(name))
     figure.text(
@@ -101,5 +101,5 @@ def _row_label(figure: Figure, run: reading.Run, y: float) -> None:
     colour = style.AFTER if held_out else style.FAINT
     label = style.plain(run.label, 18)
     figure.text(0.01, y, label, va="bottom", fontsize=style.SMALL, fontweight="bold")
-    text = f"{run.role} · {run.remark}" if run.role else run.remark
+    text = " · ".join(part for part in (run.role, run.remark) if part)
     figure.text(0.01, y, text, va="top", fontsize=style.SMALL - 1, color=colour)

@@ -112,7 +112,7 @@ def title(axes: Axes, run: Run) -> None:
     held_out = run.role == schema.HOLD_OUT
     label = plain(run.label, 18)
     axes.set_title(label, loc="left", fontsize=SMALL, pad=3, color=INK, fontweight="bold")
-    text = f"hold-out · {run.remark}" if held_out else run.remark
+    text = " · ".join(part for part in ("hold-out" if held_out else "", run.remark) if part)
     axes.set_title(
         text, loc="right", fontsize=SMALL - 0.5, pad=3, color=AFTER if held_out else FAINT
     )
@@ -172,6 +172,8 @@ def share_y(axes: Sequence[Axes], spans: Sequence[float], symmetric: bool = Fals
     symmetric : bool
         Whether zero stays in the middle.
     """
+    if not axes:
+        return
     positive = [span for span in spans if np.isfinite(span) and span > 0.0]
     shared = not positive or max(positive) < 10.0 * min(positive)
     limits = np.array([panel.get_ylim() for panel in axes])

@@ -11,6 +11,7 @@ import re
 import threading
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 from matplotlib import mathtext
@@ -67,7 +68,7 @@ def encode_formula(latex: str) -> Image | None:
     Image or None
     """
     buffer = io.BytesIO()
-    properties = FontProperties(size=FORMULA_SIZE, math_fontfamily="cm")  # type: ignore[arg-type]
+    properties = FontProperties(size=FORMULA_SIZE, math_fontfamily="cm")
     text = f"${' '.join(latex.split())}$"
     try:
         with _settings, matplotlib.rc_context({"svg.hashsalt": "bayesoleo"}):
@@ -83,7 +84,7 @@ def encode_formula(latex: str) -> Image | None:
     return Image(_uri("image/svg+xml", svg), float(size[1]), float(size[2]))
 
 
-def _save(figure: Figure, kind: str, **options: object) -> bytes:
+def _save(figure: Figure, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     with _settings, matplotlib.rc_context({"svg.hashsalt": "bayesoleo"}), warnings.catch_warnings():
         # A label may be in a script that the font lacks; a box in its place is no reason to stop.

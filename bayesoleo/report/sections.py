@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import plots, schema
 from bayesoleo.plots import reading
+from bayesoleo.plots.residuals import Against
 from bayesoleo.report.images import Image, encode_figure
 
 
@@ -22,6 +24,8 @@ class Shown:
 
 
 Draw = Callable[[], Figure]
+
+LOOPS: tuple[Against, ...] = ("velocity", "stroke")
 
 
 def data_figures(tree: xr.DataTree) -> list[Shown]:
@@ -38,8 +42,8 @@ def fit_figures(tree: xr.DataTree) -> list[Shown]:
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
         caption = f"Measured {output} and what the model predicts."
-        # type: ignore[misc]
-        entries.append((lambda output=output: plots.fit(tree, output), caption))
+
+        entries.append((partial(plots.fit, tree, output), caption))
     return _drawn(entries)
 
 
@@ -57,14 +61,13 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
     )
     for output in reading.outputs(tree):
         yield (
-            lambda output=output: plots.residual(tree, output),  # type: ignore[misc]
+            partial(plots.residual, tree, output),
             f"Residual of {output} against phase, averaged over the periods of each run.",
         )
-        for against in ("velocity", "stroke"):
+        for against in LOOPS:
             if against in tree[schema.RESIDUAL]:
                 yield (
-                    # type: ignore[misc]
-                    lambda output=output, a=against: plots.residual(tree, output, a),
+                    partial(plots.residual, tree, output, against),
                     f"Residual of {output} against {against}. {loops.format(against)}",
                 )
 
@@ -115,8 +118,8 @@ def predictive_figures(tree: xr.DataTree) -> list[Shown]:
     for output in reading.outputs(tree):
         if output in tree[schema.POSTERIOR_PREDICTIVE]:
             caption = f"Measured {output} about the prediction, with the posterior's 95 % band."
-            # type: ignore[misc]
-            entries.append((lambda output=output: plots.predictive(tree, output), caption))
+
+            entries.append((partial(plots.predictive, tree, output), caption))
     return _drawn(entries)
 
 

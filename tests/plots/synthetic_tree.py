@@ -37,7 +37,7 @@ TRUTH = {
 
 
 def oleo_tree(label: str = "run", description: str = "Shaker rig, made up.") -> xr.DataTree:
-    """14 runs of 4 periods, force and pressure; breakaway friction found in the first of 2 rounds."""
+    """14 runs, force and pressure; breakaway friction found in the first of 2 rounds."""
     rng = np.random.default_rng(7)
     runs = [f"{label} {'abcdefghijklmn'[i]}" for i in range(14)]
     roles = [schema.HOLD_OUT if i in (4, 9, 12) else schema.FIT for i in range(14)]
@@ -296,9 +296,8 @@ def _candidates(rng, winner):
 def _parameter(estimate, sd, unit, sampled=True):
     interval = [estimate - 1.96 * sd, estimate + 1.96 * sd]
     mean = estimate + 0.05 * sd if sampled else None
-    return dict(
-        estimate=estimate, mean=mean, sd=sd, interval=interval if sampled else None, unit=unit
-    )
+    entry = {"estimate": estimate, "mean": mean, "sd": sd, "unit": unit}
+    return entry | {"interval": interval if sampled else None}
 
 
 def _summary(rounds, effects, verdict, parameters=None):

@@ -1,0 +1,207 @@
+"""Every figure is drawn from 14 runs and from 2, and shows what is stored."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.text import Text
+
+from bayesoleo import plots, schema
+from bayesoleo.plots import reading, style
+from bayesoleo.plots.rankings import classes
+
+
+def texts(figure):
+    """All texts of a figure that has been drawn."""
+    figure.savefig(io.BytesIO(), format="png", dpi=40)
+    found = [item.get_text() for item in figure.findobj(Text)]
+    return [text for text in found if text]
+
+
+def lines(axes, colour):
+    return [line for line in axes.lines if line.get_color() == colour]
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plots.records,
+        plots.error,
+        plots.ranking,
+        plots.corner,
+        plots.point_against_posterior,
+        plots.trace,
+    ],
+)
+def test_figures_of_a_tree(oleo, draw):
+    assert len(texts(draw(oleo))) > 10
+
+
+@pytest.mark.parametrize("output", ["force", "pressure"])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plots.fit,
+        plots.predictive,
+        plots.residual,
+        lambda tree, output: plots.residual(tree, output, "velocity"),
+        lambda tree, output: plots.residual(tree, output, "stroke"),
+    ],
+)
+def test_figures_of_an_output_have_a_panel_for_each_run(oleo, draw, output):
+    figure = draw(oleo, output)
+    shown = texts(figure)
+    assert len(figure.axes) == 14
+    assert all(run.label in shown for run in reading.runs(oleo))
+    assert sum(text.startswith("hold-out") for text in shown) == 3
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plots.records,
+        plots.error,
+        plots.ranking,
+        lambda tree: plots.fit(tree, "voltage"),
+        lambda tree: plots.residual(tree, "voltage"),
+    ],
+)
+def test_two_runs_one_transient_nothing_added(two_runs, draw):
+    shown = texts(draw(two_runs))
+    assert "after" not in shown
+    assert "before" not in shown
+
+
+def test_a_residual_is_drawn_at_its_size_and_in_its_unit(oleo):
+    figure = plots.residual(oleo, "pressure")
+    assert any("pressure residual in kPa" in text for text in texts(figure))
+    drawn = lines(figure.axes[0], style.BEFORE)[0].get_ydata()
+    stored = oleo["residual/pressure_before_mean"].values[0]
+    np.testing.assert_allclose(drawn, stored / 1e3)
+
+
+def test_no_noise_band_under_a_transient(two_runs):
+    figure = plots.residual(two_runs, "voltage")
+    assert [len(axes.patches) for axes in figure.axes] == [1, 0]
+
+
+def test_error_without_any_noise_floor_is_the_rms(two_runs):
+    tree = two_runs.copy()
+    summary = json.loads(tree.attrs["summary"])
+    for run in summary["rounds"][0]["error"]["voltage"].values():
+        run["ratio_to_noise"] = None
+    tree.attrs["summary"] = json.dumps(summary)
+    assert "rms in µV" in texts(plots.error(tree))
+
+
+def test_effects_that_cannot_be_told_apart_share_a_letter(oleo):
+    first = json.loads(oleo.attrs["summary"])["rounds"][0]["candidates"]
+    assert classes(first) == {"Stribeck_friction": "A", "Dahl_friction": "A"}
+
+
+def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo):
+    figure = plots.corner(oleo)
+    assert len(figure.axes) == 100
+    labels = " ".join(texts(figure))
+    assert "breakaway" in labels
+    assert "offset" not in labels
+    assert len(plots.corner(oleo, ["breakaway"]).axes) == 1
+
+
+def test_a_posterior_of_zero_width_is_no_error(oleo):
+    tree = xr.DataTree.from_dict(
+        {"posterior": oleo["posterior"].to_dataset()[["breakaway", "conduction"]].copy(deep=True)}
+    )
+    tree["posterior/breakaway"][:] = 3.0
+    for draw in (plots.corner, plots.trace):
+        texts(draw(tree))
+
+
+def broadband(harmonics=300, count=4096):
+    """A multisine that 120 bins of phase cannot show."""
+    rng = np.random.default_rng(3)
+    phase = np.tile(np.arange(count) / count, 2)[None]
+    angle = 2 * np.pi * np.arange(1, harmonics + 1)[:, None] * phase
+    signal = np.cos(angle + 2 * np.pi * rng.random((harmonics, 1))).sum(axis=0)[None]
+    velocity = np.gradient(signal[0])[None]
+    dims = (schema.RUN, schema.SAMPLE)
+    data = {
+        "voltage": (dims, signal, {"units": "V"}),
+        "time": (dims, phase),
+        "phase": (dims, phase),
+    }
+    e = {
+        "voltage_before": (dims, signal**3),
+        "stroke": (dims, signal),
+        "velocity": (dims, velocity),
+    }
+    constant = {"frequency": ("run", [1.0]), "role": ("run", ["fit"])}
+    return xr.DataTree.from_dict(
+        {
+            "observed_data": xr.Dataset(data, coords={"run": ["a"]}),
+            "constant_data": xr.Dataset(constant),
+            "prediction": xr.Dataset({"voltage_before": (dims, 0.9 * signal)}),
+            "residual": xr.Dataset(e),
+        }
+    )
+
+
+def test_a_signal_of_many_harmonics_is_shown_raw_and_its_residual_by_value():
+    tree = broadband()
+    signal = tree["observed_data/voltage"].values[0]
+    fit = plots.fit(tree, "voltage").axes[0]
+    shown = lines(fit, style.MEASURED)[0].get_ydata()
+    assert np.isin(np.round(shown, 9), np.round(signal, 9)).all()
+    x, y = lines(plots.residual(tree, "voltage", "stroke").axes[0], style.BEFORE)[0].get_data()
+    assert np.corrcoef(np.asarray(x) ** 3, y)[0, 1] > 0.999
+    texts(plots.records(tree))
+
+
+def test_thinning_keeps_the_extremes():
+    y = np.random.default_rng(0).normal(size=10_000)
+    x, thinned = reading.thin(np.arange(y.size), y)
+    assert thinned.size <= 2 * reading.BINS
+    assert (thinned.min(), thinned.max()) == (y.min(), y.max())
+    assert (np.diff(x) > 0).all()
+
+
+def test_folding_averages_and_leaves_gaps():
+    centres, means = reading.fold(
+        np.array([0.1, 0.2, 0.9, np.nan]), np.array([1.0, 3.0, 5.0, 7.0]), 4
+    )
+    np.testing.assert_allclose(centres, [0.125, 0.375, 0.625, 0.875])
+    np.testing.assert_array_equal(means, [2.0, np.nan, np.nan, 5.0])
+
+
+def test_many_runs_are_cut_and_that_is_said(oleo):
+    wide = xr.DataTree.from_dict(
+        {
+            name: xr.concat([oleo[name].to_dataset()] * 2, schema.RUN)
+            for name in ("observed_data", "prediction", "constant_data")
+        }
+    )
+    figure = plots.fit(wide, "force")
+    assert len(figure.axes) == style.MOST_PANELS
+    assert "first 24 of 28 runs" in texts(figure)
+
+
+def test_labels_of_users_are_no_mathematics(oleo):
+    runs = list(oleo["observed_data"]["run"].values)
+    runs[0] = r"a$\frac{$ <b>" + "\n" + "x" * 80
+    tree = oleo.copy()
+    tree["observed_data"] = xr.DataTree(oleo["observed_data"].to_dataset().assign_coords(run=runs))
+    shown = texts(plots.records(tree))
+    assert any(text.startswith(r"a\$") and len(text) < 30 for text in shown)
+
+
+def test_figures_need_no_pyplot(oleo):
+    known = "matplotlib.pyplot" in sys.modules
+    before = sys.modules["matplotlib.pyplot"].get_fignums() if known else []
+    plots.fit(oleo, "force")
+    after = sys.modules["matplotlib.pyplot"].get_fignums() if known else []
+    assert after == before

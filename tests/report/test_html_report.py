@@ -1,0 +1,126 @@
+"""The page holds what was found, needs no other file, and shows a user's text as text."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+import xarray as xr
+
+from bayesoleo import schema
+from bayesoleo.errors import ResultsError
+from bayesoleo.report import render_report, write_report
+from bayesoleo.report.images import encode_formula
+from bayesoleo.storage import read_tree, write_tree
+
+
+@pytest.fixture(scope="session")
+def page(oleo):
+    return render_report(oleo)
+
+
+def without(tree, *names):
+    groups = {name: node.to_dataset() for name, node in tree.children.items() if name not in names}
+    cut = xr.DataTree.from_dict(groups)
+    cut.attrs = dict(tree.attrs)
+    return cut
+
+
+def test_the_page_makes_its_case(page):
+    for text in (
+        "The model lacked an effect: Stribeck_friction found, added and confirmed.",
+        "9.04 → 1.06",
+        "Figure 17.",
+        "Residual of pressure against stroke",
+        "40.200",
+        "cm²",
+        "effective sample size",
+        "12 inadmissible",
+        "What remains unexplained",
+        "bayesoleo close made-up --model f16n2d2 --seed 7",
+        "3f5a3f5a",
+        "inertia + gas_spring",
+    ):
+        assert text in page, text
+
+
+def test_the_page_needs_no_other_file_and_is_not_too_large(page):
+    assert len(page) < 6_000_000
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    assert "<script" not in page
+    assert not re.search(r"url\(|@import", page)
+
+
+def test_every_figure_has_a_caption_and_a_text_for_those_who_cannot_see_it(page):
+    pictures = re.findall(r"<figure>\s*<img [^>]*alt=\"([^\"]+)\"", page)
+    assert len(pictures) == page.count("<figure>") == page.count("<figcaption>") == 17
+
+
+def test_no_value_is_left_out_by_accident(page):
+    visible = re.sub(r'src="[^"]*"|<style>.*?</style>|<[^>]+>', " ", page, flags=re.DOTALL)
+    assert not re.search(r"\b(nan|None|inf|undefined)\b", visible)
+
+
+def test_what_a_user_wrote_is_text(synthetic):
+    evil = "<script>alert(1)</script>"
+    tree = synthetic.oleo_tree(label=f"{evil}&\"'", description=f"rig {evil}\nsecond line")
+    page = render_report(tree)
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 14 * 3
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("posterior", "sample_stats", "posterior_predictive"),
+        ("residual",),
+        ("noise", "constant_data"),
+        tuple(name for name in schema.GROUPS),
+    ],
+)
+def test_absent_groups_are_left_out(oleo, names):
+    page = render_report(without(oleo, *names))
+    assert "Stribeck_friction" in page
+    assert ("The posterior was not sampled" in page) == ("posterior" in names)
+
+
+def test_two_runs_nothing_added(two_runs):
+    page = render_report(two_runs)
+    assert "Nothing is missing: the model explains" in page
+    assert "→" not in page
+    assert "No candidate was scored." in page
+    assert "The posterior was not sampled" in page
+
+
+def test_the_page_of_a_stored_result_is_the_same(two_runs, tmp_path):
+    write_tree(two_runs, tmp_path / "results.nc")
+    write_report(read_tree(tmp_path / "results.nc"), tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == render_report(two_runs)
+
+
+@pytest.mark.parametrize(
+    ("effects", "text"),
+    [
+        ([], "Something is missing that no effect in the catalogue explains."),
+        (["wall"], "The model lacked an effect: wall added, but an error remains"),
+        (["wall", "lag"], "The model lacked effects: wall and lag added, but an error remains"),
+    ],
+)
+def test_an_unexplained_remainder_is_said(two_runs, effects, text):
+    tree = two_runs.copy()
+    summary = json.loads(tree.attrs["summary"])
+    summary.update(verdict=schema.UNEXPLAINED, effects=effects)
+    tree.attrs["summary"] = json.dumps(summary)
+    assert text in render_report(tree)
+
+
+def test_a_tree_without_summary():
+    with pytest.raises(ResultsError, match=r"key summary: the result holds no summary"):
+        render_report(xr.DataTree())
+
+
+def test_formulas_are_drawn_or_left_as_text(page):
+    assert encode_formula(r"m \ddot{q} + \frac{a}{\left|{b}\right|} = F") is not None
+    assert encode_formula(r"\begin{cases} 1 \end{cases}") is None
+    assert r"<pre>\begin{cases}" in page
