@@ -18,8 +18,8 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx_gallery.gen_gallery",
+    "sphinx-mathjax-offline",  # formulas show without a network
 ]
 exclude_patterns = ["_build", "_templates"]
 templates_path = ["_templates"]

@@ -1,0 +1,59 @@
+"""Lists in the documentation against the code that they describe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from bayesoleo import schema
+from bayesoleo.data import declaration
+from bayesoleo.effects import FAMILIES, catalogue
+from bayesoleo.model.expressions import FUNCTIONS
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def page(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def test_every_key_of_a_campaign_is_described() -> None:
+    keys = (*declaration._TOP, *declaration._CHANNEL, *declaration._RUN, *declaration._CONDITION)
+    text = page("data-format.md")
+    assert [key for key in keys if key not in text] == []
+
+
+@pytest.mark.parametrize("name", ["results.md", "architecture.md"])
+def test_every_group_of_a_result_is_described(name: str) -> None:
+    assert [group for group in schema.GROUPS if f"`{group}`" not in page(name)] == []
+
+
+def test_every_key_of_the_summary_is_described() -> None:
+    text = page("results.md")
+    whole = schema.summary_schema()
+    keys = [*whole["required"], *whole["$defs"]["round"]["required"]]
+    keys += whole["$defs"]["candidate"]["required"] + whole["$defs"]["run_error"]["required"]
+    assert [key for key in keys if key not in text] == []
+    assert [verdict for verdict in schema.VERDICTS if f"`{verdict}`" not in text] == []
+
+
+def test_every_function_of_expressions_is_described() -> None:
+    text = page("models.md")
+    assert [name for name in FUNCTIONS if f"`{name}" not in text] == []
+
+
+def test_families_in_the_catalogue_are_mentioned() -> None:
+    text = page("effects.md")
+    present = {effect.family for effect in catalogue()}
+    assert present <= set(FAMILIES)
+    assert [family for family in sorted(present) if f"`{family}`" not in text] == []
+
+
+def test_every_command_is_described() -> None:
+    cli = pytest.importorskip("bayesoleo.cli")
+    import typer.main
+
+    commands = typer.main.get_command(cli.app).commands
+    text = page("command-line.md")
+    assert [name for name in commands if f"`{name}" not in text] == []
