@@ -115,8 +115,8 @@ def force_effect(
     >>> effect = force_effect(
     ...     "seventh_order_stiffness", "stiffness", "k7*position**7", {"k7": "force/position**7"}
     ... )
-    >>> effect.title
-    'Seventh order stiffness'
+    >>> effect.title, effect.formula
+    ('Seventh order stiffness', '\\mathrm{k7} q^{7}')
     """
     amplitudes = tuple(
         unit if isinstance(unit, Amplitude) else Amplitude(name, unit, name, f"{id}: {name}")
@@ -133,7 +133,7 @@ def force_effect(
         id=id,
         family=family,
         title=title or id.replace("_", " ").capitalize(),
-        formula=formula or sp.latex(sp.Symbol(expression)),
+        formula=formula or _latex(expression, used, id),
         amplitudes=amplitudes,
         places=_places_for(used, requires),
         change=_adding_term(id, expression, states),
@@ -142,6 +142,14 @@ def force_effect(
         source=source,
         applies_to=applies_to or _applies_to(used, requires),
     )
+
+
+def _latex(expression: str, used: set[str], effect: str) -> str:
+    """LaTeX of an expression whose author gave none."""
+    words = {"position": "q", "velocity": r"\dot q", "acceleration": r"\ddot q"}
+    known = {name: symbol(name) for name in used}
+    symbols = {symbol(k): words.get(k, rf"\mathrm{{{k}}}".replace("_", r"\_")) for k in used}
+    return str(sp.latex(parse(expression, known, (), f"effect {effect}"), symbol_names=symbols))
 
 
 def _lowest(model: Model, target: str, scales: Scales) -> float:

@@ -155,11 +155,15 @@ def _exchange_lagging(model: Model, channel: str, dof: str, freed: str) -> Model
     state = f"{freed}_answer"
     while state in taken:
         state += "_"
-    table = {symbol(freed): symbol(state)}
-    table[derivative_symbol(freed, 1)] = derivative_symbol(state, 1)
+    rates = {derivative_symbol(freed, 1): derivative_symbol(state, 1)}
+    table = {symbol(freed): symbol(state)} | rates
     terms = {name: term.xreplace(table) for name, term in model.equations[dof].items()}
-    driven = _exchange(model, channel, dof, freed, {"answer": symbol(state)})
-    return driven.with_dof(state, Dof(model.inputs[freed]), terms)
+    # The answer takes the state's rate only, so that where the rate does not count it is as exact
+    # as without a state: interpolating the state itself would blur the jumps of dry friction.
+    answer = {name: e.xreplace(rates) for name, e in _solve_for_input(model, dof, freed).items()}
+    return _exchange(
+        model.with_dof(state, Dof(model.inputs[freed]), terms), channel, dof, freed, answer
+    )
 
 
 def _explicit_inverse(model: Model, measured: sp.Expr, dof: str, channel: str) -> sp.Expr | None:
