@@ -107,15 +107,15 @@ def _arrange(figure: Figure) -> None:
 
 def _tidy(figure: Figure, names: list[str], scales: list[Scale], shown: reading.Array) -> None:
     """Titles with value and spread, names and units on the outer axes, readable numbers."""
-    count = len(names)
+    count, size = len(names), figure.get_figwidth()
     axes = np.array(figure.axes).reshape(count, count)
     for i in range(count):
         mean, sd = shown[:, i].mean(), shown[:, i].std()
         text = f"{format_number(mean, sd)} ± {format_number(sd, sd)}"
         axes[i, i].set_title(text, fontsize=style.SMALL - 0.5, color=style.INK, pad=4)
-        _axis(axes[count - 1, i], "x", _label(names[i], scales[i]))
+        _axis(axes[count - 1, i], "x", _label(names[i], scales[i]), size)
         if i > 0:
-            _axis(axes[i, 0], "y", _label(names[i], scales[i]))
+            _axis(axes[i, 0], "y", _label(names[i], scales[i]), size)
     for panel in axes.ravel():
         panel.tick_params(length=2.5, color=style.FAINT)
         for spine in panel.spines.values():
@@ -124,12 +124,12 @@ def _tidy(figure: Figure, names: list[str], scales: list[Scale], shown: reading.
 
 def _label(name: str, scale: Scale) -> str:
     """Name and unit below each other; a panel is too narrow for both in one line."""
-    text = style.plain(name.replace("log_variance", "log var."), 18)
+    text = style.plain(name.replace("log_variance_", "log var. "), 18)
     return f"{text}\n[{scale.unit}]" if scale.unit else text
 
 
-def _axis(axes: Axes, which: str, label: str) -> None:
-    """Few numbers, without offsets."""
+def _axis(axes: Axes, which: str, label: str, size: float) -> None:
+    """Few numbers, without offsets; the name at a fixed distance in a figure of ``size`` inches."""
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(MaxNLocator(3, prune="both", steps=[1, 2, 5, 10]))
     formatter = ScalarFormatter(useOffset=False)
@@ -137,7 +137,8 @@ def _axis(axes: Axes, which: str, label: str) -> None:
     axis.set_major_formatter(formatter)
     axis.set_tick_params(labelsize=style.SMALL - 1, labelrotation=45)
     axis.set_label_text(label, fontsize=style.SMALL, color=style.INK)
+    place = axes.get_position()
     if which == "x":
-        axis.set_label_coords(0.5, -0.5)
+        axis.set_label_coords(0.5, -0.48 / (place.height * size))
     else:
-        axis.set_label_coords(-0.52, 0.5)
+        axis.set_label_coords(-0.5 / (place.width * size), 0.5)

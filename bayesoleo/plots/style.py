@@ -51,7 +51,9 @@ class Panels:
 def plain(text: str, most: int = 60) -> str:
     """A user's text for a figure: one line, not too long, ``$`` no mathematics."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    line = line if len(line) <= most else line[: most - 1] + "…"
+    if len(line) > most:
+        # What tells labels apart is as often at their end as at their beginning.
+        line = line[: most - most // 2 - 1] + "…" + line[len(line) - most // 2 :]
     return line.replace("$", r"\$")
 
 
@@ -110,9 +112,10 @@ def panels(runs: Sequence[Run], *, free_x: bool = False) -> Panels:
 def title(axes: Axes, run: Run) -> None:
     """Label on the left, frequency on the right; hold-out runs are marked by weight and word."""
     held_out = run.role == schema.HOLD_OUT
-    label = plain(run.label, 18)
-    axes.set_title(label, loc="left", fontsize=SMALL, pad=3, color=INK, fontweight="bold")
     text = " · ".join(part for part in ("hold-out" if held_out else "", run.remark) if part)
+    width = axes.get_position().width * WIDTH
+    label = plain(run.label, max(int((width - 0.065 * len(text)) / 0.085), 6))
+    axes.set_title(label, loc="left", fontsize=SMALL, pad=3, color=INK, fontweight="bold")
     axes.set_title(
         text, loc="right", fontsize=SMALL - 0.5, pad=3, color=AFTER if held_out else FAINT
     )
