@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import sympy as sp
@@ -17,10 +17,26 @@ from bayesoleo.prediction.records import Record
 Array = NDArray[np.float64]
 
 
-def guess_rows(model: Model, derived: Derived, record: Record, constants: Mapping[str, float], phase: Array) -> Array:
-    """Values and derivatives of every dof at phases, shape (nz, N)."""
-    rows = []
+#: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.
+Motion = Callable[[Array], Array]
+
+
+def guess_rows(
+    model: Model,
+    derived: Derived,
+    record: Record,
+    constants: Mapping[str, float],
+    phase: Array,
+    motions: Mapping[str, Motion] | None = None,
+) -> Array:
+    """Values and derivatives of every dof at phases, shape (nz, N); known motions come before guesses."""
+    rows: list[Array] = []
     for dof, order in zip(derived.dofs, derived.orders, strict=True):
+        if motions is not None and dof in motions:
+            known = motions[dof](phase)
+            if known.shape[0] == order + 1:
+                rows.extend(known)
+                continue
         expression = _measured(model, dof, record) or _declared(model, dof)
         for _ in range(order + 1):
             rows.append(_evaluate(expression, record, constants, phase))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,19 +39,6 @@ class RunPrediction:
     y: Array
     sensitivity: Array
     status: Status
-
-
-@numba.njit(nogil=True, cache=True)
-def _squares(measured: Array, y: Array) -> Array:
-    """Sums of squared residuals by lane and output, shape (L, ny); library reductions change their order with the batch."""
-    lanes, outputs, samples = y.shape
-    total = np.zeros((lanes, outputs))
-    for lane in range(lanes):
-        for output in range(outputs):
-            for i in range(samples):
-                residual = measured[output, i] - y[lane, output, i]
-                total[lane, output] += residual * residual
-    return total
 
 
 class Predictor:
@@ -133,9 +119,7 @@ class Predictor:
 
         def work(task: tuple[int, slice]) -> None:
             r, block = task
-            samples = self.simulate(theta[block], r)
-            total[block, r] = _squares(self.runs[r].measured, samples.y)
-            status[block, r] = samples.status
+            total[block, r], status[block, r] = self.runs[r].squares(self.constants(theta[block], r))
 
         thread_map(work, blocks, self.jobs)
         worst = status.max(axis=1, initial=0)

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
-from bayesoleo.prediction.guess import guess_rows
+from bayesoleo.prediction.guess import Motion, guess_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.continuation import solve_from_guess
+from bayesoleo.solvers.measures import positive, total
 from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities, solve_periodic
 from bayesoleo.solvers.schemes import scheme
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
+#: Parameter vectors whose samples are evaluated together.
+CHUNK = 4
 #: A start extrapolated too far is retried along a path of this many pieces.
 PATH_PIECES = (4, 16)
 
@@ -28,12 +33,42 @@ PATH_PIECES = (4, 16)
 class Anchor:
     """A solution with derivatives, from which others start: ``x + x_p (p - p0)``.
 
-    Frozen before sampling, it makes a solution a function of its own parameters alone.
+    Frozen before sampling, it makes a solution a function of its own parameters alone. ``x (n, w)`` are the scheme's unknowns,
+    ``x_p (na, n, w)`` their derivatives with respect to the active parameters.
     """
 
     p: Array
     x: Array
     x_p: Array
+
+    def predict(self, change: Array) -> Array:
+        """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
+        start = np.empty((change.shape[0], *self.x.shape))
+        _extrapolate(self.x.ravel(), self.x_p.reshape(self.x_p.shape[0], -1), change, start.reshape(change.shape[0], -1))
+        return start
+
+
+@numba.njit(nogil=True, cache=True)
+def _extrapolate(x, x_p, change, start):
+    """Lane by lane: the order of summation of a matrix product would vary with the batch."""
+    for lane in range(change.shape[0]):
+        for i in range(x.size):
+            start[lane, i] = x[i]
+        for k in range(change.shape[1]):
+            for i in range(x.size):
+                start[lane, i] += change[lane, k] * x_p[k, i]
+
+
+@numba.njit(nogil=True, cache=True)
+def _compare(measured, y, a, lanes, squares, inside):
+    """Sums of squared residuals ``(L, ny)`` of the chosen lanes, and whether all conditions ``a`` are positive there."""
+    for lane in lanes:
+        for output in range(y.shape[1]):
+            row = measured[output] - y[lane, output]
+            for i in range(row.size):
+                row[i] *= row[i]
+            squares[lane, output] = total(row)
+    positive(a, lanes, inside)
 
 
 @dataclass(frozen=True)
@@ -91,6 +126,7 @@ class RunPredictor:
         self.sample_inputs = input_rows(record, derived.inputs, record.phase)
         self.measured = np.stack([record.samples[name] for name in derived.outputs])
         self.anchor: Anchor | None = None
+        self.motions: dict[str, Motion] = {}
         self.active = np.array([derived.constants.index(name) for name in derived.active], dtype=np.int64)
 
     def _check(self, record: Record) -> None:
@@ -120,6 +156,22 @@ class RunPredictor:
                 values.append(self.record.conditions.get(name, np.nan if default is None else default))
         return np.array(values)
 
+    def known_motions(self) -> dict[str, Motion]:
+        """The anchored motion of each dof, from which an extended model of the same run can start."""
+        if self.anchor is None:
+            return {}
+        starts = np.cumsum([0, *(order + 1 for order in self.kernels.derived.orders)])
+        return {
+            dof: partial(self._rows_of, int(starts[k]), int(starts[k + 1]))
+            for k, dof in enumerate(self.kernels.derived.dofs)
+        }
+
+    def _rows_of(self, first: int, last: int, phase: Array) -> Array:
+        assert self.anchor is not None
+        plan = self.scheme.plan(phase, self.steps)
+        rows = self.scheme.sample(self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps))
+        return rows[0, first:last, 0]
+
     # -- solving ----------------------------------------------------------------------------------------------------------
 
     def guess(self, p: Array) -> Array:
@@ -127,8 +179,8 @@ class RunPredictor:
         derived = self.kernels.derived
         constants = dict(zip(derived.constants, p, strict=True))
         nodes = np.arange(self.steps) / self.steps
-        at_nodes = guess_rows(self.model, derived, self.record, constants, nodes)
-        at_points = guess_rows(self.model, derived, self.record, constants, self.points)
+        at_nodes = guess_rows(self.model, derived, self.record, constants, nodes, self.motions)
+        at_points = guess_rows(self.model, derived, self.record, constants, self.points, self.motions)
         return self.scheme.from_motion(at_nodes[None], at_points[None])
 
     def set_anchor(self, p: Array) -> Status:
@@ -141,17 +193,13 @@ class RunPredictor:
         if solution.status[0] == Status.CONVERGED.value:
             solution, x_p, _ = sensitivities(self.boundary, p[None], solution)
             if solution.status[0] == Status.CONVERGED.value:
-                self.anchor = Anchor(p.copy(), solution.x[0], x_p[0])
+                self.anchor = Anchor(p.copy(), solution.x[0], np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0)))
         return Status(int(solution.status[0]))
 
     def _from_anchor(self, p: Array) -> Solution:
         anchor = self.anchor
         assert anchor is not None
-        change = p[:, self.active] - anchor.p[self.active]
-        start = np.repeat(anchor.x[None], p.shape[0], axis=0)
-        for k in range(change.shape[1]):  # not a matrix product: its order of summation varies with the batch
-            start += change[:, k, None, None] * anchor.x_p[:, :, k]
-        solution = solve_periodic(self.boundary, p, start)
+        solution = solve_periodic(self.boundary, p, anchor.predict(p[:, self.active] - anchor.p[self.active]))
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:
@@ -194,9 +242,10 @@ class RunPredictor:
             if derivatives:
                 solution, x_p, _ = sensitivities(self.boundary, p, solution)
             status = solution.status
-            z = self.scheme.sample(solution.x[..., None], self.plan, self.boundary.step(self.steps))[:, :, 0]
+            z = self._rows_at_samples(solution.x[..., None], p)[:, :, 0]
         else:
-            status, z = np.zeros(count, dtype=np.int64), np.empty((count, 0, samples))
+            status = np.zeros(count, dtype=np.int64)
+            z = self._rows_at_samples(None, p)[:, :, 0]
         lanes = np.flatnonzero(status == Status.CONVERGED.value)
         y = np.full((count, ny, samples), np.nan)
         with np.errstate(all="ignore"):
@@ -208,9 +257,45 @@ class RunPredictor:
         with np.errstate(all="ignore"):
             self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
         if x_p is not None:
-            z_p = self.scheme.sample(x_p, self.plan, self.boundary.step(self.steps))
+            z_p = self._rows_at_samples(x_p, p)
             yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
         return Samples(y, yp, status)
+
+    def squares(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums of failed lanes mean nothing.
+
+        The same as comparing :meth:`predict` with the measurement, through arrays small enough to stay in the processor's cache.
+        """
+        count, samples, ny = p.shape[0], self.record.time.size, len(self.kernels.derived.outputs)
+        squares, status = np.full((count, ny), np.nan), np.zeros(count, dtype=np.int64)
+        solution = self.solve(p) if self.kernels.derived.dofs else None
+        if solution is not None:
+            status = solution.status.copy()
+        y, a = np.empty((CHUNK, ny, samples)), np.empty((CHUNK, self.boundary.conditions, samples))
+        inside = np.ones(CHUNK, dtype=np.bool_)
+        sums = np.empty((CHUNK, ny))
+        for first in range(0, count, CHUNK):
+            part = slice(first, min(first + CHUNK, count))
+            lanes = np.flatnonzero(status[part] == Status.CONVERGED.value)
+            z = self._rows_at_samples(None if solution is None else solution.x[part, :, :, None], p[part])[:, :, 0]
+            with np.errstate(all="ignore"):
+                self.kernels.output(z, self.sample_inputs, p[part], lanes, y)
+                if self.boundary.conditions:
+                    self.kernels.admissible(z, self.sample_inputs, p[part], lanes, a)
+            _compare(self.measured, y, a, lanes, sums, inside)
+            squares[first + lanes] = sums[lanes]
+            status[first + lanes] = np.where(
+                inside[lanes],
+                np.where(np.isfinite(sums[lanes]).all(axis=1), Status.CONVERGED.value, Status.NOT_FINITE.value),
+                Status.INADMISSIBLE.value,
+            )
+        return squares, status
+
+    def _rows_at_samples(self, x: Array | None, p: Array) -> Array:
+        """Values and derivatives of the dofs at the raw samples, shape (L, nz, C, N)."""
+        if x is None:
+            return np.empty((p.shape[0], 0, 1, self.record.time.size))
+        return self.scheme.sample(x, self.plan, self.boundary.step(self.steps))
 
     def _judge(self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""

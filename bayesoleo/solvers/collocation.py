@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """Steps of the mesh, positions inside them and interpolation weights of N phases."""
+    """Steps of the mesh, positions inside them and interpolation weights, each (s, N), of N phases."""
 
     index: NDArray[np.int64]
     position: Array
@@ -96,7 +96,8 @@ class Collocation:
         scaled = (phase % 1.0) * n
         index = np.minimum(scaled.astype(np.int64), n - 1)
         position = scaled - index
-        return SamplePlan(index, position, *self.method.weights(position))
+        w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
+        return SamplePlan(index, position, w0, w1, w2)
 
     def sample(self, x: Array, plan: SamplePlan, step: float) -> Array:
         """Values and derivatives at planned phases.
@@ -173,29 +174,37 @@ class Collocation:
 @jit
 def _sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
     """``z (L, nz, C, N)`` at positions inside steps from the unknowns ``x (L, n, w, C)``."""
-    d, s = orders.size, w0.shape[1]
+    d, s = orders.size, w0.shape[0]
     D = orders.sum()
     for lane in lanes:
         for column in range(x.shape[3]):
+            now = x[lane, :, :, column]
             row = state = 0
             for j in range(d):
+                value, rate = z[lane, row, column], z[lane, row + 1, column]
+                last = state + orders[j] - 1
                 for i in range(index.size):
-                    m = index[i]
-                    top = once = twice = 0.0
-                    for stage in range(s):
-                        value = x[lane, m, D + stage * d + j, column]
-                        top += w0[i, stage] * value
-                        once += w1[i, stage] * value
-                        twice += w2[i, stage] * value
-                    low = x[lane, m, state, column]
+                    value[i] = now[index[i], state]
+                    rate[i] = 0.0
+                if orders[j] == 2:
+                    top = z[lane, row + 2, column]
+                    for i in range(index.size):
+                        value[i] += h * position[i] * now[index[i], last]
+                        rate[i] = now[index[i], last]
+                        top[i] = 0.0
+                for stage in range(s):
+                    own = D + stage * d + j
                     if orders[j] == 1:
-                        z[lane, row, column, i] = low + h * once
-                        z[lane, row + 1, column, i] = top
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * w1[stage, i] * highest
+                            rate[i] += w0[stage, i] * highest
                     else:
-                        rate = x[lane, m, state + 1, column]
-                        z[lane, row, column, i] = low + h * (position[i] * rate + h * twice)
-                        z[lane, row + 1, column, i] = rate + h * once
-                        z[lane, row + 2, column, i] = top
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * h * w2[stage, i] * highest
+                            rate[i] += h * w1[stage, i] * highest
+                            z[lane, row + 2, column, i] += w0[stage, i] * highest
                 row += orders[j] + 1
                 state += orders[j]
 
