@@ -1,0 +1,147 @@
+"""The error of a prediction, held against the noise: by run and output, and by role."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.data import PeriodicAverage, periodic_average
+from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.input_noise import input_noise
+from bayesoleo.tracing.holdout import Prediction
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RunError:
+    """Error of one output in one run.
+
+    Parameters
+    ----------
+    run, role, output : str
+        Where.
+    rms : float
+        Root mean square over the raw samples, SI.
+    average : PeriodicAverage
+        The residual averaged over the recorded periods.
+    input_noise : float
+        Part of the noise that comes from the input, SI.
+    """
+
+    run: str
+    role: str
+    output: str
+    rms: float
+    average: PeriodicAverage
+    input_noise: float
+
+    @property
+    def repeating(self) -> float:
+        """Root mean square of the averaged residual."""
+        return self.average.repeating
+
+    @property
+    def noise(self) -> float:
+        """Standard error of that average, the input's noise included."""
+        return float(np.hypot(self.average.noise, self.input_noise))
+
+    @property
+    def ratio(self) -> float:
+        """``repeating / noise``: one where nothing is missing."""
+        return self.repeating / self.noise
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """Errors of all runs and outputs."""
+
+    entries: tuple[RunError, ...]
+
+    def at(self, output: str, run: str) -> RunError:
+        """Error of one output in one run."""
+        return next(e for e in self.entries if e.output == output and e.run == run)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Outputs in their order."""
+        return tuple(dict.fromkeys(entry.output for entry in self.entries))
+
+    def worst_ratio(self, role: str | None = None) -> float:
+        """Largest ratio over outputs of the ratio pooled over runs of a role."""
+        roles = {entry.role for entry in self.entries} if role is None else {role}
+        return max(self.pooled(r, o)["ratio_to_noise"] for r in roles for o in self.outputs)
+
+    def pooled(self, role: str, output: str) -> dict[str, float]:
+        """Root mean squares over the runs of a role: ``rms``, ``repeating``, ``ratio_to_noise``."""
+        chosen = [e for e in self.entries if e.role == role and e.output == output]
+
+        def mean(values: Sequence[float]) -> float:
+            return float(np.sqrt(np.mean(np.square(values))))
+
+        return {
+            "rms": mean([e.rms for e in chosen]),
+            "repeating": mean([e.repeating for e in chosen]),
+            "ratio_to_noise": mean([e.ratio for e in chosen]),
+        }
+
+    def by_run(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """As in the summary: output, run, then role, rms, repeating, noise and ratio."""
+        table: dict[str, dict[str, dict[str, Any]]] = {output: {} for output in self.outputs}
+        for e in self.entries:
+            table[e.output][e.run] = {
+                "role": e.role,
+                "rms": e.rms,
+                "repeating": e.repeating,
+                "noise": e.noise,
+                "ratio_to_noise": e.ratio,
+            }
+        return table
+
+    def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
+        """As in the summary: role, output, then rms, repeating and ratio."""
+        roles = dict.fromkeys(entry.role for entry in self.entries)
+        return {role: {output: self.pooled(role, output) for output in self.outputs} for role in roles}
+
+
+def error_table(
+    predictions: Sequence[Prediction], roles: Mapping[str, str], *, seed: int, jobs: int | None = None
+) -> ErrorTable:
+    """Compare predictions with what was measured.
+
+    Parameters
+    ----------
+    predictions : sequence of Prediction
+        One a run.
+    roles : mapping of str to str
+        Role of each run by label.
+    seed : int
+        For the draws of the input's noise.
+    jobs : int, optional
+        Threads.
+
+    Returns
+    -------
+    ErrorTable
+    """
+    tasks = list(enumerate(predictions))
+    rows = thread_map(lambda task: _of_run(task[1], roles, seed + task[0]), tasks, jobs)
+    return ErrorTable(tuple(entry for row in rows for entry in row))
+
+
+def _of_run(prediction: Prediction, roles: Mapping[str, str], seed: int) -> list[RunError]:
+    record, predictor = prediction.record, prediction.predictor
+    step = float(record.time[1] - record.time[0])
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1)) if record.time.size > 1 else step
+    spread = input_noise(predictor, prediction.vector, 0, np.random.default_rng(seed))
+    entries = []
+    for b, output in enumerate(predictor.outputs):
+        residual = record.samples[output] - prediction.y[b]
+        average = periodic_average(residual, step, record.frequency)
+        rms = float(np.sqrt(np.mean(residual**2)))
+        entries.append(RunError(record.label, roles[record.label], output, rms, average, float(spread[b])))
+    return entries

@@ -1,0 +1,133 @@
+"""Estimate an extended model, starting where its score says, and weigh what it gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
+from bayesoleo.prediction.layout import Layout
+from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.score import Base, Score
+
+Array = NDArray[np.float64]
+
+#: A new amplitude's prior is normal about its null, this many times as wide as the score expects it to be: weak, but proper.
+PRIOR_WIDTH = 10.0
+#: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
+SHAPE_SPREAD = 1.0
+
+
+@dataclass(frozen=True)
+class Refit:
+    """An extended model after estimation.
+
+    Parameters
+    ----------
+    score : Score
+        Of the candidate.
+    assembly : Assembly
+        With the effect and its priors in it, at the estimate.
+    fit : Fit
+        On the fitted runs.
+    share : float
+        Part of the present excess that it explains after estimation.
+    """
+
+    score: Score
+    assembly: Assembly
+    fit: Fit
+    share: float
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns that the effect adds."""
+        return len(self.score.names) + len(self.score.shapes)
+
+    def excludes_null(self, level: float = 0.975) -> bool:
+        """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
+
+        One amplitude: the probability of its own side of zero is at least ``level``; several: zero lies outside their joint region.
+        """
+        names = [name for name in self.fit.problem.names if name in self.score.names]
+        index = [self.fit.problem.names.index(name) for name in names]
+        value = self.fit.point.theta[index]
+        covariance = self.fit.point.covariance[np.ix_(index, index)]
+        if not np.isfinite(covariance).all():
+            return False
+        if len(index) == 1:
+            return bool(stats.norm.cdf(abs(value[0]) / np.sqrt(covariance[0, 0])) >= level)
+        distance = float(value @ np.linalg.lstsq(covariance, value, rcond=1e-12)[0])
+        return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
+
+
+def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
+    """Estimate the model extended by a candidate.
+
+    Parameters
+    ----------
+    base : Base
+        What the candidate was scored against.
+    score : Score
+        Gives starts and the scale of priors.
+    numerics : Numerics
+        The mesh is the present fit's.
+    """
+    assembly = score.option.assembly.with_values(base.fit.shared)
+    assembly = assembly.with_parameters(new_parameters(assembly, score))
+    model = assembly.model()
+    start = _start(base, score, model)
+    fit = fit_model(model, base.fit.records, replace(numerics, steps=base.fit.steps), start=start)
+    return Refit(score, assembly.with_values(fit.shared), fit, share_of(base, fit))
+
+
+def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
+    """Parameters of the effect with starts and priors from its score."""
+    present = assembly.model().parameters
+    changed: dict[str, Parameter] = {}
+    for name in score.option.candidate.parameters:
+        own = [abs(v) for key, v in zip(score.names, score.expected, strict=True) if key.split("[")[0] == name]
+        size = max(max(own), 1e-30)
+        sign = score.option.candidate.sign.get(name, 0)
+        value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0
+        prior: Normal | TruncatedNormal = Normal(0.0, PRIOR_WIDTH * size)
+        if sign:
+            low, high = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
+            prior = TruncatedNormal(0.0, PRIOR_WIDTH * size, low, high)
+            value = value if value * sign > 0 else sign * 1e-3 * size
+        changed[name] = replace(present[name], value=value, prior=prior)
+    for name, value in score.shapes.items():
+        changed[name] = replace(present[name], value=value, prior=LogNormal(value, SHAPE_SPREAD))
+    return changed
+
+
+def _start(base: Base, score: Score, model: Model) -> Array:
+    """Present estimates, by-run ones included, and the expected values of the new unknowns."""
+    layout = Layout.of(model, [record.label for record in base.fit.records])
+    known: Mapping[str, float] = base.fit.values | dict(zip(score.names, map(float, score.expected), strict=True))
+    start = layout.start(model)
+    for k, name in enumerate(layout.names):
+        if "[" in name and name in known:
+            start[k] = known[name]
+    priors = layout.priors(model)
+    for k, prior in enumerate(priors):
+        low, high = prior.support
+        if not low < start[k] < high:
+            start[k] = model.parameters[layout.parameters[k]].value
+    return start
+
+
+def share_of(base: Base, fit: Fit) -> float:
+    """Part of the excess of the averaged residual that a refitted model takes away."""
+    before = after = 0.0
+    for r in range(len(fit.records)):
+        w = base.weight[r][:, None]
+        before += float(np.sum(w * base.residual[r] ** 2))
+        residual = fit.predictor.runs[r].measured - fit.predictions[r].y
+        after += float(np.sum(w * residual**2))
+    return (before - after) / base.fall_back

@@ -1,0 +1,92 @@
+"""Which runs are fitted and which are held out, and what is done where none is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo.errors import CampaignError
+from bayesoleo.prediction.records import Record
+
+#: Half a record needs two periods for an average of its own.
+FEWEST_PERIODS_TO_SPLIT = 4
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Runs by role.
+
+    Parameters
+    ----------
+    fitted, held_out : tuple of Record
+        In leave-one-run-out both hold every run.
+    strategy : {"declared", "leave-one-run-out", "split periods", "none"}
+        How runs are held out.
+    description : str
+        The same as a sentence.
+    """
+
+    fitted: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+    strategy: str
+    description: str
+
+
+def assign(records: Sequence[Record]) -> Roles:
+    """Take the declared roles, or find another way to hold data out.
+
+    Raises
+    ------
+    CampaignError
+        If a run is a transient, for which there is no solver yet, or no run is to be fitted.
+    """
+    for record in records:
+        if record.kind != "periodic":
+            raise CampaignError(
+                "a transient run cannot be fitted", run=record.label, key="kind", value=record.kind,
+                hint="leave it out of the campaign; only periodic runs are identified",
+            )  # fmt: skip
+    fitted = tuple(record for record in records if record.role == "fit")
+    held_out = tuple(record for record in records if record.role != "fit")
+    if not fitted:
+        raise CampaignError("no run has the role fit", hint='write role = "fit" in at least one run')
+    if held_out:
+        return Roles(fitted, held_out, "declared", f"{len(held_out)} declared hold-out runs")
+    if len(fitted) >= 2:
+        text = "no hold-out run is declared: every run is predicted by a fit to the others (leave-one-run-out)"
+        return Roles(fitted, fitted, "leave-one-run-out", text)
+    (only,) = fitted
+    if only.periods >= FEWEST_PERIODS_TO_SPLIT:
+        first, second = _halves(only)
+        text = "one run and no hold-out: fitted to the first half of its periods, held out the second"
+        return Roles((first,), (second,), "split periods", text)
+    return Roles(fitted, (), "none", "one run of too few periods: nothing could be held out")
+
+
+def _halves(record: Record) -> tuple[Record, Record]:
+    half = record.periods // 2
+    middle = int(np.searchsorted(record.phase, half - 1e-9))
+    return (
+        _part(record, slice(0, middle), half, "first half", "fit"),
+        _part(record, slice(middle, None), record.periods - half, "second half", "hold-out"),
+    )
+
+
+def _part(record: Record, samples: slice, periods: int, name: str, role: str) -> Record:
+    time = record.time[samples]
+    shift = record.frequency * (time[0] - record.time[0])
+    harmonics = {
+        channel: replace(item, coefficients=item.coefficients * np.exp(2j * np.pi * item.orders * shift))
+        for channel, item in record.harmonics.items()
+    }
+    return replace(
+        record,
+        label=f"{record.label} ({name})",
+        role=role,
+        periods=periods,
+        time=time,
+        samples={channel: values[samples] for channel, values in record.samples.items()},
+        harmonics=harmonics,
+    )

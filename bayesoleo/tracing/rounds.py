@@ -1,0 +1,232 @@
+"""One round of the search: score every effect, estimate the best few, confirm one on runs that were not used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesoleo.effects import Effect
+from bayesoleo.parallel import thread_map
+from bayesoleo.tracing.fit import Numerics
+from bayesoleo.tracing.refit import Refit, refit
+from bayesoleo.tracing.roles import Roles
+from bayesoleo.tracing.scales import scales_of
+from bayesoleo.tracing.score import Base, Score, score_all
+from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
+from bayesoleo.tracing.state import State, state_of
+
+#: The floor is reached if the pooled ratio of every output is below this and no candidate explains this part of the excess.
+FLOOR_RATIO, FLOOR_SHARE = 1.15, 0.10
+#: Nominal probability of adding an effect to data that lack none.
+LEVEL = 0.01
+#: Least part of the present excess that is worth another effect.
+LEAST_SHARE = 0.05
+#: Candidates estimated before one is chosen, and how far behind the best a score may lie to be among them.
+MOST_REFITS, NEAR = 6, 0.25
+#: Effects after estimation within this share of the best are as good; the simplest of them is taken.
+AS_GOOD = 0.02
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A scored candidate with what the search makes of it.
+
+    Parameters
+    ----------
+    score : Score
+    p_value : float
+        Corrected for the search.
+    gain : float
+        Share of the excess, after estimation where it was estimated.
+    refitted : bool
+        Whether it was.
+    same : tuple of str
+        Ids of effects that these data cannot tell from it.
+    """
+
+    score: Score
+    p_value: float
+    gain: float
+    refitted: bool
+    same: tuple[str, ...]
+
+    @property
+    def effect(self) -> str:
+        """Canonical id."""
+        return self.score.option.candidate.effect
+
+
+@dataclass(frozen=True)
+class Round:
+    """Outcome of one round.
+
+    Parameters
+    ----------
+    before : State
+        The model that was examined.
+    ranking : tuple of Ranked
+        Best first.
+    failed : dict of str to str
+        Effects that could not be scored, with the reason.
+    accepted : Ranked or None
+    after : State or None
+        With the accepted effect in.
+    reason : str
+        One sentence.
+    tests : float
+        Effective number of independent tests of the search.
+    """
+
+    before: State
+    ranking: tuple[Ranked, ...]
+    failed: dict[str, str]
+    accepted: Ranked | None
+    after: State | None
+    reason: str
+    tests: float
+
+
+def examine(
+    state: State,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    effects: Sequence[Effect] | None,
+    seed: int,
+    last: bool,
+    say: Say,
+) -> Round:
+    """Look for the effect that a fitted model lacks.
+
+    Parameters
+    ----------
+    state : State
+        The fitted model.
+    roles : Roles
+        Runs.
+    numerics : Numerics
+        Scheme, threads.
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    seed : int
+        For the correction for the search.
+    last : bool
+        Only rank; accept nothing.
+    say : callable
+        Told what is being done.
+    """
+    scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
+    options = state.assembly.options(scales, None if effects is None else tuple(effects))
+    say(f"score {len(options)} candidates")
+    base = state.base()
+    scores, failed = score_all(base, options, numerics.jobs)
+    tests = effective_tests(scores, seed)
+    ranking = _rank(scores, tests, {})
+    stop = _stopping_reason(state, ranking)
+    if stop is not None or last:
+        reason = stop or "the largest number of effects has been added"
+        return Round(state, ranking, failed, None, None, reason, tests)
+    refits = _refit_best(base, ranking, numerics, say)
+    ranking = _rank(scores, tests, refits)
+    accepted, after, reason = _choose(state, base, ranking, refits, roles, seed, say)
+    return Round(state, ranking, failed, accepted, after, reason, tests)
+
+
+def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tuple[Ranked, ...]:
+    groups = classes(scores)
+    ranked = []
+    for k, score in enumerate(scores):
+        same = tuple(dict.fromkeys(scores[j].option.candidate.effect for j in groups[k]))
+        fitted = refits.get(id(score))
+        gain = score.share if fitted is None else fitted.share
+        ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
+    # What was estimated is known better than what was only scored, and comes first.
+    return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
+
+
+def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
+    worst = state.worst_ratio
+    best = max((item.gain for item in ranking), default=0.0)
+    if worst < FLOOR_RATIO and best < FLOOR_SHARE:
+        return (
+            f"nothing is missing: the residual is {worst:.2f} times its noise at most"
+            f" and no effect explains more than {100 * best:.0f} % of the excess"
+        )
+    if not any(item.p_value < LEVEL for item in ranking):
+        return "no effect is significant after the correction for the search"
+    return None
+
+
+def _refit_best(base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say) -> dict[int, Refit]:
+    """Estimate the best few: effects of physics first, what merely varies from run to run if nothing else explains much."""
+    chosen: list[Score] = []
+    significant = [item for item in ranking if item.p_value < LEVEL and item.gain > 0]
+    named = [item for item in significant if item.score.option.candidate.family != "run-to-run"]
+    pool = named or significant
+    for item in pool:
+        if len(chosen) == MOST_REFITS or item.gain < NEAR * pool[0].gain:
+            break
+        chosen.append(item.score)
+    say(f"estimate the best {len(chosen)}: {', '.join(s.option.candidate.effect for s in chosen)}")
+    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    return {id(score): result for score, result in zip(chosen, results, strict=True)}
+
+
+def _choose(
+    state: State,
+    base: Base,
+    ranking: Sequence[Ranked],
+    refits: dict[int, Refit],
+    roles: Roles,
+    seed: int,
+    say: Say,
+) -> tuple[Ranked | None, State | None, str]:
+    """The best effect that the runs not used confirm."""
+    tried = sorted((item for item in ranking if item.refitted), key=lambda item: -item.gain)
+    reasons = []
+    while tried:
+        near = [item for item in tried if item.gain >= tried[0].gain - AS_GOOD]
+        item = min(near, key=lambda one: refits[id(one.score)].size)
+        tried.remove(item)
+        result = refits[id(item.score)]
+        if result.share < LEAST_SHARE:
+            reasons.append(f"{item.effect} would explain only {100 * result.share:.0f} % of the excess")
+            continue
+        if not result.excludes_null():
+            reasons.append(f"the posterior of {item.effect} does not exclude its null")
+            continue
+        say(f"confirm {item.effect} on runs that were not used")
+        after = state_of(result.assembly, result.fit, roles, seed=seed)
+        fall, error = fall_on_hold_out(state, after)
+        if after.hold_errors.entries and not fall > error:
+            reasons.append(f"{item.effect} does not lower the error on hold-out runs")
+            continue
+        return item, after, _accepted_reason(state, after, item, fall, error)
+    return None, None, "; ".join(reasons) or "no candidate could be estimated"
+
+
+def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
+    """Fall of the weighted sum of squares on held-out runs, and its standard error.
+
+    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise of variance ``1/w`` in ``y`` gives it the variance
+    ``4 sum w (b - a)^2``.
+    """
+    fall = variance = 0.0
+    for old, new in zip(before.held_out, after.held_out, strict=True):
+        for b, output in enumerate(new.predictor.outputs):
+            weight = before.hold_errors.at(output, old.record.label).average.sigma ** -2
+            measured = old.record.samples[output]
+            fall += weight * float(np.sum((measured - old.y[b]) ** 2 - (measured - new.y[b]) ** 2))
+            variance += 4 * weight * float(np.sum((new.y[b] - old.y[b]) ** 2))
+    return fall, float(np.sqrt(variance))
+
+
+def _accepted_reason(before: State, after: State, item: Ranked, fall: float, error: float) -> str:
+    text = f"{item.effect} explains {100 * item.gain:.0f} % of the excess"
+    if after.hold_errors.entries:
+        text += f" and lowers the weighted squared error on hold-out runs by {fall:.3g} ± {error:.1g}"
+    return text

@@ -1,0 +1,103 @@
+"""A model in its present state: fitted, held against the noise on fitted and held-out runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.errors_table import ErrorTable, error_table
+from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.holdout import Prediction, predict_fitted, predict_held_out
+from bayesoleo.tracing.roles import Roles
+from bayesoleo.tracing.score import Base, base_of
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything known of one model.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        At the estimate.
+    fit : Fit
+        On the fitted runs.
+    fitted, held_out : list of Prediction
+        By run.
+    fit_errors, hold_errors : ErrorTable
+        Of these.
+    """
+
+    assembly: Assembly
+    fit: Fit
+    fitted: list[Prediction]
+    held_out: list[Prediction]
+    fit_errors: ErrorTable
+    hold_errors: ErrorTable
+
+    @property
+    def errors(self) -> ErrorTable:
+        """One entry each run and output: that of the held-out prediction where there is one."""
+        held = {entry.run for entry in self.hold_errors.entries}
+        rest = tuple(entry for entry in self.fit_errors.entries if entry.run not in held)
+        return ErrorTable((*rest, *self.hold_errors.entries))
+
+    @property
+    def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Pooled errors by role, as in the summary."""
+        return {**self.fit_errors.by_role(), **self.hold_errors.by_role()}
+
+    @property
+    def worst_ratio(self) -> float:
+        """Largest pooled ratio to the noise over roles and outputs."""
+        tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
+        return max(table.worst_ratio() for table in tables)
+
+    def base(self) -> Base:
+        """What candidates are scored against."""
+        entries = self.fit_errors.entries
+        return base_of(self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.average.number) for e in entries})
+
+
+def state_of(assembly: Assembly, fit: Fit, roles: Roles, *, seed: int) -> State:
+    """Predict all runs at a fit and compare with what was measured."""
+    fitted = predict_fitted(fit)
+    held_out = _left_out(fit, roles) if roles.strategy == "leave-one-run-out" else predict_held_out(fit, roles.held_out)
+    jobs = fit.numerics.jobs
+    return State(
+        assembly.with_values(fit.shared),
+        fit,
+        fitted,
+        held_out,
+        error_table(fitted, {p.record.label: "fit" for p in fitted}, seed=seed, jobs=jobs),
+        error_table(held_out, {p.record.label: "hold-out" for p in held_out}, seed=seed, jobs=jobs),
+    )
+
+
+def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:
+    """Each run predicted by a fit to all the others, from the joint estimate."""
+    predictions = []
+    for record in roles.held_out:
+        others = [other for other in fit.records if other.label != record.label]
+        keep = [k for k, name in enumerate(fit.problem.names) if not name.endswith(f"[{record.label}]")]
+        numerics = replace(fit.numerics, steps=fit.steps)
+        partial = fit_model(fit.model, others, numerics, start=fit.point.theta[keep])
+        predictions += predict_held_out(partial, [record])
+    return predictions
+
+
+def fit_state(
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    seed: int,
+    start: np.ndarray | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> State:
+    """Fit an assembly and describe its state."""
+    fit = fit_model(assembly.model(), roles.fitted, numerics, start=start, progress=progress)
+    return state_of(assembly, fit, roles, seed=seed)
