@@ -26,7 +26,7 @@ def headline(summary: Mapping[str, Any]) -> str:
     if summary["verdict"] == schema.NOTHING_MISSING:
         return "Nothing is missing: the model explains the measurements down to their noise."
     if summary["verdict"] == schema.EFFECT_ADDED:
-        return f"The model lacked {lacked}: {found} found, added and confirmed."
+        return f"The model lacked {lacked}: {found} found and added."
     if found:
         rest = "an error remains that no effect in the catalogue explains"
         return f"The model lacked {lacked}: {found} added, but {rest}."

@@ -29,7 +29,7 @@ def without(tree, *names):
 
 def test_the_page_makes_its_case(page):
     for text in (
-        "The model lacked an effect: Stribeck_friction found, added and confirmed.",
+        "The model lacked an effect: Stribeck_friction found and added.",
         "9.04 → 1.06",
         "Figure 17.",
         "Residual of pressure against stroke",
