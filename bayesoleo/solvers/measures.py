@@ -89,5 +89,8 @@ def take(base, dx, lanes, fractions, x):
 @jit
 def keep(source, lanes, target):
     """Copy the chosen lanes."""
+    n, w = source.shape[1:]
     for lane in lanes:
-        target[lane] = source[lane]
+        for m in range(n):
+            for j in range(w):
+                target[lane, m, j] = source[lane, m, j]

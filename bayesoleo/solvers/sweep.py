@@ -109,11 +109,16 @@ def eliminate_each(work, count, m):
     width = work.shape[1]
     matrix, right = np.empty((m, m)), np.empty((m, width - m))
     for t in range(count):
-        matrix[:] = work[:, :m, t]
-        right[:] = work[:, m:, t]
+        for i in range(m):
+            for j in range(m):
+                matrix[i, j] = work[i, j, t]
+            for j in range(m, width):
+                right[i, j - m] = work[i, j, t]
         if not eliminate(matrix, right):
             return False
-        work[:, m:, t] = right
+        for i in range(m):
+            for j in range(m, width):
+                work[i, j, t] = right[i, j - m]
     return True
 
 
@@ -127,7 +132,9 @@ def close_and_sweep(transfer, monodromy, states, initial):
     """
     D, width, n = transfer.shape
     k = width - D
-    product, following = np.eye(D, width), np.empty((D, width))
+    product, following = np.zeros((D, width)), np.empty((D, width))
+    for i in range(D):
+        product[i, i] = 1.0
     for m in range(n):
         for i in range(D):
             for j in range(width):
@@ -136,21 +143,25 @@ def close_and_sweep(transfer, monodromy, states, initial):
                     total += transfer[i, l, m] * product[l, j]
                 following[i, j] = total
         product, following = following, product
-    monodromy[:] = product[:, :D]
-    state = np.zeros((D, k))
+    closure, state = np.empty((D, D)), np.zeros((D, k))
+    for i in range(D):
+        for j in range(D):
+            monodromy[i, j] = product[i, j]
+            closure[i, j] = (1.0 if i == j else 0.0) - product[i, j]
     if not initial:
-        closure = np.eye(D) - product[:, :D]
-        state[:] = product[:, D:]
-        if not eliminate(closure, state):
-            return False
-    after = np.empty((D, k))
-    for m in range(n):
         for i in range(D):
             for j in range(k):
-                states[i, j, m] = state[i, j]
+                state[i, j] = product[i, D + j]
+        if not eliminate(closure, state):
+            return False
+    for i in range(D):
+        for j in range(k):
+            states[i, j, 0] = state[i, j]
+    for m in range(n - 1):
+        for i in range(D):
+            for j in range(k):
                 total = transfer[i, D + j, m]
                 for l in range(D):
-                    total += transfer[i, l, m] * state[l, j]
-                after[i, j] = total
-        state, after = after, state
+                    total += transfer[i, l, m] * states[l, j, m]
+                states[i, j, m + 1] = total
     return True
