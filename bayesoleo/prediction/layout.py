@@ -41,7 +41,8 @@ class Layout:
     @classmethod
     def of(cls, model: Model, runs: Sequence[str]) -> Layout:
         """Layout of a model's estimated parameters over runs."""
-        names, owners = [], []
+        names: list[str] = []
+        owners: list[str] = []
         active = model.estimated()
         columns = np.empty((len(runs), len(active)), dtype=np.int64)
         for k, name in enumerate(active):

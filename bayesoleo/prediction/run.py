@@ -203,7 +203,7 @@ class RunPredictor:
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:
-                solution = self._along_path(p, solution, lane, pieces)
+                solution = self._along_path(p, solution, int(lane), pieces)
         return solution
 
     def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:

@@ -23,19 +23,23 @@ Lanes = NDArray[np.int64]
 class Equations(Protocol):
     """What a solver needs of a system of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
 
-    residual: Callable[..., Any]
-    jacobian: Callable[..., Any]
-    parameters: Callable[..., Any]
-    admissible: Callable[..., Any]
+    @property
+    def jacobian(self) -> Callable[..., Any]: ...
+    @property
+    def parameters(self) -> Callable[..., Any]: ...
+    @property
+    def admissible(self) -> Callable[..., Any]: ...
 
 
 class Scheme(Protocol):
     """A discretisation of a period as linear maps (see :class:`~bayesoleo.solvers.collocation.Collocation`)."""
 
-    orders: tuple[int, ...]
-
+    @property
+    def orders(self) -> tuple[int, ...]: ...
     @property
     def state_size(self) -> int: ...
+    @property
+    def width(self) -> int: ...
     def phases(self, n: int) -> Array: ...
     def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array: ...
     def rows(self, x: Array, lanes: Lanes, step: float, z: Array) -> None: ...
