@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "docs" / "_ext"))
 
 project = "bayesoleo"
 author = "The bayesoleo developers"
@@ -21,7 +23,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas show without a network
 ]
-exclude_patterns = ["_build", "_templates"]
+exclude_patterns = ["_build", "_ext", "_templates"]
 templates_path = ["_templates"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -38,7 +40,9 @@ sphinx_gallery_conf = {
     "examples_dirs": ["../studies"],
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"/plot_",
-    "ignore_pattern": r"/(?!plot_)[^/]*\.py$",  # model files are no pages
+    "ignore_pattern": r"^(?!plot_)",  # model files are no pages
+    "image_scrapers": ("matplotlib", "gallery_figures.scrape"),
+    "ignore_repr_types": r"matplotlib\.",
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
@@ -54,6 +58,8 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 html_sidebars = {"index": []}
 html_show_sourcelink = False
 html_copy_source = False
