@@ -195,10 +195,17 @@ class _Newton:
         measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
         return self.inside[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
 
-    def _merit(self, lanes: Lanes, unit: Array) -> Array:
-        """Residual in a given unit; Newton's direction reduces it if the unit is kept during a step."""
+    def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
+        """Whether the residual fell, in units of the equations' terms: the larger of those before and after.
+
+        Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid to leave it.
+        """
+        unit = np.maximum(terms, self.terms[lanes]) + 1e-300
         with np.errstate(all="ignore"):
-            return np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
+            before = np.sqrt(np.sum(squares / unit, axis=1))
+            merit = np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
+        self.merit[lanes] = merit
+        return merit < before
 
     def _finish(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
         """Take the last step where it is small enough that what it leaves is round-off."""
@@ -214,9 +221,7 @@ class _Newton:
     def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
         """Take the steps, halving those that leave the admissible region or do not reduce the residual."""
         measures.keep(self.x, lanes, self.base)
-        # The unit of residuals is the size of the equations' terms before the step.
-        unit = self.terms[lanes] + 1e-300
-        before, fraction = self._merit(lanes, unit), np.ones(lanes.size)
+        squares, terms, fraction = self.squares[lanes], self.terms[lanes], np.ones(lanes.size)
         pending = np.arange(lanes.size)
         for _ in range(MAXIMUM_HALVINGS):
             if pending.size == 0:
@@ -224,10 +229,9 @@ class _Newton:
             chosen = lanes[pending]
             measures.take(self.base, dx, chosen, fraction[pending], self.x)
             good = self._evaluate(chosen)
-            merit = self._merit(chosen, unit[pending])
+            falls = self._reduces(chosen, squares[pending], terms[pending])
             # Close to the solution round-off keeps the residual from falling; the step's own size then decides.
-            good &= (merit < before[pending]) | (size[chosen] < 1e-5) | (not self.monotone)
-            self.merit[chosen[good]] = merit[good]
+            good &= falls | (size[chosen] < 1e-5) | (not self.monotone)
             pending = pending[~good]
             fraction[pending] *= 0.5
         stuck = lanes[pending]
