@@ -23,7 +23,7 @@ import platformdirs
 import sympy as sp
 
 from bayesoleo.model.derive import Derived, derive
-from bayesoleo.model.expressions import derivative_symbol, symbol
+from bayesoleo.model.expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model.model import Model
 from bayesoleo.model.printing import code
 
@@ -50,6 +50,10 @@ class Kernels:
         ``(z, u, p, lanes, yz, yp)`` with ``yz (L, ny, nz, N)`` and ``yp (L, ny, na, N)``.
     admissible : callable
         ``(z, u, p, lanes, a)`` with ``a (L, nc, N)``, positive inside the admissible region.
+    inputs : callable
+        ``(z, u, p, lanes, gu)`` with ``gu (L, d, nu, N)``: how the equations depend on the input rows.
+    output_inputs : callable
+        ``(z, u, p, lanes, yu)`` with ``yu (L, ny, nu, N)``.
     source : str
         The generated code.
     """
@@ -61,6 +65,8 @@ class Kernels:
     output: Kernel
     output_jacobian: Kernel
     admissible: Kernel
+    inputs: Kernel
+    output_inputs: Kernel
     source: str
 
 
@@ -108,16 +114,27 @@ def kernels(model: Model, active: Sequence[str] | None = None, backend: str = "n
     return _cached(digest, chosen, backend, _Hashed(model, digest))
 
 
-KERNELS = ("residual", "jacobian", "parameters", "output", "output_jacobian", "admissible")
+KERNELS = (
+    "residual",
+    "jacobian",
+    "parameters",
+    "output",
+    "output_jacobian",
+    "admissible",
+    "inputs",
+    "output_inputs",
+)
 
 
 def generate(derived: Derived, backend: str) -> str:
-    """Source of a module with the six kernels of a model."""
+    """Source of a module with all kernels of a model."""
     active, states = derived.active_symbols, derived.states
     g, y = derived.residual, derived.output
     gz, gp = derived.gradient(g, states), derived.gradient(g, active)
     yz, yp = derived.gradient(y, states), derived.gradient(y, active)
-    nz, na = len(states), len(active)
+    rows = [TIME if name == "time" else derivative_symbol(name, order) for name, order in derived.inputs]
+    gu, yu = derived.gradient(g, rows), derived.gradient(y, rows)
+    nz, na, nu = len(states), len(active), len(rows)
     targets = {
         "residual": (("g",), [*_vector("g", g)]),
         "jacobian": (("g", "gz"), [*_vector("g", g), *_matrix("gz", gz, nz)]),
@@ -125,6 +142,8 @@ def generate(derived: Derived, backend: str) -> str:
         "output": (("y",), [*_vector("y", y)]),
         "output_jacobian": (("yz", "yp"), [*_matrix("yz", yz, nz), *_matrix("yp", yp, na)]),
         "admissible": (("a",), [*_vector("a", derived.admissible)]),
+        "inputs": (("gu",), [*_matrix("gu", gu, nu)]),
+        "output_inputs": (("yu",), [*_matrix("yu", yu, nu)]),
     }
     head = ["import numpy as np"]
     if backend == "numba":

@@ -1,64 +1,85 @@
-"""How much of a prediction's error comes from the noise of its input.
+"""How the noise of a run's inputs reaches its predicted outputs.
 
-The input's harmonics are known with a variance each. Drawn anew a few times and sent through the model they show what the input's noise
-does to the outputs: it repeats in every period of the prediction, so the scatter between periods does not contain it.
+The input's harmonics are known with a variance each. What their errors do to the prediction repeats in every period, so the scatter between
+periods does not contain it: it has to be computed, by the same linear periodic problem that gives parameter sensitivities.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Harmonics
+from bayesoleo.prediction.inputs import harmonics_of
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
 
-def input_noise(predictor: Predictor, theta: Array, r: int, rng: np.random.Generator, draws: int = 6) -> Array:
-    """Root mean square change of each output by the input's noise.
+def input_columns(run: RunPredictor, p: Array) -> Array:
+    """Change of the outputs by one standard deviation of each input coefficient.
 
     Parameters
     ----------
-    predictor : Predictor
-        Anchored near ``theta``.
-    theta : ndarray, shape (l,)
-        Unknowns.
-    r : int
-        Number of the run.
-    rng : numpy.random.Generator
-        Source of the draws.
-    draws : int
-        Their number; each is an average over thousands of samples already.
+    run : RunPredictor
+        Anchored near ``p``.
+    p : ndarray, shape (np,)
+        Model constants.
 
     Returns
     -------
-    ndarray, shape (ny,)
-        In the outputs' SI units; zero if no draw could be solved.
+    ndarray, shape (ny, k, N)
+        Real and imaginary parts of all significant harmonics of all inputs; SI; no columns where the run could not be solved.
     """
-    base = predictor.runs[r]
-    p = predictor.constants(theta[None], r)
-    nominal = base.predict(p).y[0]
-    squares = []
-    for _ in range(draws):
-        harmonics = {name: _drawn(item, rng) for name, item in base.record.harmonics.items()}
-        run = RunPredictor(
-            base.model, base.kernels, replace(base.record, harmonics=harmonics), base.steps, predictor.scheme
-        )
-        run.anchor = base.anchor
-        samples = run.predict(p)
-        if samples.status[0] == Status.CONVERGED.value:
-            squares.append(np.mean((samples.y[0] - nominal) ** 2, axis=1))
-    return np.sqrt(np.mean(squares, axis=0)) if squares else np.zeros(nominal.shape[0])
+    derived, boundary = run.kernels.derived, run.boundary
+    ny, samples = run.measured.shape
+    at_samples = _input_changes(run, run.record.phase)
+    lanes, one = np.zeros(1, dtype=np.int64), p[None]
+    z = np.empty((1, 0, samples))
+    moved = np.zeros((1, 0, at_samples.shape[1], samples))
+    if derived.dofs:
+        solution = run.solve(one)
+        if solution.status[0] != Status.CONVERGED.value:
+            return np.zeros((ny, 0, samples))
+        step = boundary.step(run.steps)
+        z = run.scheme.sample(solution.x[..., None], run.plan, step)[:, :, 0]
+        moved = run.scheme.sample(_states(run, one, solution.x), run.plan, step)
+    yz, yp = np.zeros((1, ny, z.shape[1], samples)), np.zeros((1, ny, len(derived.active), samples))
+    yu = np.zeros((1, ny, len(derived.inputs), samples))
+    with np.errstate(all="ignore"):
+        run.kernels.output_jacobian(z, run.sample_inputs, one, lanes, yz, yp)
+        run.kernels.output_inputs(z, run.sample_inputs, one, lanes, yu)
+    columns = np.einsum("yuN,ukN->ykN", yu[0], at_samples)
+    columns += np.einsum("yzN,zkN->ykN", yz[0], moved[0])
+    return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 
-def _drawn(item: Harmonics, rng: np.random.Generator) -> Harmonics:
-    sd = np.sqrt(item.variances)
-    change = sd * (rng.standard_normal(sd.size) + 1j * rng.standard_normal(sd.size))
-    if item.orders.size and item.orders[0] == 0:
-        change[0] = change[0].real
-    return replace(item, coefficients=item.coefficients + change)
+def _states(run: RunPredictor, p: Array, x: Array) -> Array:
+    """Change of the solver's unknowns, shape (1, n, w, k)."""
+    boundary, d = run.boundary, len(run.scheme.orders)
+    points, nz = boundary.inputs.shape[1], run.scheme.state_size + d
+    lanes = np.zeros(1, dtype=np.int64)
+    z, g, gz = np.zeros((1, nz, points)), np.zeros((1, d, points)), np.zeros((1, d, nz, points))
+    gu = np.zeros((1, d, boundary.inputs.shape[0], points))
+    run.scheme.rows(x, lanes, boundary.step(run.steps), z)
+    run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
+    run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
+    right = np.einsum("lduN,ukN->ldkN", gu, _input_changes(run, run.points))
+    return run.scheme.linear(gz, right, None, lanes, boundary.step(run.steps))[0]
+
+
+def _input_changes(run: RunPredictor, phase: Array) -> Array:
+    """Change of every input row by one standard deviation of each coefficient, shape (nu, k, N)."""
+    rows, record = run.kernels.derived.inputs, run.record
+    channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
+    blocks = []
+    for channel in channels:
+        item = harmonics_of(record, channel)
+        turn = np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0)) * np.sqrt(item.variances)[:, None]
+        block = np.zeros((len(rows), 2 * item.orders.size, phase.size))
+        for k, (name, derivative) in enumerate(rows):
+            if name == channel:
+                changed = (2j * np.pi * record.frequency * item.orders)[:, None] ** derivative * turn
+                block[k, : item.orders.size], block[k, item.orders.size :] = changed.real, -changed.imag
+        blocks.append(block[:, np.abs(block).max(axis=(0, 2)) > 0])
+    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))

@@ -6,7 +6,7 @@ either can be added after the other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from bayesoleo.effects import Candidate, Effect, Scales, candidates, catalogue
@@ -42,6 +42,27 @@ class Option:
 
 
 @dataclass(frozen=True)
+class Step:
+    """One effect that was added.
+
+    Parameters
+    ----------
+    effect : Effect
+    target : str
+        Where it sits.
+    scales : Scales
+        For which its constants were computed.
+    amplitudes : tuple of str
+        Its new parameters, at their null where the effect is absent.
+    """
+
+    effect: Effect
+    target: str
+    scales: Scales
+    amplitudes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Assembly:
     """A declared model with a drive and added effects.
 
@@ -55,15 +76,23 @@ class Assembly:
         Effects on channels of the driven model, with their targets.
     parameters : mapping of str to Parameter
         Parameters of the sensor effects, which the native model does not have.
-    added : tuple of (str, str)
-        All effects in the order in which they were added.
+    steps : tuple of Step
+        How it was assembled, in order.
+    declared : Model or None
+        The model before any effect; ``None`` stands for ``native``.
     """
 
     native: Model
     drive: str | None = None
     sensors: tuple[tuple[Effect, str, Scales], ...] = ()
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    added: tuple[Added, ...] = ()
+    steps: tuple[Step, ...] = ()
+    declared: Model | None = None
+
+    @property
+    def added(self) -> tuple[Added, ...]:
+        """All effects with their targets, in the order in which they were added."""
+        return tuple((step.effect.id, step.target) for step in self.steps)
 
     def model(self) -> Model:
         """The driven model with everything in it."""
@@ -87,44 +116,41 @@ class Assembly:
         present = self.model().parameters
         return self.with_parameters({name: replace(present[name], value=value) for name, value in values.items()})
 
-    def options(self, scales: Scales, effects: tuple[Effect, ...] | None = None) -> list[Option]:
+    def without(self, step: Step) -> Assembly:
+        """The same assembly with one effect left out."""
+        base = Assembly(self.declared or self.native, self.drive)
+        for other in self.steps:
+            if other is not step:
+                base = base._with_step(other.effect, other.target, other.scales)[1]
+        present = self.model().parameters
+        kept = {name: item for name, item in present.items() if name in base.model().parameters}
+        return base.with_parameters(kept)
+
+    def options(self, scales: Scales, effects: Sequence[Effect] | None = None) -> list[Option]:
         """Every effect at every place where it applies, ready to be scored.
 
         An effect that leaves no unique inverse for the drive is left out: it cannot be solved for.
         """
-        chosen = catalogue() if effects is None else effects
-        physics = tuple(effect for effect in chosen if effect.family != "sensor")
-        channels = tuple(effect for effect in chosen if effect.family == "sensor")
-        found = []
-        for candidate in candidates(self.native, scales, physics):
-            found += _attempt(candidate, replace(self, native=candidate.model, added=(*self.added, _key(candidate))))
-        driven = self.model()
-        by_id = {effect.id: effect for effect in channels}
-        for candidate in candidates(driven, scales, channels):
-            effect = by_id[candidate.effect]
-            new = {name: candidate.model.parameters[name] for name in _new_names(driven, candidate.model)}
-            found += _attempt(
-                candidate,
-                replace(
-                    self,
-                    sensors=(*self.sensors, (effect, candidate.target, scales)),
-                    parameters={**self.parameters, **new},
-                    added=(*self.added, _key(candidate)),
-                ),
-            )
+        found, driven = [], self.model()
+        for effect in catalogue() if effects is None else effects:
+            base = driven if effect.family == "sensor" else self.native
+            for place in candidates(base, scales, (effect,)):
+                try:
+                    candidate, assembly = self._with_step(effect, place.target, scales)
+                    found.append(Option(candidate, assembly, assembly.model()))
+                except ModelError:
+                    continue
         return found
 
-
-def _key(candidate: Candidate) -> Added:
-    return candidate.effect, candidate.target
-
-
-def _new_names(old: Model, new: Model) -> list[str]:
-    return [name for name in new.parameters if name not in old.parameters]
-
-
-def _attempt(candidate: Candidate, assembly: Assembly) -> list[Option]:
-    try:
-        return [Option(candidate, assembly, assembly.model())]
-    except ModelError:
-        return []
+    def _with_step(self, effect: Effect, target: str, scales: Scales) -> tuple[Candidate, Assembly]:
+        """Add an effect: to the driven model's channels if it is a sensor's, else to the equations."""
+        sensor = effect.family == "sensor"
+        base = self.model() if sensor else self.native
+        candidate = effect.extend(base, target, scales)
+        step = Step(effect, target, scales, candidate.parameters)
+        grown = replace(self, steps=(*self.steps, step), declared=self.declared or self.native)
+        if not sensor:
+            return candidate, replace(grown, native=candidate.model)
+        new = {name: item for name, item in candidate.model.parameters.items() if name not in base.parameters}
+        sensors = (*self.sensors, (effect, target, scales))
+        return candidate, replace(grown, sensors=sensors, parameters={**self.parameters, **new})

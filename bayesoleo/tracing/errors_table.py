@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.data import PeriodicAverage, periodic_average
 from bayesoleo.parallel import thread_map
-from bayesoleo.prediction.input_noise import input_noise
+from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.holdout import Prediction
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ class ErrorTable:
 
 
 def error_table(
-    predictions: Sequence[Prediction], roles: Mapping[str, str], *, seed: int, jobs: int | None = None
+    predictions: Sequence[Prediction], roles: Mapping[str, str], *, jobs: int | None = None
 ) -> ErrorTable:
     """Compare predictions with what was measured.
 
@@ -119,8 +119,6 @@ def error_table(
         One a run.
     roles : mapping of str to str
         Role of each run by label.
-    seed : int
-        For the draws of the input's noise.
     jobs : int, optional
         Threads.
 
@@ -128,16 +126,15 @@ def error_table(
     -------
     ErrorTable
     """
-    tasks = list(enumerate(predictions))
-    rows = thread_map(lambda task: _of_run(task[1], roles, seed + task[0]), tasks, jobs)
+    rows = thread_map(lambda prediction: _of_run(prediction, roles), predictions, jobs)
     return ErrorTable(tuple(entry for row in rows for entry in row))
 
 
-def _of_run(prediction: Prediction, roles: Mapping[str, str], seed: int) -> list[RunError]:
+def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
     record, predictor = prediction.record, prediction.predictor
-    step = float(record.time[1] - record.time[0])
-    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1)) if record.time.size > 1 else step
-    spread = input_noise(predictor, prediction.vector, 0, np.random.default_rng(seed))
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
+    spread = np.sqrt(np.mean(np.sum(columns**2, axis=1), axis=1))
     entries = []
     for b, output in enumerate(predictor.outputs):
         residual = record.samples[output] - prediction.y[b]

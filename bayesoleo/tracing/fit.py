@@ -115,6 +115,8 @@ def fit_model(
     numerics: Numerics,
     *,
     start: Array | None = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 50,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Estimate a model's parameters from runs.
@@ -129,6 +131,10 @@ def fit_model(
         Scheme, steps, threads.
     start : ndarray, shape (l,), optional
         Where to start; by default at the nominal values.
+    tolerance : float
+        Relative step at which the estimators stop.
+    max_iterations : int
+        Of each estimator.
     progress : callable, optional
         Told what is being done.
 
@@ -146,9 +152,9 @@ def fit_model(
     while True:
         problem = _problem(model, records, numerics, steps)
         say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
-        mbe = estimate(problem, "mbe", start=start)
+        mbe = estimate(problem, "mbe", start=start, tolerance=tolerance, max_iterations=max_iterations)
         say("posterior mode")
-        point = polish(problem, mbe)
+        point = polish(problem, mbe, tolerance=tolerance, max_iterations=max_iterations)
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         shift = _mesh_shift(problem, point, predictions, numerics) if model.dofs else 0.0

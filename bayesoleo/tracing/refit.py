@@ -82,7 +82,9 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = assembly.with_parameters(new_parameters(assembly, score))
     model = assembly.model()
     start = _start(base, score, model)
-    fit = fit_model(model, base.fit.records, replace(numerics, steps=base.fit.steps), start=start)
+    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
+    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
+    fit = fit_model(model, base.fit.records, quick, start=start, tolerance=1e-4, max_iterations=15)
     return Refit(score, assembly.with_values(fit.shared), fit, share_of(base, fit))
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.model import Model
 from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.solvers.status import Status
@@ -26,6 +27,44 @@ Array = NDArray[np.float64]
 
 #: Samples kept for comparing candidates with each other: every one of this many.
 THINNING = 7
+#: Directions of input noise that are counted in a run, and the squared size, in noise units, below which one is not worth it.
+MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
+
+
+@dataclass(frozen=True)
+class InputNoise:
+    """Low-rank part of a run's noise covariance, ``diag(1/w) + B B'``, that comes from its input.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (ny, k, N)
+        ``B``: change of the outputs by one standard deviation of each input coefficient.
+    weight : ndarray, shape (ny,)
+        ``w``.
+    inverse : ndarray, shape (k, k)
+        ``(I + B' w B)^-1``.
+    """
+
+    columns: Array
+    weight: Array
+    inverse: Array
+
+    @classmethod
+    def of(cls, columns: Array, weight: Array) -> InputNoise:
+        """Keep the directions that matter against the noise of the samples."""
+        size = np.einsum("ykN,ykN,y->k", columns, columns, weight, optimize=True)
+        kept = columns[:, np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
+        inner = np.einsum("yjN,ykN,y->jk", kept, kept, weight, optimize=True)
+        return cls(kept, weight, np.linalg.inv(np.eye(inner.shape[0]) + inner))
+
+    def product(self, left: Array, right: Array) -> Array:
+        """``left' W right`` for blocks of shapes (ny, a, N) and (ny, b, N), by Woodbury's identity."""
+        plain = np.einsum("yaN,ybN,y->ab", left, right, self.weight, optimize=True)
+        if self.inverse.size == 0:
+            return plain
+        a = np.einsum("ykN,yaN,y->ka", self.columns, left, self.weight, optimize=True)
+        b = np.einsum("ykN,ybN,y->kb", self.columns, right, self.weight, optimize=True)
+        return plain - a.T @ self.inverse @ b
 
 
 @dataclass(frozen=True)
@@ -44,8 +83,12 @@ class Base:
         In units of the prior's standard deviation, so that the normal matrix is well scaled.
     period : list of ndarray of int, each shape (N_r,)
         Number of the period that each sample lies in.
+    input_noise : list of InputNoise
+        By run: directions in which the input's noise moves the outputs, counted in ``W``.
     gram : ndarray, shape (l, l)
         ``J' W J``.
+    gradient : ndarray, shape (l,)
+        ``J' W e``.
     noise : float
         Expected sum of squares of the averaged residual, had only noise remained.
     excess : float
@@ -57,7 +100,9 @@ class Base:
     weight: list[Array]
     sensitivity: list[Array]
     period: list[NDArray[np.int64]]
+    input_noise: list[InputNoise]
     gram: Array
+    gradient: Array
     noise: float
     excess: float
 
@@ -67,15 +112,15 @@ class Base:
         return max(self.excess, 0.0) + 2.0 * np.sqrt(2.0 * self.noise)
 
 
-def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, int]]) -> Base:
+def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float]]) -> Base:
     """Prepare scoring.
 
     Parameters
     ----------
     fit : Fit
         The present model.
-    errors : mapping of (run, output) to (sigma, repeating, number)
-        Noise of a single sample, root mean square of the averaged residual, coefficients of the average.
+    errors : mapping of (run, output) to (sigma, repeating, noise)
+        Noise of a single sample, root mean square of the averaged residual, and its standard error, input noise included.
     """
     scale = np.array([prior.sd for prior in fit.problem.priors])
     tolerances = _tolerance_columns(fit)
@@ -84,6 +129,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, int]]
     # A constant known to a tolerance is no free parameter: its prior's precision, one in this unit, stays with it.
     gram[known:, known:] += np.eye(size - known)
     noise = excess = 0.0
+    gradient, moved = np.zeros(size), []
     for r, record in enumerate(fit.records):
         run = fit.predictor.runs[r]
         e = run.measured - fit.predictions[r].y
@@ -91,16 +137,24 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, int]]
         w = 1.0 / sigmas**2
         columns = fit.predictions[r].sensitivity[:, _free(fit)] * scale[:, None]
         columns = np.concatenate([columns, tolerances[r]], axis=1)
-        gram += np.einsum("ykN,ylN,y->kl", columns, columns, w, optimize=True)
+        from_input = InputNoise.of(input_columns(run, _present(fit, r)), w)
+        gram += from_input.product(columns, columns)
+        gradient += from_input.product(columns, e[:, None])[:, 0]
         for b, output in enumerate(fit.predictor.outputs):
-            _, repeating, number = errors[record.label, output]
-            noise += number
-            excess += record.time.size * repeating**2 * w[b] - number
+            _, repeating, floor = errors[record.label, output]
+            noise += record.time.size * w[b] * floor**2
+            excess += record.time.size * w[b] * (repeating**2 - floor**2)
         residual.append(e)
         weight.append(w)
         sensitivity.append(columns)
         period.append(np.floor(record.phase + 1e-9).astype(np.int64))
-    return Base(fit, residual, weight, sensitivity, period, gram, noise, excess)
+        moved.append(from_input)
+    return Base(fit, residual, weight, sensitivity, period, moved, gram, gradient, noise, excess)
+
+
+def _present(fit: Fit, r: int) -> Array:
+    """Constants of a run at the estimate, shape (np,)."""
+    return fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
 
 
 def _tolerance_columns(fit: Fit) -> list[Array]:
@@ -245,8 +299,7 @@ def _sensitivities(fit: Fit, model: Model, shapes: Sequence[Mapping[str, float]]
 
 def _set_present(fit: Fit, r: int, predictor: Predictor, p: Array) -> None:
     """Give an extended model the estimates of the present one, by-run values included."""
-    theta = fit.problem.full(fit.point.theta[None])
-    present = fit.predictor.constants(theta, r)[0]
+    present = _present(fit, r)
     names = fit.predictor.runs[r].kernels.derived.constants
     position = {name: k for k, name in enumerate(predictor.runs[r].kernels.derived.constants)}
     for name, value in zip(names, present, strict=True):
@@ -258,17 +311,14 @@ def _evaluate(base: Base, option: Option, values: Mapping[str, float], block: _B
     k, size = len(block.names), base.gram.shape[0]
     cross, own, score = np.zeros((size, k)), np.zeros((k, k)), np.zeros(k)
     for r, C in enumerate(block.by_run):
-        w = base.weight[r]
-        cross += np.einsum("ylN,ykN,y->lk", base.sensitivity[r], C, w, optimize=True)
-        own += np.einsum("yjN,ykN,y->jk", C, C, w, optimize=True)
-        score += np.einsum("ykN,yN,y->k", C, base.residual[r], w, optimize=True)
+        inner = base.input_noise[r]
+        cross += inner.product(base.sensitivity[r], C)
+        own += inner.product(C, C)
+        score += inner.product(C, base.residual[r][:, None])[:, 0]
     regular = base.gram + 1e-12 * np.diag(np.diag(base.gram)) if size else base.gram
     project = np.linalg.lstsq(regular, cross, rcond=None)[0] if size else np.zeros((0, k))
     information = own - cross.T @ project
-    gradient = np.zeros(size)
-    for r in range(len(block.by_run)):
-        gradient += np.einsum("ylN,yN,y->l", base.sensitivity[r], base.residual[r], base.weight[r], optimize=True)
-    score = score - project.T @ gradient
+    score = score - project.T @ base.gradient
     keep = np.diag(information) > 1e-8 * np.diag(own)
     if not keep.any() or not np.isfinite(information).all():
         return None

@@ -59,10 +59,10 @@ class State:
     def base(self) -> Base:
         """What candidates are scored against."""
         entries = self.fit_errors.entries
-        return base_of(self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.average.number) for e in entries})
+        return base_of(self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.noise) for e in entries})
 
 
-def state_of(assembly: Assembly, fit: Fit, roles: Roles, *, seed: int) -> State:
+def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
     """Predict all runs at a fit and compare with what was measured."""
     fitted = predict_fitted(fit)
     held_out = _left_out(fit, roles) if roles.strategy == "leave-one-run-out" else predict_held_out(fit, roles.held_out)
@@ -72,8 +72,8 @@ def state_of(assembly: Assembly, fit: Fit, roles: Roles, *, seed: int) -> State:
         fit,
         fitted,
         held_out,
-        error_table(fitted, {p.record.label: "fit" for p in fitted}, seed=seed, jobs=jobs),
-        error_table(held_out, {p.record.label: "hold-out" for p in held_out}, seed=seed, jobs=jobs),
+        error_table(fitted, {p.record.label: "fit" for p in fitted}, jobs=jobs),
+        error_table(held_out, {p.record.label: "hold-out" for p in held_out}, jobs=jobs),
     )
 
 
@@ -94,10 +94,9 @@ def fit_state(
     roles: Roles,
     numerics: Numerics,
     *,
-    seed: int,
     start: np.ndarray | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> State:
     """Fit an assembly and describe its state."""
     fit = fit_model(assembly.model(), roles.fitted, numerics, start=start, progress=progress)
-    return state_of(assembly, fit, roles, seed=seed)
+    return state_of(assembly, fit, roles)

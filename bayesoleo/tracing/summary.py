@@ -1,0 +1,121 @@
+"""The summary of a closed loop: plain dicts that ``summary.json`` is made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesoleo import schema
+from bayesoleo.posterior import Samples
+from bayesoleo.tracing.loop import ClosedLoop
+from bayesoleo.tracing.rounds import Ranked, Round
+from bayesoleo.tracing.state import State
+
+
+def summarise(loop: ClosedLoop, samples: Samples | None, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a closed loop in the terms of the summary's JSON Schema.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    samples : Samples or None
+        Posterior of the final model; without it the parameters have no mean and no interval.
+    about : mapping
+        ``campaign``, ``model``, ``drive``, ``seed`` and other keys for the top level.
+
+    Returns
+    -------
+    dict
+        Checked against the schema.
+    """
+    final = loop.final
+    summary = {
+        **about,
+        "rounds": [_round(item) for item in loop.rounds],
+        "effects": list(loop.effects),
+        "parameters": _parameters(final, samples),
+        "error_before": loop.first.by_role,
+        "error_after": final.by_role,
+        "verdict": loop.verdict,
+        "hold_out": loop.roles.description,
+        "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
+        "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
+        "notes": [*loop.notes, *_input_noise_notes(final), *_sampler_notes(samples)],
+    }
+    clean = _finite(summary)
+    schema.validate_summary(clean)
+    return clean
+
+
+def _round(item: Round) -> dict[str, Any]:
+    return {
+        "error": item.before.errors.by_run(),
+        "candidates": [_candidate(ranked) for ranked in item.ranking],
+        "accepted": item.accepted.effect if item.accepted else None,
+        "reason": item.reason,
+    }
+
+
+def _candidate(ranked: Ranked) -> dict[str, Any]:
+    score, candidate = ranked.score, ranked.score.option.candidate
+    expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    return {
+        "effect": candidate.effect,
+        "target": candidate.target,
+        "family": candidate.family,
+        "gain": ranked.gain,
+        "p_value": ranked.p_value,
+        "expected": expected | {name: float(value) for name, value in score.shapes.items()},
+        "indistinguishable_from": [name for name in ranked.same if name != candidate.effect],
+    }
+
+
+def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, Any]]:
+    fit, table = state.fit, {}
+    for k, name in enumerate(fit.problem.names):
+        owner = fit.predictor.layout.parameters[fit.predictor.layout.names.index(name)]
+        entry: dict[str, Any] = {
+            "estimate": float(fit.point.theta[k]),
+            "mean": None,
+            "sd": float(fit.point.sd[k]),
+            "interval": None,
+            "unit": fit.model.parameters[owner].unit,
+        }
+        if samples is not None:
+            draws = samples.draws[:, :, samples.names.index(name)]
+            low, high = np.quantile(draws, [0.025, 0.975])
+            entry |= {"mean": float(draws.mean()), "sd": float(draws.std()), "interval": [float(low), float(high)]}
+        table[name] = entry
+    return table
+
+
+def _input_noise_notes(state: State) -> list[str]:
+    """Say where the noise of the input, sent through the model, is the larger part of the noise floor."""
+    notes = []
+    for output in state.errors.outputs:
+        entries = [e for e in state.errors.entries if e.output == output and e.input_noise > e.average.noise]
+        if entries:
+            worst = max(entries, key=lambda e: e.input_noise / e.average.noise)
+            notes.append(
+                f"input noise dominates the noise of {output} in {len(entries)} runs: in run {worst.run} it is"
+                f" {worst.input_noise / worst.average.noise:.1f} times the output's own"
+            )
+    return notes
+
+
+def _sampler_notes(samples: Samples | None) -> list[str]:
+    return [f"sampler: {samples.warning}"] if samples is not None and samples.warning else []
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON has no words for by None."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,404 @@
+"""From a campaign folder and a model to results: the verbs that the command line and scripts call."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import schema
+from bayesoleo.data import Campaign, ReducedCampaign, load_campaign, reduce_campaign
+from bayesoleo.effects import Effect
+from bayesoleo.errors import InputError
+from bayesoleo.model import Model, driven_by, possible_drives
+from bayesoleo.posterior import LogDensity, Samples, laplace_mixture
+from bayesoleo.posterior import sample as draw_samples
+from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.report import write_report
+from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.storage import provenance, write_text_atomic, write_tree
+from bayesoleo.systems import equations, equations_latex
+from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.fit import Fit, Numerics, first_steps, fit_model
+from bayesoleo.tracing.loop import ClosedLoop, close_loop
+from bayesoleo.tracing.result import loop_groups, point_group, posterior_groups, records_tree
+from bayesoleo.tracing.roles import Roles, assign
+from bayesoleo.tracing.summary import summarise
+
+Say = Callable[[str], None]
+Source = str | os.PathLike[str] | Campaign | ReducedCampaign
+
+RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run of the workflow depends on besides data and model.
+
+    Parameters
+    ----------
+    seed : int
+        Everything random follows from it.
+    jobs : int, optional
+        Threads; by default all cores. Results do not depend on it.
+    quick : bool
+        Draw enough for two-digit intervals only.
+    effective_size : int
+        Effective draws asked of the sampler.
+    scheme : str
+        Discretisation: ``radau3`` …, or ``thesis``.
+    steps : int, optional
+        Steps of the mesh in a period; by default refined until the estimate no longer moves.
+    max_effects : int
+        Effects added at most.
+    drive : str, optional
+        Channel that drives the model; ``"model"`` keeps the model's own inputs. By default the channel that the rig controls, if the model can
+        be driven by it.
+    effects : tuple of Effect, optional
+        Instead of the catalogue.
+    command : str
+        Kept in the result.
+    """
+
+    seed: int = 0
+    jobs: int | None = None
+    quick: bool = False
+    effective_size: int = 1000
+    scheme: str = DEFAULT_SCHEME
+    steps: int | None = None
+    max_effects: int = 4
+    drive: str | None = None
+    effects: tuple[Effect, ...] | None = None
+    command: str = ""
+
+    @property
+    def numerics(self) -> Numerics:
+        """How models are solved."""
+        return Numerics(self.scheme, self.steps, self.jobs)
+
+
+def _silent(_: str) -> None:
+    """Say nothing."""
+
+
+def reduce(campaign: Source, *, jobs: int | None = None, progress: bool = False) -> ReducedCampaign:
+    """Load a campaign and reduce its runs to records.
+
+    Parameters
+    ----------
+    campaign : path-like, Campaign or ReducedCampaign
+        Folder with ``campaign.toml``, or what was loaded from one.
+    jobs : int, optional
+        Threads.
+    progress : bool
+        Whether to show a bar.
+
+    Raises
+    ------
+    CampaignError
+        If anything in it cannot be used.
+    """
+    if isinstance(campaign, ReducedCampaign):
+        return campaign
+    loaded = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    return reduce_campaign(loaded, jobs=jobs, progress=progress)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A campaign and a model, ready for work.
+
+    Parameters
+    ----------
+    reduced : ReducedCampaign
+    roles : Roles
+    assembly : Assembly
+        The declared model with its drive.
+    settings : Settings
+    """
+
+    reduced: ReducedCampaign
+    roles: Roles
+    assembly: Assembly
+    settings: Settings
+
+    @property
+    def campaign(self) -> Campaign:
+        """As loaded."""
+        return self.reduced.campaign
+
+    def about(self) -> dict[str, Any]:
+        """Top-level keys of the summary."""
+        return {
+            "format": schema.FORMAT,
+            "campaign": self.campaign.name,
+            "model": self.assembly.native.name,
+            "drive": self.assembly.drive or ", ".join(self.assembly.native.inputs),
+            "seed": self.settings.seed,
+        }
+
+
+def prepare(campaign: Source, model: Model, settings: Settings, *, progress: bool = False) -> Task:
+    """Bring a campaign and a model together, and find out early what does not fit.
+
+    Raises
+    ------
+    InputError
+        If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
+    """
+    reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
+    drive = choose_drive(model, reduced.campaign, settings.drive)
+    roles = assign(reduced.records)
+    assembly = Assembly(model, drive)
+    driven = assembly.model()
+    # Building a predictor of one step checks channels, conditions and priors of every run without solving anything.
+    predictor = Predictor(driven, reduced.records, steps=8, backend="numpy", jobs=1)
+    predictor.layout.priors(driven)
+    return Task(reduced, roles, assembly, settings)
+
+
+def choose_drive(model: Model, campaign: Campaign, wanted: str | None) -> str | None:
+    """The channel that is to drive a model; ``None`` for its own inputs."""
+    if wanted == "model":
+        return None
+    if wanted is not None:
+        driven_by(model, wanted)
+        return None if wanted in model.inputs else wanted
+    controlled = campaign.controlled
+    if controlled is None or controlled in model.inputs or controlled not in possible_drives(model):
+        return None
+    return controlled
+
+
+def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:  # noqa: B008 - frozen
+    """Say what would be done; write nothing.
+
+    Returns
+    -------
+    dict
+        Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh and number of candidate effects.
+    """
+    from bayesoleo.effects import catalogue
+
+    task = prepare(campaign, model, settings)
+    driven = task.assembly.model()
+    predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
+    return {
+        **task.about(),
+        "inputs": list(driven.inputs),
+        "outputs": list(driven.outputs),
+        "fit": [record.label for record in task.roles.fitted],
+        "hold_out": [record.label for record in task.roles.held_out],
+        "strategy": task.roles.description,
+        "unknowns": list(predictor.layout.names),
+        "possible_drives": list(possible_drives(model)),
+        "steps": settings.steps or first_steps(driven, task.roles.fitted),
+        "effects": len(catalogue() if settings.effects is None else settings.effects),
+    }
+
+
+def estimate(
+    campaign: Source, model: Model, settings: Settings = Settings(), *, out: Path | None = None, say: Say = _silent  # noqa: B008
+) -> xr.DataTree:
+    """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    out : Path, optional
+        Folder for ``results.nc``.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the groups of the records and ``point``.
+    """
+    task = prepare(campaign, model, settings)
+    fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
+    return _finish(task, {schema.POINT: point_group(fit)}, fit, out)
+
+
+def sample(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    out: Path | None = None,
+    say: Say = _silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Estimate, then sample the posterior from there with emcee.
+
+    Parameters are those of :func:`close`; the tree has the groups of the records, the point and the posterior.
+    """
+    task = prepare(campaign, model, settings)
+    fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
+    samples = _sample(task, fit, out, say, progress)
+    groups = {schema.POINT: point_group(fit), **posterior_groups(fit, samples, settings.seed)}
+    return _finish(task, groups, fit, out)
+
+
+def trace(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    out: Path | None = None,
+    say: Say = _silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Hold a fitted model's residual against the noise and rank what might be missing; add nothing.
+
+    Parameters are those of :func:`close`.
+    """
+    task = prepare(campaign, model, settings, progress=progress)
+    loop = _loop(task, 0, say)
+    return _result(task, loop, None, out, say)
+
+
+def close(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    out: Path | None = None,
+    say: Say = _silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before and after.
+
+    Parameters
+    ----------
+    campaign : path-like, Campaign or ReducedCampaign
+        What was measured.
+    model : Model
+        In its own drive.
+    settings : Settings
+        Seed, threads, drive and so on.
+    out : Path, optional
+        Folder for ``results.nc``, ``report.html``, ``summary.json`` and the sampler's checkpoints, from which a run that was stopped goes on.
+    say : callable
+        Told what is being done.
+    progress : bool
+        Whether to show bars.
+
+    Returns
+    -------
+    xarray.DataTree
+        The result; its root attribute ``summary`` is the JSON of the summary.
+
+    Raises
+    ------
+    InputError
+        If campaign, model and settings do not fit together.
+    """
+    task = prepare(campaign, model, settings, progress=progress)
+    loop = _loop(task, settings.max_effects, say)
+    say("sample the posterior")
+    samples = _sample(task, loop.final.fit, out, say, progress)
+    return _result(task, loop, samples, out, say)
+
+
+def _loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
+    settings = task.settings
+    return close_loop(
+        task.assembly,
+        task.roles,
+        settings.numerics,
+        effects=settings.effects,
+        seed=settings.seed,
+        max_effects=max_effects,
+        say=say,
+    )
+
+
+def _sample(task: Task, fit: Fit, out: Path | None, say: Say, progress: bool) -> Samples:
+    settings = task.settings
+    fit.problem.freeze(fit.point.theta)
+    density = LogDensity(fit.problem, settings.jobs)
+    start = laplace_mixture(density, np.stack([fit.point.theta]))
+    fingerprint = hashlib.sha256(
+        json.dumps([task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]).encode()
+    ).hexdigest()
+    return draw_samples(
+        density,
+        start,
+        effective_size=settings.effective_size,
+        seed=settings.seed,
+        out=None if out is None else out / "checkpoints" / fingerprint[:16],
+        fingerprint=fingerprint,
+        progress=progress,
+        quick=settings.quick,
+    )
+
+
+def _result(task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | None, say: Say) -> xr.DataTree:
+    seed, fit = task.settings.seed, loop.final.fit
+    files = {} if out is None else {name: str(out / name) for name in (RESULTS, REPORT, SUMMARY)}
+    summary = summarise(loop, samples, {**task.about(), "files": files})
+    groups = {schema.POINT: point_group(fit), **loop_groups(loop, samples, seed)}
+    if samples is not None:
+        groups |= posterior_groups(fit, samples, seed)
+    tree = _finish(task, groups, fit, None, summary=summary)
+    if out is not None:
+        say("write results and report")
+        out.mkdir(parents=True, exist_ok=True)
+        write_tree(tree, out / RESULTS)
+        write_report(tree, out / REPORT)
+        write_text_atomic(out / SUMMARY, schema.summary_json(summary))
+    return tree
+
+
+def _finish(
+    task: Task, groups: Mapping[str, xr.Dataset], fit: Fit, out: Path | None, summary: Mapping[str, Any] | None = None
+) -> xr.DataTree:
+    """One tree with provenance; written if a folder is given."""
+    roles = task.roles
+    runs = {record.label: record for record in (*roles.fitted, *roles.held_out)}
+    tree = xr.DataTree.from_dict({**records_tree(list(runs.values()), task.campaign), **groups})
+    more: dict[str, Any] = {
+        schema.CAMPAIGN: task.campaign.name,
+        schema.CAMPAIGN_DESCRIPTION: task.campaign.description,
+        schema.CAMPAIGN_SHA256: task.campaign.sha256,
+        schema.MODEL: task.assembly.native.name,
+        schema.DRIVE: task.about()["drive"],
+        schema.EQUATIONS: "\n".join(f"{name}: {text}" for name, text in equations(fit.model).items()),
+        schema.EQUATIONS_LATEX: list(equations_latex(fit.model)),
+        schema.COMMAND: task.settings.command,
+    }
+    if summary is not None:
+        more |= {
+            schema.EFFECTS: list(summary["effects"]),
+            schema.VERDICT: summary["verdict"],
+            schema.SUMMARY: schema.summary_json(dict(summary)),
+        }
+    tree.attrs.update(provenance(task.settings.seed, **more))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_tree(tree, out / RESULTS)
+    return tree
+
+
+def check_writable(out: Path) -> None:
+    """Find out before any work whether a folder can be written.
+
+    Raises
+    ------
+    InputError
+        If it cannot.
+    """
+    existing = out
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError("the output folder cannot be written", file=out, hint="choose another with --out")
