@@ -61,14 +61,15 @@ def _extrapolate(x, x_p, change, start):
 
 @numba.njit(nogil=True, cache=True)
 def _compare(measured, y, a, lanes, squares, inside):
-    """Sums of squared residuals ``(L, ny)`` of the chosen lanes, and whether all conditions ``a`` are positive there."""
+    """Sums of squared residuals ``(L, ny)`` of the chosen lanes, and whether no condition ``a`` is broken there."""
+    defined = np.ones(inside.size, dtype=np.bool_)
+    positive(a, lanes, inside, defined)
     for lane in lanes:
         for output in range(y.shape[1]):
             row = measured[output] - y[lane, output]
             for i in range(row.size):
                 row[i] *= row[i]
-            squares[lane, output] = total(row)
-    positive(a, lanes, inside)
+            squares[lane, output] = total(row) if defined[lane] else np.nan
 
 
 @dataclass(frozen=True)
@@ -306,7 +307,7 @@ class RunPredictor:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
                 self.kernels.admissible(z, self.sample_inputs, p, lanes, a)
-            inside = (a[lanes] > 0).all(axis=(1, 2))
-            status[lanes[~inside]] = Status.INADMISSIBLE.value
+            status[lanes[np.isnan(a[lanes]).any(axis=(1, 2))]] = Status.NOT_FINITE.value
+            status[lanes[(a[lanes] <= 0).any(axis=(1, 2))]] = Status.INADMISSIBLE.value
         y[status != Status.CONVERGED.value] = np.nan
         return status

@@ -47,14 +47,16 @@ def measure(z, g, gz, lanes, squares, terms):
 
 
 @jit
-def positive(a, lanes, inside):
-    """Whether all conditions ``a (L, nc, N)`` are positive: ``inside (L,)``."""
+def positive(a, lanes, inside, defined):
+    """Whether no condition ``a (L, nc, N)`` is broken, ``inside (L,)``, and whether all are numbers, ``defined (L,)``."""
     for lane in lanes:
-        outside = 0
+        outside = odd = 0
         for k in range(a.shape[1]):
             for i in range(a.shape[2]):
-                outside += not (a[lane, k, i] > 0.0)
+                outside += a[lane, k, i] <= 0.0
+                odd += a[lane, k, i] != a[lane, k, i]
         inside[lane] = outside == 0
+        defined[lane] = odd == 0
 
 
 @jit
@@ -67,7 +69,7 @@ def step_size(x, dx, lanes, state_size, size):
             for j in range(w):
                 spoilt += dx[lane, m, j, 0] * 0.0
         size[lane] = spoilt
-        for j in range(state_size):
+        for j in range(min(state_size, w)):
             largest, change = 1e-300, 0.0
             for m in range(n):
                 largest = max(largest, abs(x[lane, m, j]))

@@ -155,7 +155,7 @@ class _Newton:
         self.gz = np.empty((lanes, d, nz, points))
         self.a = np.empty((lanes, problem.conditions, points))
         self.squares, self.terms = np.empty((lanes, d)), np.empty((lanes, d))
-        self.inside = np.ones(lanes, dtype=np.bool_)
+        self.inside, self.defined = np.ones(lanes, dtype=np.bool_), np.ones(lanes, dtype=np.bool_)
         self.status = np.full(lanes, Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(lanes, dtype=np.int64)
         self.merit = np.full(lanes, np.inf)
@@ -191,9 +191,9 @@ class _Newton:
             equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
             if self.problem.conditions:
                 equations.admissible(self.z, u, self.p, lanes, self.a)
-        measures.positive(self.a, lanes, self.inside)
+        measures.positive(self.a, lanes, self.inside, self.defined)
         measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
-        return self.inside[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
+        return self.inside[lanes] & self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
 
     def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
         """Whether the residual fell, in units of the equations' terms: the larger of those before and after.

@@ -17,7 +17,8 @@ def scheme(name: str, orders: tuple[int, ...]) -> Scheme:
     Parameters
     ----------
     name : str
-        ``radau2``, ``radau3``, ``gauss2``, ``gauss3``, or ``thesis`` for second-order backward differences.
+        ``radau2``, ``radau3``, ``gauss2``, ``gauss3``, or ``thesis`` for second-order backward differences. Gauss points do not
+        damp what is infinitely stiff: not for a dof ruled by an algebraic equation (a drive through a compliance of zero).
     orders : tuple of int
         Order of each dof.
 

@@ -13,11 +13,16 @@ import numpy as np
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
+#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of what cancels.
+ROUND_OFF = 1e-12
+
+
 @jit
-def eliminate(matrix, right):
+def eliminate(matrix, right, least):
     """Solve ``matrix @ x = right`` in place by elimination with row scaling and partial pivoting.
 
-    ``matrix (m, m)`` is destroyed, ``right (m, k)`` becomes the solution. Returns False where a pivot vanishes or is not finite.
+    ``matrix (m, m)`` is destroyed, ``right (m, k)`` becomes the solution. Returns False where a pivot is not above ``least``, over the
+    largest entry of its row, or not finite.
     """
     m, k = right.shape
     for i in range(m):
@@ -36,7 +41,7 @@ def eliminate(matrix, right):
         for i in range(column + 1, m):
             if abs(matrix[i, column]) > abs(matrix[pivot, column]):
                 pivot = i
-        if not (abs(matrix[pivot, column]) > 1e-300):
+        if not (abs(matrix[pivot, column]) > least):
             return False
         if pivot != column:
             for j in range(m):
@@ -114,7 +119,7 @@ def eliminate_each(work, count, m):
                 matrix[i, j] = work[i, j, t]
             for j in range(m, width):
                 right[i, j - m] = work[i, j, t]
-        if not eliminate(matrix, right):
+        if not eliminate(matrix, right, 1e-300):
             return False
         for i in range(m):
             for j in range(m, width):
@@ -150,9 +155,15 @@ def close_and_sweep(transfer, monodromy, states, initial):
             closure[i, j] = (1.0 if i == j else 0.0) - product[i, j]
     if not initial:
         for i in range(D):
+            largest, size = 0.0, 1.0
+            for j in range(D):
+                largest = max(largest, abs(closure[i, j]))
+                size += abs(monodromy[i, j])
+            if not (largest > ROUND_OFF * size):
+                return False
             for j in range(k):
                 state[i, j] = product[i, D + j]
-        if not eliminate(closure, state):
+        if not eliminate(closure, state, ROUND_OFF):
             return False
     for i in range(D):
         for j in range(k):

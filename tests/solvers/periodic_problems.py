@@ -131,5 +131,3 @@ def rest(boundary: Boundary, n: int, value: float = 0.0) -> np.ndarray:
     start = np.zeros((1, n, boundary.scheme.width))
     start[:, :, 0] = value
     return start
-
-

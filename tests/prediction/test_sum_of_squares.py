@@ -1,0 +1,94 @@
+"""The misfit of a vector depends on that vector alone, bit for bit."""
+
+import numpy as np
+import pytest
+from synthetic_runs import answered, oleo_runs
+
+from bayesoleo.model.drive import driven_by
+from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.solvers.status import Status, count
+from bayesoleo.systems.oleo import thermomechanical_oleo
+
+STEPS = 64
+
+
+@pytest.fixture(scope="module")
+def model():
+    return driven_by(thermomechanical_oleo(2), "displacement")
+
+
+@pytest.fixture(scope="module")
+def predictor(model):
+    records = answered(model, oleo_runs(), noise=0.01, steps=STEPS)
+    predictor = Predictor(model, records, steps=STEPS)
+    statuses = predictor.set_anchor(predictor.layout.start(model))
+    assert set(statuses) == {Status.CONVERGED}
+    return predictor
+
+
+@pytest.fixture(scope="module")
+def vectors(model, predictor):
+    start = predictor.layout.start(model)
+    theta = start * (1 + 0.01 * np.random.default_rng(3).standard_normal((37, start.size)))
+    volume = predictor.layout.names.index("initial_volume")
+    theta[5, volume] *= 0.5  # the piston would leave the gas no volume
+    theta[11] = np.nan
+    return theta
+
+
+@pytest.fixture(scope="module")
+def whole(predictor, vectors):
+    return predictor.sum_of_squares(vectors)
+
+
+def test_failures_are_counted_and_have_no_sums(whole):
+    squares, status = whole
+    assert squares.shape == (37, 5, 2)
+    assert count(status)["converged"] == 35
+    assert Status(status[5]) is not Status.CONVERGED
+    assert Status(status[11]) is Status.NOT_FINITE
+    assert np.isnan(squares[[5, 11]]).all()
+    assert np.isfinite(np.delete(squares, [5, 11], axis=0)).all()
+
+
+@pytest.mark.parametrize("size", [1, 3, 16, 17, 36])
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+def test_batch_split_and_threads_change_nothing(predictor, vectors, whole, size, jobs):
+    predictor.jobs = jobs
+    parts = [predictor.sum_of_squares(vectors[k : k + size]) for k in range(0, 37, size)]
+    assert np.concatenate([squares for squares, _ in parts]).tobytes() == whole[0].tobytes()
+    np.testing.assert_array_equal(np.concatenate([status for _, status in parts]), whole[1])
+
+
+def test_row_position_changes_nothing(predictor, vectors, whole):
+    order = np.random.default_rng(8).permutation(37)
+    squares, status = predictor.sum_of_squares(vectors[order])
+    assert squares.tobytes() == whole[0][order].tobytes()
+    np.testing.assert_array_equal(status, whole[1][order])
+
+
+def test_sums_are_those_of_the_predicted_outputs(predictor, vectors, whole):
+    for r, run in enumerate(predictor.runs):
+        samples = predictor.simulate(vectors[:4], r)
+        expected = np.sum((run.measured - samples.y) ** 2, axis=2)
+        # The same numbers summed in another order.
+        np.testing.assert_allclose(whole[0][:4, r], expected, rtol=1e-12)
+
+
+def test_back_ends_agree_to_round_off(model):
+    records = oleo_runs()[1:3]
+    squares = []
+    for backend in ("numpy", "numba"):
+        predictor = Predictor(model, records, steps=STEPS, backend=backend)
+        theta = predictor.layout.start(model)
+        predictor.set_anchor(theta)
+        squares.append(predictor.sum_of_squares(theta[None] * 1.001)[0])
+    # Round-off of 1e-15 in outputs, in sums of squares of the outputs themselves.
+    np.testing.assert_allclose(squares[0], squares[1], rtol=1e-11)
+
+
+def test_without_an_anchor_nothing_converges(model, predictor):
+    fresh = Predictor(model, predictor.records[:1], steps=STEPS)
+    squares, status = fresh.sum_of_squares(fresh.layout.start(model)[None])
+    assert Status(status[0]) is Status.NO_CONVERGENCE
+    assert np.isnan(squares).all()

@@ -1,0 +1,80 @@
+"""Derivatives with respect to parameters are exact, through ``|v|`` and steep friction too."""
+
+import mpmath
+import numpy as np
+import pytest
+from periodic_problems import coupled, duffing, friction_oscillator, harmonics, problem, rest
+
+from bayesoleo.solvers.periodic import sensitivities, solve_periodic
+from bayesoleo.solvers.status import Status
+
+FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
+FREQUENCY = 0.2
+
+
+@pytest.mark.parametrize("name", ["radau2", "radau3", "gauss2", "gauss3", "thesis"])
+@pytest.mark.parametrize(
+    "model", [duffing(quadratic=0.4), friction_oscillator(), coupled()], ids=lambda m: m.name
+)
+def test_against_differences_of_solutions(model, name):
+    n, step = 48, 1e-5
+    boundary, p = problem(model, FORCE, FREQUENCY, name, n)
+    solution = solve_periodic(boundary, p, rest(boundary, n))
+    solution, x_p, _ = sensitivities(boundary, p, solution)
+    assert solution.status[0] == Status.CONVERGED
+    for k in range(boundary.active):
+        ends = []
+        for sign in (1, -1):
+            moved = p.copy()
+            moved[0, k] += sign * step
+            ends.append(solve_periodic(boundary, moved, solution.x).x[0])
+        difference = (ends[0] - ends[1]) / (2 * step)
+        # Differences err by step**2 times a third derivative, and by 1e-14 / step of round-off;
+        # where a point sits within a step of the kink of |v|, by the step itself.
+        np.testing.assert_allclose(x_p[0, ..., k], difference, atol=2e-6 * np.abs(difference).max())
+
+
+def test_against_high_precision_differences():
+    """The thesis's scheme written again with 40 digits: what is left is the package's round-off."""
+    n, model = 8, friction_oscillator()
+    boundary, p = problem(model, FORCE, FREQUENCY, "thesis", n)
+    solution = solve_periodic(boundary, p, rest(boundary, n))
+    _, x_p, _ = sensitivities(boundary, p, solution)
+    step = mpmath.mpf(1) / (n * mpmath.mpf(FREQUENCY))
+    force = [mpmath.mpf(float(value)) for value in boundary.inputs[0]]
+
+    def residual(parameters):
+        damping, quadratic, stiffness, amplitude, slope = parameters
+
+        def equations(*q):
+            values = []
+            for m in range(n):
+                v = (3 * q[m] - 4 * q[m - 1] + q[m - 2]) / (2 * step)
+                a = (2 * q[m] - 5 * q[m - 1] + 4 * q[m - 2] - q[m - 3]) / step**2
+                friction = amplitude * mpmath.atan(slope * v) + quadratic * v * abs(v)
+                offset = mpmath.mpf(0.1) - force[m]
+                values.append(a + damping * v + stiffness * q[m] + friction + offset)
+            return values
+
+        return equations
+
+    with mpmath.workdps(40):
+        nominal = [mpmath.mpf(float(value)) for value in p[0, :5]]
+        start = [mpmath.mpf(float(value)) for value in solution.x[0, :, 0]]
+        small = mpmath.mpf(10) ** -12
+        for k in range(5):
+            ends = []
+            for sign in (1, -1):
+                moved = list(nominal)
+                moved[k] += sign * small
+                ends.append(mpmath.findroot(residual(moved), start, tol=1e-50, maxsteps=60))
+            exact = np.array([float((a - b) / (2 * small)) for a, b in zip(*ends, strict=True)])
+            np.testing.assert_allclose(x_p[0, :, 0, k], exact, atol=1e-12 * np.abs(exact).max())
+
+
+def test_failed_solutions_have_no_sensitivities():
+    boundary, p = problem(duffing(), FORCE, FREQUENCY)
+    solution = solve_periodic(boundary, p, rest(boundary, 64), max_iterations=1)
+    judged, x_p, _ = sensitivities(boundary, p, solution)
+    assert judged.status[0] == Status.NO_CONVERGENCE
+    assert not x_p.any()
