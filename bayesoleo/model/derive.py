@@ -1,4 +1,4 @@
-"""Residuals and partial derivatives of a declared model, by computer algebra as in Verbeek (1993), section 4.3."""
+"""Residuals and partial derivatives of a model, by computer algebra (Verbeek 1993, section 4.3)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class Derived:
     states : tuple of sympy.Symbol
         For each dof its value and derivatives up to its order.
     inputs : tuple of (str, int)
-        Input name and order of derivative of every row that occurs; ``("time", 0)`` is the time itself.
+        Input name and order of derivative of every row that occurs; ``("time", 0)`` is the time
+        itself.
     constants : tuple of str
         Parameters, then conditions.
     active : tuple of str
@@ -81,12 +82,18 @@ def derive(model: Model, active: Sequence[str] | None = None) -> Derived:
     output = tuple(model.output(name) for name in model.outputs)
     admissible = tuple(model.expand(expression) for expression in model.admissible)
     if any(expression.has(TIME) for expression in residual):
-        raise ModelError(f"model {model.name!r}: an equation depends on time", hint="use time in outputs only")
+        raise ModelError(
+            f"model {model.name!r}: an equation depends on time", hint="use time in outputs only"
+        )
     states = tuple(
-        derivative_symbol(dof, k) for dof, order in zip(model.dofs, orders, strict=True) for k in range(order + 1)
+        derivative_symbol(dof, k)
+        for dof, order in zip(model.dofs, orders, strict=True)
+        for k in range(order + 1)
     )
     occurring = {item for e in (*residual, *output, *admissible) for item in e.free_symbols}
-    rows = sorted(split_derivative(item) for item in occurring if split_derivative(item)[0] in model.inputs)
+    rows = sorted(
+        split_derivative(item) for item in occurring if split_derivative(item)[0] in model.inputs
+    )
     if TIME in occurring:
         rows.append(("time", 0))
     return Derived(

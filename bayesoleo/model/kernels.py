@@ -1,8 +1,10 @@
 """Functions that evaluate a model at a block of points for many parameter vectors.
 
-All arrays have the points last, so that a loop over points runs through memory: states ``z (L, nz, N)``, inputs ``u (nu, N)`` shared by
-the lanes of a call, constants ``p (L, np)``. ``lanes`` lists which of the ``L`` parameter vectors to evaluate. The same generated source
-serves two back ends: NumPy (ready at once; for models evaluated a few times) and Numba (compiled, cached on disk by the source's hash).
+All arrays have the points last, so that a loop over points runs through memory: states ``z (L, nz,
+N)``, inputs ``u (nu, N)`` shared by the lanes of a call, constants ``p (L, np)``. ``lanes`` lists
+which of the ``L`` parameter vectors to evaluate. The same generated source serves two back ends:
+NumPy (ready at once; for models evaluated a few times) and Numba (compiled, cached on disk by the
+source's hash).
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ class Kernels:
     admissible : callable
         ``(z, u, p, lanes, a)`` with ``a (L, nc, N)``, positive inside the admissible region.
     inputs : callable
-        ``(z, u, p, lanes, gu)`` with ``gu (L, d, nu, N)``: how the equations depend on the input rows.
+        ``(z, u, p, lanes, gu)`` with ``gu (L, d, nu, N)``: how the equations depend on the input
+        rows.
     output_inputs : callable
         ``(z, u, p, lanes, yu)`` with ``yu (L, ny, nu, N)``.
     source : str
@@ -132,7 +135,9 @@ def generate(derived: Derived, backend: str) -> str:
     g, y = derived.residual, derived.output
     gz, gp = derived.gradient(g, states), derived.gradient(g, active)
     yz, yp = derived.gradient(y, states), derived.gradient(y, active)
-    rows = [TIME if name == "time" else derivative_symbol(name, order) for name, order in derived.inputs]
+    rows = [
+        TIME if name == "time" else derivative_symbol(name, order) for name, order in derived.inputs
+    ]
     gu, yu = derived.gradient(g, rows), derived.gradient(y, rows)
     nz, na, nu = len(states), len(active), len(rows)
     targets = {
@@ -147,14 +152,21 @@ def generate(derived: Derived, backend: str) -> str:
     }
     head = ["import numpy as np"]
     if backend == "numba":
-        head += ["import numba", "jit = numba.njit(nogil=True, cache=True, error_model='numpy')", ARCTAN]
-    parts = [_function(name, outs, items, derived, backend) for name, (outs, items) in targets.items()]
+        head += [
+            "import numba",
+            "jit = numba.njit(nogil=True, cache=True, error_model='numpy')",
+            ARCTAN,
+        ]
+    parts = [
+        _function(name, outs, items, derived, backend) for name, (outs, items) in targets.items()
+    ]
     return "\n".join(head) + "\n\n\n" + "\n\n\n".join(parts) + "\n"
 
 
-#: Rational arctangent after Moshier (Cephes), good to 2e-16, without branches and calls, so that loops over points become vector
-#: instructions: 20 times faster than the library's. In every kernel's source, so that the hash it is cached under covers it.
-ARCTAN = '''
+#: Rational arctangent after Moshier (Cephes), good to 2e-16, without branches and calls, so that
+#: loops over points become vector instructions: 20 times faster than the library's. In every
+#: kernel's source, so that the hash it is cached under covers it.
+ARCTAN = """
 
 @jit
 def arctan(x):
@@ -172,7 +184,7 @@ def arctan(x):
     bottom = ((s + 2.485846490142306e1) * s + 1.650270098316988e2) * s + 4.328810604912903e2
     bottom = (bottom * s + 4.853903996359137e2) * s + 1.945506571482614e2
     value = base + (t + (t * (s * top / bottom) + rest))
-    return -value if x < 0.0 else value'''
+    return -value if x < 0.0 else value"""
 
 
 Item = tuple[str, sp.Expr]
@@ -183,16 +195,21 @@ def _vector(name: str, expressions: Sequence[sp.Expr]) -> list[Item]:
 
 
 def _matrix(name: str, expressions: Sequence[sp.Expr], columns: int) -> list[Item]:
-    return [(f"{name}[l, {k // columns}, {k % columns}, {{i}}]", e) for k, e in enumerate(expressions)]
+    return [
+        (f"{name}[l, {k // columns}, {k % columns}, {{i}}]", e) for k, e in enumerate(expressions)
+    ]
 
 
-#: Results that one compiled loop stores: with more of them the compiler gives up on proving that they do not overlap, and with it on
-#: vector instructions; computing a shared arctangent twice costs less.
+#: Results that one compiled loop stores: with more of them the compiler gives up on proving that
+#: they do not overlap, and with it on vector instructions; computing a shared arctangent twice
+#: costs less.
 STORES = 6
 
 
-def _function(name: str, outs: Sequence[str], items: Sequence[Item], derived: Derived, backend: str) -> str:
-    """One kernel: lanes outside, points inside (loops of a few results each for Numba, whole rows for NumPy)."""
+def _function(
+    name: str, outs: Sequence[str], items: Sequence[Item], derived: Derived, backend: str
+) -> str:
+    """One kernel: lanes outside, points inside: loops of a few results (Numba) or rows (NumPy)."""
     lines = ["@jit"] if backend == "numba" else []
     lines += [f"def {name}(z, u, p, lanes, {', '.join(outs)}):", "    for l in lanes:"]
     if not items:
@@ -204,23 +221,35 @@ def _function(name: str, outs: Sequence[str], items: Sequence[Item], derived: De
         names, loads_constant, loads_point = _names(derived, [e for _, e in part])
         constants = {symbol(c) for c in derived.constants if symbol(c) in names}
         outside, inside, results = code([e for _, e in part], names, constants)
-        body = loads_point + inside + [f"{target} = {result}" for (target, _), result in zip(part, results, strict=True)]
+        body = (
+            loads_point
+            + inside
+            + [f"{target} = {result}" for (target, _), result in zip(part, results, strict=True)]
+        )
         lines += ["        " + line for line in loads_constant + outside]
         if backend == "numpy":
             lines += ["        " + line.format(i=":") for line in body]
         else:
             lines.append(f"        for i in range({outs[0]}.shape[-1]):")
-            lines += ["            " + line.format(i="i").replace("np.arctan(", "arctan(") for line in body]
+            lines += [
+                "            " + line.format(i="i").replace("np.arctan(", "arctan(")
+                for line in body
+            ]
     return "\n".join(lines)
 
 
 def _calls_library(expressions: Sequence[sp.Expr]) -> bool:
-    """Whether there are calls that no vector instruction replaces: computing them once then matters more than the split."""
+    """Whether calls occur that no vector instruction replaces; once is then better than split."""
     functions = (sp.exp, sp.log, sp.sin, sp.cos, sp.tan, sp.tanh)
-    return any(e.has(*functions) or any(not power.exp.is_Rational for power in e.atoms(sp.Pow)) for e in expressions)
+    return any(
+        e.has(*functions) or any(not power.exp.is_Rational for power in e.atoms(sp.Pow))
+        for e in expressions
+    )
 
 
-def _names(derived: Derived, expressions: Sequence[sp.Expr]) -> tuple[dict[sp.Symbol, str], list[str], list[str]]:
+def _names(
+    derived: Derived, expressions: Sequence[sp.Expr]
+) -> tuple[dict[sp.Symbol, str], list[str], list[str]]:
     """Code names of the symbols that occur, with the lines that load them."""
     used = set().union(*(e.free_symbols for e in expressions)) if expressions else set()
     names: dict[sp.Symbol, str] = {}
@@ -241,7 +270,7 @@ def _names(derived: Derived, expressions: Sequence[sp.Expr]) -> tuple[dict[sp.Sy
 
 
 def _load(source: str, backend: str) -> ModuleType:
-    """Import generated source; Numba needs it as a file, which is also where its compiled code is cached."""
+    """Import generated source; Numba needs it as a file, beside which it keeps compiled code."""
     name = "bayesoleo_kernels_" + hashlib.sha256(source.encode()).hexdigest()[:24]
     if backend == "numpy":
         module = ModuleType(name)

@@ -1,4 +1,4 @@
-"""Print shared-subexpression code that runs on NumPy arrays and, inside a loop, on Numba scalars."""
+"""Print code with shared subexpressions for NumPy arrays and, in a loop, for Numba scalars."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 
 class _Printer(PythonCodePrinter):
-    """Prints NumPy functions, which Numba compiles for scalars too, and turns small powers into products."""
+    """Prints NumPy functions, which Numba compiles for scalars, and small powers as products."""
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
@@ -37,8 +37,8 @@ class _Printer(PythonCodePrinter):
     def _print_NumberSymbol(self, expr: sp.NumberSymbol) -> str:
         return repr(float(expr))
 
-    _print_Pi = _print_NumberSymbol
-    _print_Exp1 = _print_NumberSymbol
+    _print_Pi = _print_NumberSymbol  # noqa: N815 - the printer's own convention
+    _print_Exp1 = _print_NumberSymbol  # noqa: N815
 
     def _print_Heaviside(self, expr: sp.Heaviside) -> str:
         return f"(0.5 + 0.5*np.sign({self._print(expr.args[0])}))"
@@ -62,9 +62,8 @@ class _Printer(PythonCodePrinter):
         return self._extremum("minimum", expr.args)
 
 
-for _name, _target in {
-    "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "tan": "tan", "atan": "arctan", "tanh": "tanh"
-}.items():  # fmt: skip
+_CALLS = {name: name for name in ("exp", "log", "sin", "cos", "tan", "tanh")} | {"atan": "arctan"}
+for _name, _target in _CALLS.items():
 
     def _print_function(self: _Printer, expr: sp.Expr, target: str = _target) -> str:
         return f"np.{target}({self._print(expr.args[0])})"
@@ -95,7 +94,10 @@ def code(
     results : list of str
         One Python expression for each entry of ``expressions``.
     """
-    renamed = [expression.xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()}) for expression in expressions]
+    renamed = [
+        expression.xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()})
+        for expression in expressions
+    ]
     fixed = {sp.Symbol(names[item], real=True) for item in constant}
     counter = sp.numbered_symbols("w", real=True)
     shared, reduced = sp.cse(renamed, symbols=counter, order="none")

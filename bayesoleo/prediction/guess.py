@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from bayesoleo.model import Model
 from bayesoleo.model.derive import Derived
-from bayesoleo.model.expressions import derivative_symbol, parse, split_derivative, symbol, total_derivative
+from bayesoleo.model.expressions import (
+    derivative_symbol,
+    parse,
+    split_derivative,
+    symbol,
+    total_derivative,
+)
 from bayesoleo.prediction.inputs import harmonics_of
 from bayesoleo.prediction.records import Record
 
@@ -29,7 +35,7 @@ def guess_rows(
     phase: Array,
     motions: Mapping[str, Motion] | None = None,
 ) -> Array:
-    """Values and derivatives of every dof at phases, shape (nz, N); known motions come before guesses."""
+    """Values and derivatives of every dof, shape (nz, N): known motions before guesses."""
     rows: list[Array] = []
     for dof, order in zip(derived.dofs, derived.orders, strict=True):
         if motions is not None and dof in motions:
@@ -54,13 +60,19 @@ def _measured(model: Model, dof: str, record: Record) -> sp.Expr | None:
 
 def _declared(model: Model, dof: str) -> sp.Expr:
     known = {name: symbol(name) for name in (*model.parameters, *model.conditions, *model.inputs)}
-    return parse(model.dofs[dof].guess, known, model.inputs, f"model {model.name!r}, guess of {dof!r}")
+    return parse(
+        model.dofs[dof].guess, known, model.inputs, f"model {model.name!r}, guess of {dof!r}"
+    )
 
 
-def _evaluate(expression: sp.Expr, record: Record, constants: Mapping[str, float], phase: Array) -> Array:
+def _evaluate(
+    expression: sp.Expr, record: Record, constants: Mapping[str, float], phase: Array
+) -> Array:
     values = {symbol(name): value for name, value in constants.items()}
     total = np.zeros(phase.size)
-    moving = [item for item in expression.free_symbols if split_derivative(item)[0] in record.harmonics]
+    moving = [
+        item for item in expression.free_symbols if split_derivative(item)[0] in record.harmonics
+    ]
     columns = []
     for item in moving:
         channel, order = split_derivative(item)

@@ -1,7 +1,8 @@
 """How the noise of a run's inputs reaches its predicted outputs.
 
-The input's harmonics are known with a variance each. What their errors do to the prediction repeats in every period, so the scatter between
-periods does not contain it: it has to be computed, by the same linear periodic problem that gives parameter sensitivities.
+The input's harmonics are known with a variance each. What their errors do to the prediction repeats
+in every period, so the scatter between periods does not contain it: it has to be computed, by the
+same linear periodic problem that gives parameter sensitivities.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     Returns
     -------
     ndarray, shape (ny, k, N)
-        Real and imaginary parts of all significant harmonics of all inputs; SI; no columns where the run could not be solved.
+        Real and imaginary parts of all significant harmonics of all inputs; SI; no columns where
+        the run could not be solved.
     """
     derived, boundary = run.kernels.derived, run.boundary
     ny, samples = run.measured.shape
@@ -75,11 +77,19 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
     blocks = []
     for channel in channels:
         item = harmonics_of(record, channel)
-        turn = np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0)) * np.sqrt(item.variances)[:, None]
+        turn = (
+            np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0))
+            * np.sqrt(item.variances)[:, None]
+        )
         block = np.zeros((len(rows), 2 * item.orders.size, phase.size))
         for k, (name, derivative) in enumerate(rows):
             if name == channel:
-                changed = (2j * np.pi * record.frequency * item.orders)[:, None] ** derivative * turn
-                block[k, : item.orders.size], block[k, item.orders.size :] = changed.real, -changed.imag
+                changed = (2j * np.pi * record.frequency * item.orders)[
+                    :, None
+                ] ** derivative * turn
+                block[k, : item.orders.size], block[k, item.orders.size :] = (
+                    changed.real,
+                    -changed.imag,
+                )
         blocks.append(block[:, np.abs(block).max(axis=(0, 2)) > 0])
     return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))

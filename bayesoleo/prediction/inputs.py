@@ -36,7 +36,8 @@ def input_rows(record: Record, rows: tuple[tuple[str, int], ...], phase: Array) 
     record : Record
         A periodic run.
     rows : tuple of (str, int)
-        As in :class:`~bayesoleo.model.derive.Derived`; the channel ``time`` gives seconds since the first sample.
+        As in :class:`~bayesoleo.model.derive.Derived`; the channel ``time`` gives seconds since the
+        first sample.
     phase : ndarray, shape (N,)
         Cycles since the first sample.
     """

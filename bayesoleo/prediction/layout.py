@@ -1,4 +1,4 @@
-"""Where the unknowns of an estimate go in a model: shared parameters once, by-run parameters once a run."""
+"""Where the unknowns of an estimate go in a model: shared ones once, by-run ones once a run."""
 
 from __future__ import annotations
 
@@ -70,7 +70,8 @@ class Layout:
             if prior is None:
                 raise ModelError(
                     f"model {model.name!r}: parameter {name!r} has no prior",
-                    hint="give it sd=…, relative_sd=…, bounds=(low, high) or prior=…, or write fixed=True",
+                    hint="give it sd=…, relative_sd=…, bounds=(low, high) or prior=…, "
+                    "or write fixed=True",
                 )
             priors.append(prior)
         return tuple(priors)

@@ -70,7 +70,13 @@ class Predictor:
         backend: str = "numba",
         jobs: int | None = None,
     ):
-        self.model, self.records, self.steps, self.scheme, self.jobs = model, tuple(records), steps, scheme, jobs
+        self.model, self.records, self.steps, self.scheme, self.jobs = (
+            model,
+            tuple(records),
+            steps,
+            scheme,
+            jobs,
+        )
         self.backend = backend
         self.layout = Layout.of(model, [record.label for record in records])
         compiled = kernels(model, self.layout.active, backend)
@@ -88,7 +94,9 @@ class Predictor:
     def set_anchor(self, theta: Array) -> list[Status]:
         """Solve every run at ``theta (l,)`` and start later solutions from there."""
         work = range(len(self.runs))
-        return thread_map(lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs)
+        return thread_map(
+            lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs
+        )
 
     def predict(self, theta: Array) -> list[RunPrediction]:
         """Outputs and sensitivities of every run at ``theta (l,)``."""
@@ -109,17 +117,23 @@ class Predictor:
     def sum_of_squares(self, theta: Array) -> tuple[Array, NDArray[np.int64]]:
         """Sums of squared residuals, shape (L, N, ny), and the status of each vector, shape (L,).
 
-        The work is cut into blocks of runs and vectors; every vector's result is computed from its own lane in a fixed order, so
-        neither the cut nor the threads change a bit of it.
+        The work is cut into blocks of runs and vectors; every vector's result is computed from its
+        own lane in a fixed order, so neither the cut nor the threads change a bit of it.
         """
         count, runs = theta.shape[0], len(self.runs)
         total = np.full((count, runs, len(self.outputs)), np.nan)
         status = np.zeros((count, runs), dtype=np.int64)
-        blocks = [(r, slice(k, min(k + BLOCK, count))) for r in range(runs) for k in range(0, count, BLOCK)]
+        blocks = [
+            (r, slice(k, min(k + BLOCK, count)))
+            for r in range(runs)
+            for k in range(0, count, BLOCK)
+        ]
 
         def work(task: tuple[int, slice]) -> None:
             r, block = task
-            total[block, r], status[block, r] = self.runs[r].squares(self.constants(theta[block], r))
+            total[block, r], status[block, r] = self.runs[r].squares(
+                self.constants(theta[block], r)
+            )
 
         thread_map(work, blocks, self.jobs)
         worst = status.max(axis=1, initial=0)

@@ -1,7 +1,8 @@
 """Reduced records: what a campaign's run becomes before a model sees it.
 
-A periodic channel is two things at once: its raw samples, which a likelihood compares with a prediction, and its significant
-harmonics, which a model takes as an input together with exact time derivatives.
+A periodic channel is two things at once: its raw samples, which a likelihood compares with a
+prediction, and its significant harmonics, which a model takes as an input together with exact time
+derivatives.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ class Harmonics:
             rates = rates.copy()
             rates[0] = 0.0
         values = np.empty(phase.shape)
-        # Blocks keep the table of exponentials small: 512 x 400 complex numbers stay within the second-level cache.
+        # Blocks keep the table of exponentials small: 512 x 400 complex numbers stay within the
+        # second-level cache.
         for first in range(0, phase.size, 512):
             block = phase[first : first + 512]
             table = np.exp(2j * np.pi * np.outer(block % 1.0, self.orders))
@@ -76,7 +78,8 @@ class Record:
     periods : int
         Number of whole periods kept; 0 for a transient.
     time : ndarray, shape (N,)
-        Sample times, s; the first sample is the origin of phase: ``phase = frequency * (time - time[0])``.
+        Sample times, s; the first sample is the origin of phase: ``phase = frequency * (time -
+        time[0])``.
     samples : mapping of str to ndarray, shape (N,)
         Raw samples of each channel over those whole periods, SI.
     harmonics : mapping of str to Harmonics

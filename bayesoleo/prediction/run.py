@@ -1,4 +1,4 @@
-"""Predict one run: solve the model under the run's inputs and evaluate outputs at its raw samples."""
+"""Predict one run: solve the model under its inputs, evaluate outputs at its raw samples."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ PATH_PIECES = (4, 16)
 class Anchor:
     """A solution with derivatives, from which others start: ``x + x_p (p - p0)``.
 
-    Frozen before sampling, it makes a solution a function of its own parameters alone. ``x (n, w)`` are the scheme's unknowns,
-    ``x_p (na, n, w)`` their derivatives with respect to the active parameters.
+    Frozen before sampling, it makes a solution a function of its own parameters alone. ``x (n, w)``
+    are the scheme's unknowns, ``x_p (na, n, w)`` their derivatives with respect to the active
+    parameters.
     """
 
     p: Array
@@ -44,7 +45,12 @@ class Anchor:
     def predict(self, change: Array) -> Array:
         """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
         start = np.empty((change.shape[0], *self.x.shape))
-        _extrapolate(self.x.ravel(), self.x_p.reshape(self.x_p.shape[0], -1), change, start.reshape(change.shape[0], -1))
+        _extrapolate(
+            self.x.ravel(),
+            self.x_p.reshape(self.x_p.shape[0], -1),
+            change,
+            start.reshape(change.shape[0], -1),
+        )
         return start
 
 
@@ -61,7 +67,7 @@ def _extrapolate(x, x_p, change, start):
 
 @numba.njit(nogil=True, cache=True)
 def _compare(measured, y, a, lanes, squares, inside):
-    """Sums of squared residuals ``(L, ny)`` of the chosen lanes, and whether no condition ``a`` is broken there."""
+    """Sums of squared residuals ``(L, ny)``, and whether no condition ``a`` is broken, by lane."""
     defined = np.ones(inside.size, dtype=np.bool_)
     positive(a, lanes, inside, defined)
     for lane in lanes:
@@ -108,7 +114,9 @@ class RunPredictor:
         Discretisation.
     """
 
-    def __init__(self, model: Model, kernels: Kernels, record: Record, steps: int, scheme_name: str):
+    def __init__(
+        self, model: Model, kernels: Kernels, record: Record, steps: int, scheme_name: str
+    ):
         self.model, self.kernels, self.record, self.steps = model, kernels, record, steps
         derived = kernels.derived
         self._check(record)
@@ -128,10 +136,14 @@ class RunPredictor:
         self.measured = np.stack([record.samples[name] for name in derived.outputs])
         self.anchor: Anchor | None = None
         self.motions: dict[str, Motion] = {}
-        self.active = np.array([derived.constants.index(name) for name in derived.active], dtype=np.int64)
+        self.active = np.array(
+            [derived.constants.index(name) for name in derived.active], dtype=np.int64
+        )
 
     def _check(self, record: Record) -> None:
-        missing = [name for name in (*self.model.inputs, *self.model.outputs) if name not in record.samples]
+        missing = [
+            name for name in (*self.model.inputs, *self.model.outputs) if name not in record.samples
+        ]
         if missing:
             raise CampaignError(
                 f"model {self.model.name!r} needs channel {missing[0]!r}, which the campaign lacks",
@@ -143,7 +155,8 @@ class RunPredictor:
                 raise CampaignError(
                     f"model {self.model.name!r} needs condition {name!r}",
                     run=record.label,
-                    hint=f'write {name} = {{ value = …, unit = "{condition.unit}" }} under [runs.conditions]',
+                    hint=f'write {name} = {{ value = …, unit = "{condition.unit}" }} '
+                    "under [runs.conditions]",
                 )
 
     def base_constants(self) -> Array:
@@ -154,11 +167,13 @@ class RunPredictor:
                 values.append(self.model.parameters[name].value)
             else:
                 default = self.model.conditions[name].default
-                values.append(self.record.conditions.get(name, np.nan if default is None else default))
+                values.append(
+                    self.record.conditions.get(name, np.nan if default is None else default)
+                )
         return np.array(values)
 
     def known_motions(self) -> dict[str, Motion]:
-        """The anchored motion of each dof, from which an extended model of the same run can start."""
+        """The anchored motion of each dof, from which an extended model of the run can start."""
         if self.anchor is None:
             return {}
         starts = np.cumsum([0, *(order + 1 for order in self.kernels.derived.orders)])
@@ -170,10 +185,10 @@ class RunPredictor:
     def _rows_of(self, first: int, last: int, phase: Array) -> Array:
         assert self.anchor is not None
         plan = self.scheme.plan(phase, self.steps)
-        rows = self.scheme.sample(self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps))
+        rows = self.scheme.sample(
+            self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps)
+        )
         return rows[0, first:last, 0]
-
-    # -- solving ----------------------------------------------------------------------------------------------------------
 
     def guess(self, p: Array) -> Array:
         """First guess of the unknowns, shape (1, n, w)."""
@@ -181,7 +196,9 @@ class RunPredictor:
         constants = dict(zip(derived.constants, p, strict=True))
         nodes = np.arange(self.steps) / self.steps
         at_nodes = guess_rows(self.model, derived, self.record, constants, nodes, self.motions)
-        at_points = guess_rows(self.model, derived, self.record, constants, self.points, self.motions)
+        at_points = guess_rows(
+            self.model, derived, self.record, constants, self.points, self.motions
+        )
         return self.scheme.from_motion(at_nodes[None], at_points[None])
 
     def set_anchor(self, p: Array) -> Status:
@@ -194,13 +211,17 @@ class RunPredictor:
         if solution.status[0] == Status.CONVERGED.value:
             solution, x_p, _ = sensitivities(self.boundary, p[None], solution)
             if solution.status[0] == Status.CONVERGED.value:
-                self.anchor = Anchor(p.copy(), solution.x[0], np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0)))
+                self.anchor = Anchor(
+                    p.copy(), solution.x[0], np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+                )
         return Status(int(solution.status[0]))
 
     def _from_anchor(self, p: Array) -> Solution:
         anchor = self.anchor
         assert anchor is not None
-        solution = solve_periodic(self.boundary, p, anchor.predict(p[:, self.active] - anchor.p[self.active]))
+        solution = solve_periodic(
+            self.boundary, p, anchor.predict(p[:, self.active] - anchor.p[self.active])
+        )
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:
@@ -230,8 +251,6 @@ class RunPredictor:
             empty = np.zeros((count, self.steps, self.scheme.width))
             return Solution(empty, failed, np.zeros(count, dtype=np.int64))
         return self._from_anchor(p)
-
-    # -- predicting -------------------------------------------------------------------------------------------------------
 
     def predict(self, p: Array, *, derivatives: bool = False) -> Samples:
         """Outputs at the raw samples for constants ``p (L, np)``."""
@@ -263,9 +282,11 @@ class RunPredictor:
         return Samples(y, yp, status)
 
     def squares(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums of failed lanes mean nothing.
+        """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums
+        of failed lanes mean nothing.
 
-        The same as comparing :meth:`predict` with the measurement, through arrays small enough to stay in the processor's cache.
+        The same as comparing :meth:`predict` with the measurement, through arrays small enough to
+        stay in the processor's cache.
         """
         count, samples, ny = p.shape[0], self.record.time.size, len(self.kernels.derived.outputs)
         squares, status = np.full((count, ny), np.nan), np.zeros(count, dtype=np.int64)
@@ -278,7 +299,9 @@ class RunPredictor:
         for first in range(0, count, CHUNK):
             part = slice(first, min(first + CHUNK, count))
             lanes = np.flatnonzero(status[part] == Status.CONVERGED.value)
-            z = self._rows_at_samples(None if solution is None else solution.x[part, :, :, None], p[part])[:, :, 0]
+            z = self._rows_at_samples(
+                None if solution is None else solution.x[part, :, :, None], p[part]
+            )[:, :, 0]
             with np.errstate(all="ignore"):
                 self.kernels.output(z, self.sample_inputs, p[part], lanes, y)
                 if self.boundary.conditions:
@@ -287,7 +310,11 @@ class RunPredictor:
             squares[first + lanes] = sums[lanes]
             status[first + lanes] = np.where(
                 inside[lanes],
-                np.where(np.isfinite(sums[lanes]).all(axis=1), Status.CONVERGED.value, Status.NOT_FINITE.value),
+                np.where(
+                    np.isfinite(sums[lanes]).all(axis=1),
+                    Status.CONVERGED.value,
+                    Status.NOT_FINITE.value,
+                ),
                 Status.INADMISSIBLE.value,
             )
         return squares, status
@@ -298,7 +325,9 @@ class RunPredictor:
             return np.empty((p.shape[0], 0, 1, self.record.time.size))
         return self.scheme.sample(x, self.plan, self.boundary.step(self.steps))
 
-    def _judge(self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _judge(
+        self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
         status = status.copy()
         finite = np.isfinite(y[lanes]).all(axis=(1, 2))

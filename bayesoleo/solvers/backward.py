@@ -1,7 +1,9 @@
-"""The thesis's discretisation: second-order backward differences on an equidistant mesh (Verbeek 1993, eqs. 4.21-4.23).
+"""The thesis's discretisation: second-order backward differences on an equidistant mesh (Verbeek
+1993, eqs. 4.21-4.23).
 
-``q'_m = (3 q_m - 4 q_{m-1} + q_{m-2}) / (2 h)`` and ``q''_m = (2 q_m - 5 q_{m-1} + 4 q_{m-2} - q_{m-3}) / h**2``, indices modulo n. The unknowns are
-the dofs at the nodes, ``x (L, n, d)``; three past blocks are the state that the closure carries.
+``q'_m = (3 q_m - 4 q_{m-1} + q_{m-2}) / (2 h)`` and ``q''_m = (2 q_m - 5 q_{m-1} + 4 q_{m-2} -
+q_{m-3}) / h**2``, indices modulo n. The unknowns are the dofs at the nodes, ``x (L, n, d)``; three
+past blocks are the state that the closure carries.
 """
 
 from __future__ import annotations
@@ -65,7 +67,9 @@ class BackwardDifferences:
             rows.append(past[0])
             rows.append(sum(weight * q for weight, q in zip(FIRST, past, strict=True)) / step)
             if order == 2:
-                rows.append(sum(weight * q for weight, q in zip(SECOND, past, strict=True)) / step**2)
+                rows.append(
+                    sum(weight * q for weight, q in zip(SECOND, past, strict=True)) / step**2
+                )
         return np.stack(rows, axis=1)
 
     def plan(self, phase: Array, n: int) -> CubicPlan:
@@ -84,7 +88,7 @@ class BackwardDifferences:
         return CubicPlan((index + np.arange(-1, 3)[:, None]) % n, weights)
 
     def sample(self, x: Array, plan: CubicPlan, step: float) -> Array:
-        """Values and derivatives at planned phases by cubic interpolation between nodes, shape (L, nz, C, N)."""
+        """Values and derivatives at planned phases by cubic interpolation, shape (L, nz, C, N)."""
         rows = self._node_rows(x, step)
         total = np.zeros((*rows.shape[:3], plan.weights.shape[1]))
         for nodes, weights in zip(plan.nodes, plan.weights, strict=True):
@@ -101,7 +105,7 @@ class BackwardDifferences:
         *,
         initial: bool = False,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Solve ``G dx = -right`` with the periodic closure (see ``Collocation.linear``); the monodromy is that of the recursion."""
+        """Solve ``G dx = -right`` as ``Collocation.linear``; the monodromy is the recursion's."""
         count, d, n = gz.shape[0], len(self.orders), gz.shape[3]
         dx = np.zeros((count, n, d, right.shape[2]))
         monodromy = np.zeros((count, 3 * d, 3 * d))
@@ -150,7 +154,7 @@ def _linear(gz, right, lanes, h, orders, first, second, initial, dx, monodromy, 
 
 @jit
 def _assemble(gz, right, begin, count, h, orders, first, second, work):
-    """Equations of ``count`` nodes: ``work (d, d + 3 d + k, block)`` is [node | three nodes before it | right side]."""
+    """Equations of ``count`` nodes: ``work (d, 4 d + k, block)``, [node, three before | right]."""
     d, k = orders.size, right.shape[1]
     for e in range(d):
         row = 0
@@ -162,7 +166,9 @@ def _assemble(gz, right, begin, count, h, orders, first, second, work):
                 for t in range(count):
                     m = begin + t
                     total = value * gz[e, row, m] + rate * gz[e, row + 1, m]
-                    work[e, past * d + j, t] = total + (bend * gz[e, row + 2, m] if orders[j] == 2 else 0.0)
+                    work[e, past * d + j, t] = total + (
+                        bend * gz[e, row + 2, m] if orders[j] == 2 else 0.0
+                    )
             row += orders[j] + 1
         for column in range(k):
             for t in range(count):

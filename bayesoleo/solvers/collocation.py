@@ -1,8 +1,10 @@
-"""One-step collocation on an equidistant mesh, as linear maps between unknowns, stage values and samples.
+"""One-step collocation on an equidistant mesh, as linear maps between unknowns, stage values and
+samples.
 
-The unknowns of a step are the state at its left node (value, and velocity of a second-order dof) and the highest derivative of each
-dof at each stage: ``x (L, n, w)`` with ``w = D + s d``. Everything else - stage values, samples between nodes, sensitivities - is linear
-in them, so the same maps serve solutions and their derivatives.
+The unknowns of a step are the state at its left node (value, and velocity of a second-order dof)
+and the highest derivative of each dof at each stage: ``x (L, n, w)`` with ``w = D + s d``.
+Everything else - stage values, samples between nodes, sensitivities - is linear in them, so the
+same maps serve solutions and their derivatives.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """Steps of the mesh, positions inside them and interpolation weights, each (s, N), of N phases."""
+    """Steps of the mesh, positions in them and interpolation weights, each (s, N), of N phases."""
 
     index: NDArray[np.int64]
     position: Array
@@ -92,7 +94,7 @@ class Collocation:
         _rows(x, lanes, step, method.a, method.a @ method.a, method.c, self._orders, z)
 
     def plan(self, phase: Array, n: int) -> SamplePlan:
-        """Where in the mesh given phases (cycles) lie, with their interpolation weights; worth keeping for fixed samples."""
+        """Where in the mesh given phases (cycles) lie; worth keeping for fixed samples."""
         scaled = (phase % 1.0) * n
         index = np.minimum(scaled.astype(np.int64), n - 1)
         position = scaled - index
@@ -118,7 +120,9 @@ class Collocation:
         nz = self.state_size + len(self.orders)
         z = np.empty((x.shape[0], nz, x.shape[3], plan.index.size))
         everyone = np.arange(x.shape[0])
-        _sample(x, everyone, plan.index, plan.position, plan.w0, plan.w1, plan.w2, step, self._orders, z)
+        _sample(
+            x, everyone, plan.index, plan.position, plan.w0, plan.w1, plan.w2, step, self._orders, z
+        )
         return z
 
     def linear(
@@ -275,7 +279,7 @@ def _linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx
 
 @jit
 def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
-    """Equations at the stages of ``count`` steps: ``work (s d, s d + D + k, block)`` is [stage unknowns | left state | right side]."""
+    """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
     d, s = orders.size, c.size
     D, k = orders.sum(), right.shape[1]
     size = s * d
@@ -286,12 +290,18 @@ def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
             row = state = 0
             for j in range(d):
                 for stage in range(s):
-                    once, twice, own = h * a[i, stage], h * h * aa[i, stage], 1.0 if stage == i else 0.0
+                    once, twice, own = (
+                        h * a[i, stage],
+                        h * h * aa[i, stage],
+                        1.0 if stage == i else 0.0,
+                    )
                     column = stage * d + j
                     if orders[j] == 1:
                         for t in range(count):
                             point = begin + t * s
-                            work[line, column, t] = once * gz[e, row, point] + own * gz[e, row + 1, point]
+                            work[line, column, t] = (
+                                once * gz[e, row, point] + own * gz[e, row + 1, point]
+                            )
                     else:
                         for t in range(count):
                             point = begin + t * s
@@ -302,7 +312,9 @@ def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
                 if orders[j] == 2:
                     for t in range(count):
                         point = begin + t * s
-                        work[line, size + state + 1, t] = -(h * c[i] * gz[e, row, point] + gz[e, row + 1, point])
+                        work[line, size + state + 1, t] = -(
+                            h * c[i] * gz[e, row, point] + gz[e, row + 1, point]
+                        )
                 row += orders[j] + 1
                 state += orders[j]
             for column in range(k):
@@ -328,13 +340,15 @@ def _transfer(stages, h, b, ba, orders, transfer):
                     transfer[last, column, m] += h * b[stage] * stages[stage * d + j, column, m]
                 if orders[j] == 2:
                     for m in range(n):
-                        transfer[state, column, m] += h * h * ba[stage] * stages[stage * d + j, column, m]
+                        transfer[state, column, m] += (
+                            h * h * ba[stage] * stages[stage * d + j, column, m]
+                        )
         state += orders[j]
 
 
 @jit
 def _add_jumps(x, h, b, ba, orders, transfer):
-    """Add the jump between the end of each step and the next node, periodically, to the right-hand side (one column)."""
+    """Add the jump from each step's end to the next node to the right-hand side (one column)."""
     d, s, n = orders.size, b.size, x.shape[0]
     D = orders.sum()
     state = 0
@@ -349,7 +363,9 @@ def _add_jumps(x, h, b, ba, orders, transfer):
                 twice += ba[stage] * value
             transfer[last, D, m] += x[m, last] + h * once - x[following, last]
             if orders[j] == 2:
-                transfer[state, D, m] += x[m, state] + h * (x[m, last] + h * twice) - x[following, state]
+                transfer[state, D, m] += (
+                    x[m, state] + h * (x[m, last] + h * twice) - x[following, state]
+                )
         state += orders[j]
 
 

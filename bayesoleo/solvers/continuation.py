@@ -1,4 +1,4 @@
-"""Reach a solution from a static guess by raising the forcing step by step where Newton's method alone fails."""
+"""Reach a solution from a static guess by raising the forcing where Newton's method alone fails."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ SMALLEST_STEP = 1.0 / 512
 
 
 def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:
-    """Solve each lane directly; those that fail by continuation in the amplitude of the inputs, then by undamped Newton steps.
+    """Solve each lane directly; those that fail by continuation in the amplitude of the inputs,
+    then by undamped Newton steps.
 
     Parameters
     ----------
@@ -38,7 +39,8 @@ def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:
         one = slice(lane, lane + 1)
         better = _raise_forcing(problem, p[one], start[one])
         if better is None:
-            # Where the branch from rest folds back before full amplitude, wandering steps find the other branch.
+            # Where the branch from rest folds back before full amplitude, wandering steps find the
+            # other branch.
             better = solve_periodic(problem, p[one], start[one], max_iterations=200, monotone=False)
         if better.status[0] == Status.CONVERGED.value:
             x[one], status[one] = better.x, better.status

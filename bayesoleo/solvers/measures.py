@@ -1,6 +1,8 @@
-"""Compiled bookkeeping of a batched Newton iteration: sizes of residuals and steps, lane by lane in a fixed order.
+"""Compiled bookkeeping of a batched Newton iteration: sizes of residuals and steps, lane by lane in
+a fixed order.
 
-Library reductions would change their order of summation with the shape of the batch, and with it the last bits of a solution.
+Library reductions would change their order of summation with the shape of the batch, and with it
+the last bits of a solution.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from bayesoleo.solvers.sweep import jit
 
 @jit
 def total(row):
-    """Sum of a row in eight interleaved partial sums: fixed order, and no addition waits for the one before."""
+    """Sum in eight interleaved partial sums: in fixed order, without waiting for each addition."""
     a = b = c = d = e = f = g = h = 0.0
     whole = row.size - row.size % 8
     for i in range(0, whole, 8):
@@ -31,7 +33,7 @@ def total(row):
 
 @jit
 def measure(z, g, gz, lanes, squares, terms):
-    """Mean squares of residuals and of the equations' terms, both ``(L, d)``; not finite where anything is not."""
+    """Mean squares of residuals and of terms, both ``(L, d)``; not finite where anything is not."""
     d, nz, points = gz.shape[1:]
     row = np.empty(points)
     for lane in lanes:
@@ -48,7 +50,7 @@ def measure(z, g, gz, lanes, squares, terms):
 
 @jit
 def positive(a, lanes, inside, defined):
-    """Whether no condition ``a (L, nc, N)`` is broken, ``inside (L,)``, and whether all are numbers, ``defined (L,)``."""
+    """Whether no condition ``a (L, nc, N)`` is broken; whether all are numbers: both (L,)."""
     for lane in lanes:
         outside = odd = 0
         for k in range(a.shape[1]):
@@ -61,7 +63,7 @@ def positive(a, lanes, inside, defined):
 
 @jit
 def step_size(x, dx, lanes, state_size, size):
-    """Largest change of a state over its largest value, ``size (L,)``; NaN where a change is not finite."""
+    """Largest change of a state over its largest value, shape (L,); NaN where one is not finite."""
     n, w = x.shape[1:]
     for lane in lanes:
         spoilt = 0.0

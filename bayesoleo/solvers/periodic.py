@@ -1,7 +1,8 @@
-"""Periodic solutions by Newton's method on all unknowns of a period at once, for many parameter vectors.
+"""Periodic solutions by Newton's method on all unknowns of a period at once, for many parameter
+vectors.
 
-Lanes (parameter vectors) never see each other: each has its own step length, its own end and its own status, so that a solution depends
-on its own parameters and start alone, bit for bit.
+Lanes (parameter vectors) never see each other: each has its own step length, its own end and its
+own status, so that a solution depends on its own parameters and start alone, bit for bit.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Lanes = NDArray[np.int64]
 
 
 class Equations(Protocol):
-    """What a solver needs of a system of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
+    """What a solver needs of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
 
     @property
     def jacobian(self) -> Callable[..., Any]: ...
@@ -32,7 +33,7 @@ class Equations(Protocol):
 
 
 class Scheme(Protocol):
-    """A discretisation of a period as linear maps (see :class:`~bayesoleo.solvers.collocation.Collocation`)."""
+    """A discretisation of a period as linear maps (see ``bayesoleo.solvers.collocation``)."""
 
     @property
     def orders(self) -> tuple[int, ...]: ...
@@ -46,7 +47,14 @@ class Scheme(Protocol):
     def plan(self, phase: Array, n: int) -> Any: ...
     def sample(self, x: Array, plan: Any, step: float) -> Array: ...
     def linear(
-        self, gz: Array, right: Array, x: Array | None, lanes: Lanes, step: float, *, initial: bool = False
+        self,
+        gz: Array,
+        right: Array,
+        x: Array | None,
+        lanes: Lanes,
+        step: float,
+        *,
+        initial: bool = False,
     ) -> tuple[Array, Array, NDArray[np.bool_]]: ...
 
 
@@ -101,7 +109,8 @@ class Solution:
     iterations: NDArray[np.int64]
 
 
-#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still contracting leaves 1e-14.
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14.
 LAST_STEP = 1e-7
 #: Without quadratic contraction (at a kink) a step this small is taken as converged.
 SMALL_STEP = 1e-11
@@ -124,8 +133,9 @@ def solve_periodic(
     max_iterations : int
         After which a lane's status is ``NO_CONVERGENCE``.
     monotone : bool
-        Halve steps until the residual falls. Otherwise only until it is finite and admissible: plain Newton wanders, but out of
-        the hollows of the residual's norm in which the monotone iteration gets stuck.
+        Halve steps until the residual falls. Otherwise only until it is finite and admissible:
+        plain Newton wanders, but out of the hollows of the residual's norm in which the monotone
+        iteration gets stuck.
 
     Returns
     -------
@@ -171,14 +181,18 @@ class _Newton:
             if lanes.size == 0:
                 break
             self.iterations[lanes] += 1
-            dx, _, ok = self.problem.scheme.linear(self.gz, self.g[:, :, None], self.x, lanes, self.step)
+            dx, _, ok = self.problem.scheme.linear(
+                self.gz, self.g[:, :, None], self.x, lanes, self.step
+            )
             measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
             lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
             lanes = self._finish(lanes, dx, size)
             lanes = self._advance(lanes, dx, size)
         return Solution(self.x, self.status, self.iterations)
 
-    def _drop(self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]) -> Lanes:
+    def _drop(
+        self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]
+    ) -> Lanes:
         bad = lanes[~good]
         self.status[bad] = reason if isinstance(reason, int) else reason[bad]
         return lanes[good]
@@ -196,9 +210,11 @@ class _Newton:
         return self.inside[lanes] & self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
 
     def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
-        """Whether the residual fell, in units of the equations' terms: the larger of those before and after.
+        """Whether the residual fell, in units of the equations' terms: the larger of those before
+        and after.
 
-        Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid to leave it.
+        Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid
+        to leave it.
         """
         unit = np.maximum(terms, self.terms[lanes]) + 1e-300
         with np.errstate(all="ignore"):
@@ -219,7 +235,7 @@ class _Newton:
         return lanes[~done]
 
     def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
-        """Take the steps, halving those that leave the admissible region or do not reduce the residual."""
+        """Take the steps, halved where they are inadmissible or do not reduce the residual."""
         measures.keep(self.x, lanes, self.base)
         squares, terms, fraction = self.squares[lanes], self.terms[lanes], np.ones(lanes.size)
         pending = np.arange(lanes.size)
@@ -230,12 +246,15 @@ class _Newton:
             measures.take(self.base, dx, chosen, fraction[pending], self.x)
             good = self._evaluate(chosen)
             falls = self._reduces(chosen, squares[pending], terms[pending])
-            # Close to the solution round-off keeps the residual from falling; the step's own size then decides.
+            # Close to the solution round-off keeps the residual from falling; the step's own size
+            # then decides.
             good &= falls | (size[chosen] < 1e-5) | (not self.monotone)
             pending = pending[~good]
             fraction[pending] *= 0.5
         stuck = lanes[pending]
-        outside = np.where(self.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value)
+        outside = np.where(
+            self.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value
+        )
         self.status[stuck] = outside
         measures.keep(self.base, stuck, self.x)
         self.last[lanes[fraction < 1.0]] = np.inf

@@ -7,7 +7,8 @@ from bayesoleo.solvers.collocation import Collocation
 from bayesoleo.solvers.periodic import Scheme
 from bayesoleo.solvers.tableau import tableau
 
-#: Three-stage Radau IIA: order five, and stiff components (steep friction) decay instead of ringing.
+#: Three-stage Radau IIA: order five, and stiff components (steep friction) decay instead of
+#: ringing.
 DEFAULT_SCHEME = "radau3"
 
 
@@ -17,8 +18,9 @@ def scheme(name: str, orders: tuple[int, ...]) -> Scheme:
     Parameters
     ----------
     name : str
-        ``radau2``, ``radau3``, ``gauss2``, ``gauss3``, or ``thesis`` for second-order backward differences. Gauss points do not
-        damp what is infinitely stiff: not for a dof ruled by an algebraic equation (a drive through a compliance of zero).
+        ``radau2``, ``radau3``, ``gauss2``, ``gauss3``, or ``thesis`` for second-order backward
+        differences. Gauss points do not damp what is infinitely stiff: not for a dof ruled by an
+        algebraic equation (a drive through a compliance of zero).
     orders : tuple of int
         Order of each dof.
 

@@ -1,8 +1,9 @@
 """Compiled linear algebra of one Newton step: small blocks, one forward sweep, a periodic closure.
 
-Each step of the mesh maps the state at its left end to that at its right end. Eliminating a step's own unknowns leaves
-``delta_{m+1} = M_m delta_m + r_m``; the product of all ``M_m`` closes the period with one small system (Verbeek 1993, section 4.3.1,
-with one state in place of three past blocks). Compiled once for every model: the sizes are run-time numbers.
+Each step of the mesh maps the state at its left end to that at its right end. Eliminating a step's
+own unknowns leaves ``delta_{m+1} = M_m delta_m + r_m``; the product of all ``M_m`` closes the
+period with one small system (Verbeek 1993, section 4.3.1, with one state in place of three past
+blocks). Compiled once for every model: the sizes are run-time numbers.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import numpy as np
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
-#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of what cancels.
+#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of
+#: what cancels.
 ROUND_OFF = 1e-12
 
 
@@ -21,8 +23,8 @@ ROUND_OFF = 1e-12
 def eliminate(matrix, right, least):
     """Solve ``matrix @ x = right`` in place by elimination with row scaling and partial pivoting.
 
-    ``matrix (m, m)`` is destroyed, ``right (m, k)`` becomes the solution. Returns False where a pivot is not above ``least``, over the
-    largest entry of its row, or not finite.
+    ``matrix (m, m)`` is destroyed, ``right (m, k)`` becomes the solution. Returns False where a
+    pivot is not above ``least``, over the largest entry of its row, or not finite.
     """
     m, k = right.shape
     for i in range(m):
@@ -31,7 +33,8 @@ def eliminate(matrix, right, least):
             largest = max(largest, abs(matrix[i, j]))
         if not (largest > 0.0 and largest < np.inf):
             return False
-        # Rows are equations in different units; scaled alike, their entries can be compared as pivots.
+        # Rows are equations in different units; scaled alike, their entries can be compared as
+        # pivots.
         for j in range(m):
             matrix[i, j] /= largest
         for j in range(k):
@@ -60,21 +63,24 @@ def eliminate(matrix, right, least):
         inverse = 1.0 / matrix[i, i]
         for j in range(k):
             total = right[i, j]
-            for l in range(i + 1, m):
-                total -= matrix[i, l] * right[l, j]
+            for other in range(i + 1, m):
+                total -= matrix[i, other] * right[other, j]
             right[i, j] = total * inverse
     return True
 
 
-#: A pivot this small against the largest entry of its row asks for the elimination that exchanges rows.
+#: A pivot this small against the largest entry of its row asks for the elimination that exchanges
+#: rows.
 SMALL_PIVOT = 1e-3
 
 
 @jit
 def eliminate_together(work, scale, count, m):
-    """Solve ``count`` systems at once, without exchanging rows: ``work (m, m + k, block)`` holds ``[matrix | right]``, systems last.
+    """Solve ``count`` systems at once, without exchanging rows: ``work (m, m + k, block)`` holds
+    ``[matrix | right]``, systems last.
 
-    The right-hand columns become the solutions. Returns False, with ``work`` spoilt, where a pivot is too small for that.
+    The right-hand columns become the solutions. Returns False, with ``work`` spoilt, where a pivot
+    is too small for that.
     """
     width = work.shape[1]
     for i in range(m):
@@ -100,9 +106,9 @@ def eliminate_together(work, scale, count, m):
                     work[i, j, t] -= work[i, column, t] * work[column, j, t]
     for i in range(m - 1, -1, -1):
         for j in range(m, width):
-            for l in range(i + 1, m):
+            for other in range(i + 1, m):
                 for t in range(count):
-                    work[i, j, t] -= work[i, l, t] * work[l, j, t]
+                    work[i, j, t] -= work[i, other, t] * work[other, j, t]
             for t in range(count):
                 work[i, j, t] *= work[i, i, t]
     return True
@@ -131,9 +137,10 @@ def eliminate_each(work, count, m):
 def close_and_sweep(transfer, monodromy, states, initial):
     """Close the period and run through it once more.
 
-    Parameters: ``transfer (D, D + k, n)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is the product of all ``M_m`` and
-    ``states (D, k, n)`` the solution at the nodes. With ``initial`` true the first state is held (an initial value problem)
-    instead of being closed. Returns False if the closure is singular.
+    Parameters: ``transfer (D, D + k, n)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is
+    the product of all ``M_m`` and ``states (D, k, n)`` the solution at the nodes. With ``initial``
+    true the first state is held (an initial value problem) instead of being closed. Returns False
+    if the closure is singular.
     """
     D, width, n = transfer.shape
     k = width - D
@@ -144,8 +151,8 @@ def close_and_sweep(transfer, monodromy, states, initial):
         for i in range(D):
             for j in range(width):
                 total = transfer[i, j, m] if j >= D else 0.0
-                for l in range(D):
-                    total += transfer[i, l, m] * product[l, j]
+                for other in range(D):
+                    total += transfer[i, other, m] * product[other, j]
                 following[i, j] = total
         product, following = following, product
     closure, state = np.empty((D, D)), np.zeros((D, k))
@@ -172,7 +179,7 @@ def close_and_sweep(transfer, monodromy, states, initial):
         for i in range(D):
             for j in range(k):
                 total = transfer[i, D + j, m]
-                for l in range(D):
-                    total += transfer[i, l, m] * states[l, j, m]
+                for other in range(D):
+                    total += transfer[i, other, m] * states[other, j, m]
                 states[i, j, m + 1] = total
     return True

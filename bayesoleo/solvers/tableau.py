@@ -1,4 +1,4 @@
-"""Collocation methods: their nodes, weights and interpolation polynomials, computed rather than tabulated."""
+"""Collocation methods: nodes, weights and interpolation polynomials, computed, not tabulated."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ class Tableau:
         Returns
         -------
         tuple of three ndarray, each shape (N, s)
-            They turn stage values of the highest derivative into that derivative, the one below and the one below that.
+            They turn stage values of the highest derivative into that derivative, the one below and
+            the one below that.
         """
         polynomials = _lagrange(self.c)
         tables = [
@@ -80,11 +81,11 @@ def _from_nodes(name: str, order: int, c: Array) -> Tableau:
 
 
 def _radau_nodes(stages: int) -> Array:
-    """Zeros of P_s(x) - P_{s-1}(x) on [-1, 1], which include 1; Hairer and Wanner (1996), section IV.5."""
+    """Zeros of P_s - P_{s-1} on [-1, 1], which include 1 (Hairer and Wanner 1996, section IV.5)."""
     coefficients = np.zeros(stages + 1)
     coefficients[stages], coefficients[stages - 1] = 1.0, -1.0
     nodes = np.sort((np.real(legendre.legroots(coefficients)) + 1.0) / 2.0)
-    nodes[-1] = 1.0 # exact by construction; the root finder leaves 1e-16
+    nodes[-1] = 1.0  # exact by construction; the root finder leaves 1e-16
     return nodes
 
 
@@ -99,11 +100,14 @@ def tableau(name: str) -> Tableau:
 
     References
     ----------
-    Hairer, E. and Wanner, G. (1996). Solving Ordinary Differential Equations II, 2nd ed., section IV.5.
+    Hairer, E. and Wanner, G. (1996). Solving Ordinary Differential Equations II, 2nd ed., section
+    IV.5.
     """
     family, stages = name[:-1], name[-1:]
     if stages not in ("2", "3") or family not in ("radau", "gauss"):
-        raise InputError("unknown scheme", value=name, hint="use radau2, radau3, gauss2, gauss3 or thesis")
+        raise InputError(
+            "unknown scheme", value=name, hint="use radau2, radau3, gauss2, gauss3 or thesis"
+        )
     s = int(stages)
     if family == "radau":
         return _from_nodes(name, 2 * s - 1, _radau_nodes(s))

@@ -1,4 +1,4 @@
-"""Records of oleo runs made in memory: a displacement in a few harmonics, and what a model answers to it."""
+"""Records of oleo runs made in memory: a displacement in a few harmonics, a model's answer."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def oleo_runs(others: tuple[str, ...] = ("force", "pressure")) -> list[Record]:
 
 
 def answered(model: Model, records: list[Record], noise: float = 0.0, **options) -> list[Record]:
-    """The records with the model's outputs as samples, plus noise relative to each output's spread."""
+    """The records with the model's outputs as samples, plus noise in parts of their spread."""
     predictor = Predictor(model, records, **options)
     theta = predictor.layout.start(model)
     predictor.set_anchor(theta)

@@ -1,4 +1,4 @@
-"""The same system driven by either channel, with and without something in series, is the same system."""
+"""A system driven by either channel, with or without something in series, is the same system."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def predicted(model, records, steps=64, **options):
 
 
 def test_displacement_to_force_and_back():
-    """The force that a prescribed motion needs, resolved into harmonics, brings about that motion."""
+    """The force that a prescribed motion needs, as harmonics, brings about that motion."""
     base = thermomechanical_oleo(2)
     # A gentle friction slope: its arctangent must fit into the harmonics that carry the force.
     base = base.with_values({"friction_slope": 40.0, "friction_base": 500.0})
@@ -74,8 +74,9 @@ def test_without_compliance_the_added_equation_changes_nothing():
     predictor, found = predicted(model, records, 256)
     assert predictor.outputs == plain.outputs == ("force", "pressure")
     for one, other in zip(expected, found, strict=True):
-        # The stroke equals the displacement where its equation holds. Between those points it errs by
-        # (2 pi/256)**4/24 of the gas's change; its velocity, through steep friction, by a thousand times that.
+        # The stroke equals the displacement where its equation holds. Between those points it errs
+        # by (2 pi/256)**4/24 of the gas's change; its velocity, through steep friction, by a
+        # thousand times that.
         scale = np.abs(one.y).max(axis=1)
         assert (np.abs(other.y - one.y).max(axis=1) < [3e-6, 5e-9] * scale).all()
         theta = predictor.layout.start(model)[: one.sensitivity.shape[1], None]
@@ -122,7 +123,8 @@ def test_compliance_against_integration():
     )
     exact = (drive.evaluate(f * solution.t, f) - solution.y[0]) / value
     scale = np.ptp(exact)
-    # The ringing after each reversal of friction is coarse in 512 steps of 4 ms: its period is 12 ms.
+    # The ringing after each reversal of friction is coarse in 512 steps of 4 ms: its period is 12
+    # ms.
     error = np.sqrt(np.mean((force[late] - exact) ** 2)) / scale
     assert error < 2e-3
 
@@ -179,7 +181,8 @@ def test_sensitivities_at_samples_are_differences_of_predictions(frequency):
             moved[k] += sign * step
             ends.append(predictor.simulate(moved[None], 0).y[0])
         difference = (ends[0] - ends[1]) / (2 * step)
-        # Outputs of 1e6 Pa and 1e3 N are good to 1e-15: differences over 1e-5 to 1e-9 of the output.
+        # Outputs of 1e6 Pa and 1e3 N are good to 1e-15: differences over 1e-5 to 1e-9 of the
+        # output.
         limit = 1e-9 * np.abs(answer[0].y).max(axis=1) / abs(value) + 1e-7 * np.abs(difference).max(
             axis=1
         )

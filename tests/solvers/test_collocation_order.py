@@ -105,6 +105,6 @@ def test_a_motion_survives_the_way_to_unknowns_and_back(name):
     assert x.shape == (1, n, method.width)
     z = np.empty((1, 5, at_points.shape[1]))
     method.rows(x, np.array([0]), period / n, z)
-    # Second-order differences of a unit sine err by (2 pi / n)**2 = 2.4e-3 of a second derivative of
-    # pi**2, times 11/12; collocation by the cube of 2 pi / n and less.
+    # Second-order differences of a unit sine err by (2 pi / n)**2 = 2.4e-3 of a second derivative
+    # of pi**2, times 11/12; collocation by the cube of 2 pi / n and less.
     np.testing.assert_allclose(z[0], at_points, atol=0.12 if name == "thesis" else 2e-4)

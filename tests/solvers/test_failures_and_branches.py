@@ -1,4 +1,4 @@
-"""Failures have names, neighbours do not matter, and where two motions are stable both are found."""
+"""Failures have names, neighbours do not matter, and of two stable motions both are found."""
 
 from dataclasses import replace
 

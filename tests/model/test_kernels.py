@@ -1,0 +1,226 @@
+"""Generated kernels compute what SymPy does, in both back ends, on both sides of every kink."""
+
+import numpy as np
+import pytest
+import sympy as sp
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from bayesoleo.model import Condition, Model, Output, Parameter
+from bayesoleo.model.expressions import FUNCTIONS, symbol
+from bayesoleo.model.kernels import cache_folder, kernels
+from bayesoleo.systems.oleo import thermomechanical_oleo
+
+NAMES = ("x", "w", "a", "b")
+
+
+def model_of(*expressions: str) -> Model:
+    return Model(
+        "expressions",
+        inputs={"x": "", "w": ""},
+        parameters={"a": Parameter(0.7, sd=1.0), "b": Parameter(-1.3, sd=1.0)},
+        outputs={f"y{k}": Output(text) for k, text in enumerate(expressions)},
+    )
+
+
+def evaluated(model: Model, backend: str, x: np.ndarray, w: np.ndarray, p: np.ndarray):
+    """Outputs (L, ny, N) and their derivatives with respect to ``a`` and ``b`` (L, ny, 2, N)."""
+    made = kernels(model, backend=backend)
+    table = {("x", 0): x, ("w", 0): w}
+    u = np.array([table[row] for row in made.derived.inputs]).reshape(-1, x.size)
+    lanes, ny = np.arange(p.shape[0]), len(model.outputs)
+    z = np.empty((p.shape[0], 0, x.size))
+    y = np.full((p.shape[0], ny, x.size), np.nan)
+    yz, yp = np.empty((p.shape[0], ny, 0, x.size)), np.full((p.shape[0], ny, 2, x.size), np.nan)
+    with np.errstate(all="ignore"):
+        made.output(z, u, p, lanes, y)
+        made.output_jacobian(z, u, p, lanes, yz, yp)
+    return y, yp
+
+
+#: One call of every function, with an argument in its domain that takes both signs where it may.
+CALLS = {
+    "abs": "abs(a*x)",
+    "sign": "sign(a*x)",
+    "sqrt": "sqrt(1 + (a*x)**2)",
+    "exp": "exp(a*x)",
+    "log": "log(4 + a*x**2)",
+    "sin": "sin(a*x)",
+    "cos": "cos(a*x)",
+    "tan": "tan(a*x/9)",
+    "atan": "atan(a*x)",
+    "arctan": "arctan(30*a*x)",
+    "tanh": "tanh(a*x)",
+    "min": "min(a*x, b, x)",
+    "max": "max(a*x, b, x)",
+    "positive": "positive(a*x)",
+    "step": "step(a*x)",
+}
+
+
+def test_every_function_of_the_language_is_tried():
+    assert CALLS.keys() == FUNCTIONS.keys()
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_functions_agree_with_sympy(backend):
+    model = model_of(*CALLS.values())
+    # 11 points: one whole vector register and a rest, in two lanes.
+    x = np.linspace(-2.5, 2.5, 11)
+    p = np.array([[0.7, -1.3], [-0.4, 0.2]])
+    y, yp = evaluated(model, backend, x, np.zeros(11), p)
+    for k, channel in enumerate(model.outputs):
+        expression = model.output(channel)
+        for lane in range(2):
+            for i, value in enumerate(x):
+                at = {symbol("x"): value, symbol("a"): p[lane, 0], symbol("b"): p[lane, 1]}
+                exact = float(expression.xreplace({s: sp.Float(v, 40) for s, v in at.items()}))
+                # A rounding of the argument and one of the result, a few units in the last place.
+                assert y[lane, k, i] == pytest.approx(exact, rel=2e-15, abs=1e-15), channel
+    assert np.isfinite(yp).all()
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_a_derivative_at_a_kink_is_the_mean_of_its_two_sides(backend):
+    texts = [
+        "abs(a + x)",
+        "positive(a + x)",
+        "max(a, x)",
+        "min(a, x)",
+        "step(a + x)",
+        "sign(a + x)",
+    ]
+    model = model_of(*texts, "a*b*w")
+    p = np.array([[0.5, 1.0]])
+    x = np.array([-0.5, 0.5])  # the kink of the sums, the kink of max and min
+    y, yp = evaluated(model, backend, x, np.ones(2), p)
+    np.testing.assert_array_equal(y[0, :6, 0], [0, 0, 0.5, -0.5, 0.5, 0])
+    np.testing.assert_array_equal(yp[0, :6, 0, 0], [0, 0.5, 1, 0, 0, 0])
+    np.testing.assert_array_equal(yp[0, 2:4, 0, 1], [0.5, 0.5])
+
+
+def test_the_fast_arctangent_is_good_to_the_last_bits():
+    model = model_of("atan(a*x) + 0*b*w")
+    rng = np.random.default_rng(2)
+    x = rng.standard_normal(20_000) * 10 ** rng.uniform(-8, 8, 20_000)
+    x[:8] = [0.0, 0.66, 2.414213562373095, 1.0, np.inf, -np.inf, np.nan, 1e-310]
+    y, _ = evaluated(model, "numba", x, x, np.array([[1.0, 0.0]]))
+    exact = np.arctan(x)
+    assert np.isnan(y[0, 0, 6])
+    good = ~np.isnan(x)
+    np.testing.assert_allclose(y[0, 0, good], exact[good], rtol=5e-16, atol=0)
+
+
+def test_nothing_finite_is_made_of_what_is_not():
+    model = model_of(*(text for name, text in CALLS.items() if name not in ("step", "sign")))
+    x = np.array([np.nan, 1.0])
+    for backend in ("numpy", "numba"):
+        y, _ = evaluated(model, backend, x, x, np.array([[0.7, -1.3]]))
+        assert np.isnan(y[0, :, 0]).all()
+        assert np.isfinite(y[0, :, 1]).all()
+
+
+expressions = st.recursive(
+    st.sampled_from(NAMES) | st.integers(-3, 3).map(str) | st.sampled_from(["0.5", "pi", "1e-3"]),
+    lambda inner: st.one_of(
+        st.tuples(inner, st.sampled_from("+-*"), inner).map(lambda t: f"({t[0]} {t[1]} {t[2]})"),
+        st.tuples(inner, inner).map(lambda t: f"({t[0]}/(1.5 + ({t[1]})**2))"),
+        st.tuples(inner, st.integers(2, 5)).map(lambda t: f"({t[0]})**{t[1]}"),
+        st.tuples(inner, st.sampled_from(["1.4", "-0.7", "b"])).map(
+            lambda t: f"(1 + abs({t[0]}))**({t[1]})"
+        ),
+        st.tuples(
+            st.sampled_from(["abs", "sign", "sin", "cos", "atan", "tanh", "positive", "step"]),
+            inner,
+        ).map(lambda t: f"{t[0]}({t[1]})"),
+        st.tuples(st.sampled_from(["min", "max"]), inner, inner).map(
+            lambda t: f"{t[0]}({t[1]}, {t[2]})"
+        ),
+    ),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(text=expressions, values=st.tuples(*[st.sampled_from([-1.7, -0.4, 0.3, 1.9])] * 4))
+def test_random_expressions_agree_with_sympy(text, values):
+    """Values against SymPy with 30 digits; derivatives against differences of those."""
+    model = model_of(text)
+    x, w, a, b = (np.array([v]) for v in values)
+    y, yp = evaluated(model, "numpy", x, w, np.array([[a[0], b[0]]]))
+    expression = model.output("y0")
+
+    def exact(**moved: sp.Float) -> sp.Float:
+        at = {name: sp.Float(v, 30) for name, v in zip(NAMES, values, strict=True)} | moved
+        return sp.N(expression.xreplace({symbol(n): v for n, v in at.items()}), 30)
+
+    value = float(exact())
+    assume(abs(value) < 1e12)
+    # Sums of a handful of terms may cancel; their size is not known here, so a floor of 1e-11.
+    assert y[0, 0, 0] == pytest.approx(value, rel=1e-11, abs=1e-11)
+    for k, name in enumerate("ab"):
+        middle, small = sp.Float(values[2 + k], 30), sp.Float("1e-9", 30)
+        ahead, behind = (exact(**{name: middle + sign * small}) for sign in (1, -1))
+        right, left = (ahead - exact()) / small, (exact() - behind) / small
+        assume(abs(right - left) < 1e-5 * (1 + abs(right)))  # not at a kink or a jump
+        slope = float((ahead - behind) / (2 * small))
+        assert yp[0, 0, k, 0] == pytest.approx(slope, rel=1e-8, abs=1e-8)
+
+
+def test_lanes_left_out_are_left_alone():
+    model = model_of("a*x", "b + w")
+    made = kernels(model, backend="numba")
+    u = np.ones((2, 5))
+    y = np.full((4, 2, 5), 7.0)
+    p = np.arange(8.0).reshape(4, 2)
+    made.output(np.empty((4, 0, 5)), u, p, np.array([2, 0]), y)
+    np.testing.assert_array_equal(y[[1, 3]], 7.0)
+    np.testing.assert_array_equal(y[2, :, 0], [4.0, 6.0])
+
+
+def test_a_kernel_split_into_loops_equals_the_whole():
+    """More results than a compiled loop stores: the back ends agree on all of them."""
+    texts = [f"sin({k}*a*x) + b*w*{k}" for k in range(1, 4)] + [
+        f"{k}*atan(a*x) + a*b*w**{k}" for k in range(1, 15)
+    ]
+    x, w = np.linspace(-1, 1, 77), np.linspace(2, 3, 77)
+    p = np.array([[0.3, 2.0], [-1.1, 0.4]])
+    one = evaluated(model_of(*texts), "numpy", x, w, p)
+    other = evaluated(model_of(*texts), "numba", x, w, p)
+    for left, right in zip(one, other, strict=True):
+        # Powers to the fourteenth of 3 are 5e6; the last bits of a dozen products differ.
+        np.testing.assert_allclose(left, right, rtol=1e-13, atol=1e-13)
+
+
+def test_kernels_are_made_once_and_kept_where_the_environment_says(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path / "kernels"
+    model = model_of("a*x + 0.123456789*b*w")
+    first = kernels(model)
+    assert kernels(model) is first
+    (source,) = (tmp_path / "kernels").glob("*.py")
+    assert source.read_text() == first.source
+    other = kernels(model, active=("b",))
+    assert other.derived.active == ("b",)
+
+
+def test_a_folder_that_cannot_be_written_costs_only_the_cache(tmp_path, monkeypatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(blocked))
+    assert cache_folder().is_dir()
+
+
+def test_conditions_and_states_take_their_declared_places():
+    model = thermomechanical_oleo(2)
+    derived = kernels(model, backend="numpy").derived
+    assert derived.orders == (2, 1)
+    assert [s.name for s in derived.states] == [
+        "stroke",
+        "dot(stroke)",
+        "ddot(stroke)",
+        "temperature",
+        "dot(temperature)",
+    ]
+    assert derived.constants == (*model.parameters, *model.conditions)
+    assert isinstance(model.conditions["initial_pressure"], Condition)
