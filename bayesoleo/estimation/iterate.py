@@ -8,7 +8,7 @@ Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,16 @@ _NEGLIGIBLE_GAIN = 1e-6
 _MANY_HALVINGS = 4
 # Distance to the fixed point, in standard deviations, up to which a small step means convergence.
 _NEAR = 0.1
+# A step that turns back by more than this part of the last one overshoots: linear equations that
+# lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
+_OVERSHOOT = 0.3
+# Cosine from which two steps lie on one line; off it nothing is known of the overshoot.
+_ON_ONE_LINE = 0.9
+# So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
+_IDLE = 3
+# Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
+# asks for certified digits gets them, if slowly.
+_IDLE_STEPS = 1e3
 
 
 @dataclass(frozen=True)
@@ -152,6 +162,54 @@ class _Point:
         return self.evaluation.status
 
 
+@dataclass(frozen=True)
+class _Pace:
+    """How the last step compares with the one before it, by which the next one is shortened.
+
+    Near the fixed point the error along one line shrinks from ``e`` to ``(1 - s k) e``, where ``s``
+    is the part of the proposed step that was taken and ``k`` its overshoot. Two proposals on that
+    line tell ``k``, and the part ``1/k`` ends the zigzag (Aitken's process, 1926).
+
+    Parameters
+    ----------
+    taken : ndarray, shape (l,)
+        The last step, in scaled unknowns.
+    part : float
+        Of the proposal that was taken.
+    idle : int
+        Iterations in a row that were slow and gained nothing.
+    slow : bool
+        The present proposal is not much shorter than the last step.
+    overshoot : float
+        The present estimate of ``k``; one where nothing says otherwise.
+    """
+
+    taken: Array | None = None
+    part: float = 1.0
+    idle: int = 0
+    slow: bool = False
+    overshoot: float = 1.0
+
+    def look(self, proposal: Array, rows: Array) -> _Pace:
+        """Compare a proposal with the last step in the metric ``rows' rows``."""
+        if self.taken is None:
+            return self
+        new, old = rows @ proposal, rows @ self.taken
+        lengths = float(np.linalg.norm(new)), float(np.linalg.norm(old))
+        if lengths[1] == 0 or lengths[0] == 0:
+            return replace(self, slow=False, overshoot=1.0)
+        cosine = float(new @ old) / (lengths[0] * lengths[1])
+        ratio = lengths[0] / lengths[1]
+        overshoot = 1 / self.part - np.sign(cosine) * ratio
+        if abs(cosine) < _ON_ONE_LINE or overshoot < 1 + _OVERSHOOT:
+            overshoot = 1.0
+        return replace(self, slow=ratio > _OVERSHOOT, overshoot=float(overshoot))
+
+    def after(self, taken: Array, part: float, idle: bool) -> _Pace:
+        """Pace after a step that was a part of its proposal and gained nothing, or something."""
+        return _Pace(taken, part, self.idle + 1 if idle and self.slow else 0)
+
+
 class _Loop:
     """The iteration's current point and history; lives inside :func:`iterate` only."""
 
@@ -170,6 +228,7 @@ class _Loop:
         self.history: list[Iteration] = []
         self.evaluations, self.distance = 0, np.nan
         self.point: _Point
+        self.no_rows = np.zeros((0, len(self.scale.sd)))
 
     def look(self, theta: Array) -> _Point:
         self.evaluations += 1
@@ -191,15 +250,19 @@ class _Loop:
 
     def run(self, tolerance: float, max_iterations: int) -> Status:
         """Iterate until a step is small and the fixed point near, or nothing helps."""
+        pace = _Pace()
         for _ in range(max_iterations):
             variance = self.variance()
             equations = self.equations(variance)
             if not np.isfinite(equations.jacobian).all():
                 return Status.NOT_FINITE
-            proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
+            weight = self.step.rows(self.state, equations.jacobian)
+            proposal = equations.solve(weight)
             small = self.is_small(proposal, equations, tolerance)
+            pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
             before = self.point
-            trial, halvings, taken = self.shorten(proposal, equations, variance)
+            part = 1 / pace.overshoot
+            trial, halvings, taken = self.shorten(part * proposal, equations, variance)
             if halvings >= _MANY_HALVINGS:
                 gain = 0.5 * float(proposal @ equations.gradient)
                 small = small or gain <= _NEGLIGIBLE_GAIN
@@ -207,13 +270,14 @@ class _Loop:
                 self.move(trial, halvings)
             elif not small:
                 return Status.NO_CONVERGENCE if trial.status.ok else trial.status
-            if small:
+            won = self.merit(self.point, variance) - self.merit(before, variance)
+            pace = pace.after(taken, part * 0.5**halvings, self.is_idle(won, equations, tolerance))
+            if small or pace.idle >= _IDLE:
                 self.distance = self.equations(self.variance()).distance()
                 if self.distance <= _NEAR:
                     return Status.CONVERGED
                 if self.step.locks or self.point is before:
                     return Status.NO_CONVERGENCE
-            won = self.merit(self.point, variance) - self.merit(before, variance)
             expected = equations.expected_gain(taken)
             ratio = won / expected if expected > 0 else 1.0
             self.state = self.step.accept(self.state, equations.jacobian, ratio)
@@ -267,3 +331,12 @@ class _Loop:
         size = np.abs(self.scale.sd * proposal)
         unit = np.maximum(np.abs(self.point.theta), self.scale.sd * equations.sd())
         return bool(np.all(size <= tolerance * unit))
+
+    def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:
+        """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
+        nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
+        if won > nothing:
+            return False
+        # A prior that only scales the steps must not hide how far the optimum is.
+        rows = np.eye(len(equations.slope)) if self.step.fixed_prior else self.no_rows
+        return equations.expected_gain(equations.solve(rows)) <= nothing

@@ -156,3 +156,55 @@ def test_given_starts_are_used_in_any_number_of_threads():
     assert len(one) == len(two) == 1
     assert one.hits == two.hits == (6,)
     np.testing.assert_array_equal(one[0].theta, two[0].theta)
+
+
+def misfit_problem(curvature):
+    """Two groups, the second of which the model misses by more than one: Gauss-Newton overshoots.
+
+    The sum of squares has ``1 + 2 k (1 + k t^2)/(1 + 4 k^2 t^2)`` times the curvature that the
+    sensitivities show, with ``k`` the curvature given.
+    """
+    group = np.repeat([0.0, 1.0], 50)
+    noise = np.random.default_rng(0).normal(0.0, 0.01, group.size)
+    return FunctionProblem(
+        lambda x, t: np.where(x < 0.5, t[0], 1 + curvature * t[0] ** 2),
+        group,
+        np.where(group < 0.5, 0.3, 0.0) + noise,
+        [Normal(0.0, 100.0)],
+        start=[0.8],
+    )
+
+
+@pytest.mark.parametrize("method", ["be", "mbe", "mmve", "gauss-newton", "levenberg-marquardt"])
+@pytest.mark.parametrize("curvature", [0.3, 0.45, 0.49])
+def test_overshooting_steps_are_shortened(method, curvature):
+    point = estimate(misfit_problem(curvature), method)
+    assert point.status is Status.CONVERGED
+    # undamped, a curvature of 0.49 leaves 0.93 of the error in each iteration
+    assert point.iterations <= 8
+    first, second = misfit_problem(curvature).evaluate(point.theta).residual[0].reshape(2, 50)
+    slope = first.sum() + 2 * curvature * point.theta[0] * second.sum()
+    # the wide prior of BE moves the optimum by 1e-7
+    assert slope / 50 == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("method", ["mbe", "gauss-newton"])
+def test_slow_steps_that_gain_nothing_are_convergence(method):
+    """A sensitivity four times too large leaves 3/4 of the error in each iteration."""
+    y = np.random.default_rng(1).normal(1.0, 5.0, 50)
+    problem = FunctionProblem(
+        lambda x, t: t[0] * x,
+        np.ones(50),
+        y,
+        [Normal(0.0, 100.0)],
+        start=[30.0],
+        jacobian=lambda x, _: 4 * x[:, None],
+    )
+    point = estimate(problem, method)
+    assert point.status is Status.CONVERGED
+    # 40 standard deviations fall to 0.001 in 37 iterations, and to the tolerance in 61
+    assert 30 < point.iterations < 45
+    assert point.theta[0] == pytest.approx(y.mean(), abs=1e-3)
+    strict = estimate(problem, method, tolerance=1e-9, max_iterations=200)
+    assert strict.iterations > 55
+    assert strict.theta[0] == pytest.approx(y.mean(), abs=1e-6)
