@@ -20,7 +20,7 @@ from bayesoleo.solvers.status import Status
 Array = NDArray[np.float64]
 
 #: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
-BLOCK = 16
+BLOCK = 32
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from bayesoleo.solvers.status import Status
 Array = NDArray[np.float64]
 
 #: Parameter vectors whose samples are evaluated together.
-CHUNK = 4
+CHUNK = 8
 #: A start extrapolated too far is retried along a path of this many pieces.
 PATH_PIECES = (4, 16)
 

@@ -1,4 +1,4 @@
-"""Force-driven runs over the whole of the thesis's test plan are solved from both kinds of guess."""
+"""Force-driven runs over the whole of the thesis's plan are solved from both kinds of guess."""
 
 from dataclasses import replace
 
