@@ -1,0 +1,161 @@
+"""Arguments and options that several commands take, with the words that ``--help`` shows."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bayesoleo.errors import InputError
+
+if TYPE_CHECKING:
+    from bayesoleo.workflow import Settings
+
+RUNNING, SOLVING, OUTPUT = "How it is run", "How the model is solved", "What is written"
+SCHEMES = ("radau2", "radau3", "gauss2", "gauss3", "thesis")
+
+CampaignPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CAMPAIGN", show_default=False, help="Folder with campaign.toml and a file a run."
+    ),
+]
+ModelText = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="MODEL",
+        show_default=False,
+        help="Built-in system, or file.py:object. A file is code, and is run.",
+    ),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        "-o",
+        metavar="DIR",
+        show_default=False,
+        rich_help_panel=OUTPUT,
+        help="Folder to write to. An older result in it stays until the new one is complete.",
+    ),
+]
+Json = Annotated[
+    bool, typer.Option("--json", rich_help_panel=OUTPUT, help="Print JSON, for programs.")
+]
+Seed = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        metavar="N",
+        rich_help_panel=RUNNING,
+        help="The same seed gives the same result, whatever the number of threads.",
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        show_default="all cores",
+        rich_help_panel=RUNNING,
+        help="Threads.",
+    ),
+]
+Quiet = Annotated[
+    bool,
+    typer.Option("--quiet", "-q", rich_help_panel=RUNNING, help="No progress, only the result."),
+]
+Quick = Annotated[
+    bool,
+    typer.Option(
+        "--quick",
+        rich_help_panel=RUNNING,
+        help="Draw enough for intervals of two digits only.",
+    ),
+]
+EffectiveSize = Annotated[
+    int,
+    typer.Option(
+        min=10,
+        metavar="N",
+        rich_help_panel=RUNNING,
+        help="Draw until every parameter has this effective sample size.",
+    ),
+]
+Drive = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CHANNEL|model",
+        show_default="what the campaign says is controlled",
+        rich_help_panel=SOLVING,
+        help="Channel that drives the model; 'model' keeps its own inputs.",
+    ),
+]
+Scheme = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        rich_help_panel=SOLVING,
+        help=f"Discretisation: {', '.join(SCHEMES)} (second-order backward differences).",
+    ),
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(
+        min=8,
+        metavar="N",
+        show_default="refined until the estimate stays",
+        rich_help_panel=SOLVING,
+        help="Steps a period.",
+    ),
+]
+MaxEffects = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        metavar="N",
+        rich_help_panel=RUNNING,
+        help="Add at most this many effects.",
+    ),
+]
+
+
+def settings(
+    *,
+    seed: int = 0,
+    jobs: int | None = None,
+    quick: bool = False,
+    effective_size: int = 1000,
+    scheme: str = "radau3",
+    steps: int | None = None,
+    max_effects: int = 4,
+    drive: str | None = None,
+) -> Settings:
+    """Settings of the workflow from options.
+
+    Raises
+    ------
+    InputError
+        If there is no such scheme.
+    """
+    from bayesoleo.workflow import Settings
+
+    if scheme not in SCHEMES:
+        close = difflib.get_close_matches(scheme, SCHEMES, 1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        hint += f"one of: {', '.join(SCHEMES)}"
+        raise InputError("unknown scheme", key="--scheme", value=scheme, hint=hint)
+    return Settings(
+        seed=seed,
+        jobs=jobs,
+        quick=quick,
+        effective_size=effective_size,
+        scheme=scheme,
+        steps=steps,
+        max_effects=max_effects,
+        drive=drive,
+    )

@@ -1,0 +1,320 @@
+"""Steps of the loop, each a command of its own: reduce, estimate, sample, trace."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bayesoleo import schema
+from bayesoleo.cli import options, shell, tables
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from rich.console import Console
+
+    from bayesoleo.data import ReducedCampaign
+
+PANEL = "Single steps"
+#: Candidates that ``trace`` shows in the terminal.
+SHOWN = 12
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    shell.add(app, PANEL, reduce, estimate, sample, trace)
+
+
+def reduce(
+    campaign: options.CampaignPath,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE.nc",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Write samples, constants and noise to a netCDF file as well.",
+        ),
+    ] = None,
+    as_json: options.Json = False,
+    jobs: options.Jobs = None,
+    quiet: options.Quiet = False,
+) -> None:
+    """Show what the records of a campaign hold: frequencies, whole periods, harmonics and noise.
+
+    Frequencies are refined from the declared ones; leading periods that have not settled are left
+    out. Of each channel the significant harmonics are counted; its noise is the standard deviation
+    of a single sample about the periodic mean. Writes nothing without --out.
+
+    \b
+    Examples:
+      bayesoleo reduce shaker
+      bayesoleo reduce shaker --json > runs.json
+    """
+    from bayesoleo import workflow
+
+    if out is not None:
+        shell.check_writable(out.parent)
+    found = workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet))
+    if out is not None:
+        _write_records(found, out)
+    if as_json:
+        units = {name: channel.si_unit for name, channel in found.campaign.channels.items()}
+        facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
+        shell.print_json(tables.plain(facts))
+    else:
+        _print_records(found, shell.console())
+
+
+def _runs(reduced: ReducedCampaign) -> list[dict[str, Any]]:
+    """What there is to say of every run, SI."""
+    return [
+        {
+            "run": record.label,
+            "role": record.role,
+            "group": record.group,
+            "kind": record.kind,
+            "frequency": record.frequency,
+            "frequency_sd": record.frequency_sd,
+            "periods": record.periods,
+            "dropped_periods": record.dropped_periods,
+            "samples": record.time.size,
+            "conditions": dict(record.conditions),
+            "channels": {
+                name: {
+                    "harmonics": _orders(record.harmonics.get(name)),
+                    "noise": record.signal_noise[name],
+                }
+                for name in record.samples
+            },
+        }
+        for record in reduced.records
+    ]
+
+
+def _orders(harmonics: Any) -> int | None:
+    """Number of significant harmonics, the mean not counted."""
+    return None if harmonics is None else int((harmonics.orders > 0).sum())
+
+
+def _print_records(reduced: ReducedCampaign, console: Console) -> None:
+    from bayesoleo.plots.units import engineering
+
+    runs, channels = _runs(reduced), reduced.campaign.channels
+    head = ["run", "role", "frequency [Hz]", "± sd", "periods", "left out", "samples"]
+    cells: list[list[Any]] = [
+        [
+            run["run"],
+            run["role"],
+            f"{run['frequency']:.6g}" if run["kind"] == "periodic" else None,
+            float(run["frequency_sd"]),
+            run["periods"] or None,
+            run["dropped_periods"],
+            run["samples"],
+        ]
+        for run in runs
+    ]
+    for name, channel in channels.items():
+        noise = [run["channels"][name]["noise"] for run in runs]
+        scale = engineering(channel.si_unit, sorted(noise)[len(noise) // 2])
+        head += [f"{name}: harmonics", f"noise [{scale.unit or '1'}]"]
+        for row, run, level in zip(cells, runs, noise, strict=True):
+            row += [run["channels"][name]["harmonics"], f"{scale.factor * level:.3g}"]
+    console.print(tables.table(head, cells, words=2))
+
+
+def _write_records(reduced: ReducedCampaign, out: Path) -> None:
+    import xarray as xr
+
+    from bayesoleo.storage import provenance, write_tree
+    from bayesoleo.tracing.result import records_tree
+
+    campaign = reduced.campaign
+    tree = xr.DataTree.from_dict(records_tree(list(reduced.records), campaign))
+    about = {
+        schema.CAMPAIGN: campaign.name,
+        schema.CAMPAIGN_DESCRIPTION: campaign.description,
+        schema.CAMPAIGN_SHA256: campaign.sha256,
+    }
+    tree.attrs.update(provenance(None, **about))
+    write_tree(tree, out)
+
+
+def estimate(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    out: options.Out = None,
+    jobs: options.Jobs = None,
+    quiet: options.Quiet = False,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    steps: options.Steps = None,
+    as_json: options.Json = False,
+) -> None:
+    """Estimate the parameters from the runs with role fit: MBE, then the mode of the posterior.
+
+    Prints start, MBE point, mode and linearised standard deviation. Writes nothing without --out;
+    with it, results.nc in that folder.
+
+    \b
+    Examples:
+      bayesoleo estimate shaker --model f16n2d2
+      bayesoleo estimate shaker --model model.py:model --drive model --out point
+    """
+    from bayesoleo import workflow
+    from bayesoleo.modelfile import load_model
+
+    if out is not None:
+        shell.check_writable(out)
+    chosen = options.settings(jobs=jobs, scheme=scheme, steps=steps, drive=drive)
+    declared = load_model(model)
+    with shell.stoppable(out):
+        tree = workflow.estimate(campaign, declared, chosen, out=out, say=shell.teller(quiet))
+    if as_json:
+        shell.print_json(tables.plain({"parameters": _point(tree), "status": _status(tree)}))
+        return
+    console = shell.console()
+    names = ("unit", "start", "mbe", "estimate", "sd")
+    rows = [[name, *(row[key] for key in names)] for name, row in _point(tree).items()]
+    console.print(tables.table(["parameter", *names], rows, words=2))
+    console.print(_status(tree)["status_message"], style="dim", markup=False)
+    _print_written(out, console)
+
+
+def _point(tree: xr.DataTree) -> dict[str, dict[str, Any]]:
+    point = tree[schema.POINT].to_dataset()
+    keys = (schema.START, schema.MBE, schema.ESTIMATE, schema.SD)
+    return {
+        str(name): {"unit": str(point[schema.UNIT].values[k])}
+        | {key: float(point[key].values[k]) for key in keys}
+        for k, name in enumerate(point[schema.PARAMETER].values)
+    }
+
+
+def _status(tree: xr.DataTree) -> dict[str, Any]:
+    return dict(tree[schema.POINT].attrs)
+
+
+def sample(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    out: options.Out = None,
+    quick: options.Quick = False,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    effective_size: options.EffectiveSize = 1000,
+    quiet: options.Quiet = False,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    steps: options.Steps = None,
+) -> None:
+    """Sample the posterior from the estimate until the effective size asked for is reached.
+
+    No effect is looked for. Draws are saved as they are made: the same command goes on where it was
+    stopped.
+
+    \b
+    Written to DIR, by default bayesoleo-<name of the campaign>-sample in the current folder:
+      results.nc      records, point estimate and posterior
+
+    \b
+    Examples:
+      bayesoleo sample shaker --model f16n2d2 --quick
+      bayesoleo sample shaker --model model.py:model --effective-size 4000
+    """
+    from bayesoleo import workflow
+    from bayesoleo.modelfile import load_model
+
+    folder = shell.output_folder(out, lambda: f"bayesoleo-{shell.campaign_name(campaign)}-sample")
+    chosen = options.settings(
+        seed=seed,
+        jobs=jobs,
+        quick=quick,
+        effective_size=effective_size,
+        scheme=scheme,
+        steps=steps,
+        drive=drive,
+    )
+    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    declared = load_model(model)
+    with shell.stoppable(folder):
+        tree = workflow.sample(campaign, declared, chosen, out=folder, say=say, progress=progress)
+    console = shell.console()
+    _print_posterior(tree, console)
+    _print_written(folder, console)
+
+
+def _print_posterior(tree: xr.DataTree, console: Console) -> None:
+    posterior = tree[schema.POSTERIOR].to_dataset()
+    about = tree[schema.SAMPLE_STATS].attrs
+    size = json.loads(str(about.get("effective_sample_size", "{}")))
+    rows = []
+    for name, draws in posterior.data_vars.items():
+        low, high = draws.quantile([0.025, 0.975]).values
+        values = [float(draws.mean()), float(draws.std()), float(low), float(high)]
+        # One number for all, or one for each.
+        effective = size.get(str(name)) if isinstance(size, dict) else size
+        count = None if effective is None else round(effective)
+        rows.append([str(name), str(draws.attrs.get(schema.UNITS, "")), *values, count])
+    head = ["parameter", "unit", "mean", "sd", "2.5 %", "97.5 %", "effective draws"]
+    console.print(tables.table(head, rows, words=2))
+    if about.get("warning"):
+        shell.complain(f"warning: {about['warning']}")
+
+
+def trace(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    out: options.Out = None,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    quiet: options.Quiet = False,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    steps: options.Steps = None,
+) -> None:
+    """Hold the residual against its noise and rank what may be missing; add nothing.
+
+    One round of the loop: the model is fitted, its residual is averaged over the periods and
+    compared with the noise of that average, and every effect of the catalogue is scored without
+    being fitted. Writes nothing without --out; with it, results.nc, report.html and summary.json in
+    that folder.
+
+    \b
+    Examples:
+      bayesoleo trace shaker --model f16n1d2
+      bayesoleo trace shaker --model f16n1d2 --out ranking
+    """
+    from bayesoleo import workflow
+    from bayesoleo.modelfile import load_model
+    from bayesoleo.report import print_summary
+    from bayesoleo.report.tables import candidates
+
+    if out is not None:
+        shell.check_writable(out)
+    chosen = options.settings(seed=seed, jobs=jobs, scheme=scheme, steps=steps, drive=drive)
+    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    declared = load_model(model)
+    with shell.stoppable(out):
+        tree = workflow.trace(campaign, declared, chosen, out=out, say=say, progress=progress)
+    summary = json.loads(tree.attrs[schema.SUMMARY])
+    console = shell.console()
+    first = summary["rounds"][0]
+    if first["candidates"]:
+        ranking = candidates(first)
+        console.print(tables.table(ranking.head, ranking.rows[:SHOWN], words=ranking.words))
+        if len(ranking.rows) > SHOWN:
+            console.print(f"and {len(ranking.rows) - SHOWN} more", style="dim")
+    print_summary({**summary, "files": {}}, console)
+    _print_written(out, console)
+
+
+def _print_written(out: Path | None, console: Console) -> None:
+    """Say where the result is."""
+    if out is not None and (out / "results.nc").exists():
+        console.print()
+        console.print(f"result    {out / 'results.nc'}", markup=False, soft_wrap=True)

@@ -1,0 +1,142 @@
+"""``MODEL`` on the command line: the name of a built-in system, or ``file.py:object``."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+from bayesoleo.errors import InputError, ModelError
+from bayesoleo.model import Model
+from bayesoleo.systems import system
+
+DEFAULT_OBJECT = "model"
+_HINT = "write file.py:object"
+
+
+def load_model(text: str) -> Model:
+    """The model that a text names.
+
+    Parameters
+    ----------
+    text : str
+        Name of a built-in system, or ``file.py:object``; ``object`` is ``model`` where it is left
+        out. A file is code: it is run here, and only when it is named.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ModelError
+        No such system, file or object; the object is not a model; the file raises something, which
+        is told with its line.
+
+    Examples
+    --------
+    >>> load_model("gas_spring").name
+    'gas_spring'
+    """
+    file, colon, name = text.rpartition(":")
+    if text.endswith(".py"):
+        file, name = text, DEFAULT_OBJECT
+    elif not (colon and file.endswith(".py")):
+        return _built_in(text)
+    path = Path(file).expanduser()
+    found = vars(_run(path))
+    name = name or DEFAULT_OBJECT
+    if name not in found:
+        raise ModelError("no such object", file=path, value=name, hint=_models_in(found, path))
+    model = found[name]
+    if not isinstance(model, Model):
+        problem = f"{name} is not a Model but {type(model).__name__}"
+        raise ModelError(problem, file=path, hint=_models_in(found, path))
+    return model
+
+
+def _built_in(text: str) -> Model:
+    try:
+        return system(text)
+    except InputError as error:
+        hint = error.hint
+        if Path(text).exists():
+            hint = "there is a file of that name, but a model file ends in .py"
+        elif any(mark in text for mark in "/\\:"):
+            hint = f"{_HINT}, or the name of a built-in system (bayesoleo systems lists them)"
+        raise ModelError(error.problem, value=text, hint=hint) from None
+
+
+def _models_in(found: dict[str, object], path: Path) -> str:
+    names = [name for name, item in found.items() if isinstance(item, Model)]
+    if not names:
+        return f"the file holds no Model; write {DEFAULT_OBJECT} = Model(...)"
+    return f"write {' or '.join(f'{path}:{name}' for name in names)}"
+
+
+def _run(path: Path) -> ModuleType:
+    """Run a file as a module of its own that stays out of ``sys.modules``."""
+    try:
+        source = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelError("there is no such file", file=path, hint=_HINT) from None
+    except OSError as error:
+        raise ModelError(f"cannot be read: {error.strerror}", file=path) from error
+    # No name that a user's own module could have.
+    name = f"_bayesoleo_model_{hashlib.sha256(bytes(path.resolve())).hexdigest()[:16]}"
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    try:
+        with _importing_beside(path, module):
+            exec(compile(source, str(path), "exec"), module.__dict__)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever the user's code raises, SystemExit too
+        raise _told(error, path) from error
+    return module
+
+
+@contextmanager
+def _importing_beside(path: Path, module: ModuleType) -> Iterator[None]:
+    """While it runs, the file finds what lies beside it, and nothing is written there."""
+    folder, wrote = str(path.resolve().parent), sys.dont_write_bytecode
+    sys.path.append(folder)  # last, so that it hides no installed package
+    sys.modules[module.__name__] = module  # dataclasses look themselves up
+    sys.dont_write_bytecode = True
+    try:
+        yield
+    finally:
+        sys.dont_write_bytecode = wrote
+        sys.modules.pop(module.__name__, None)
+        if folder in sys.path:
+            sys.path.reverse()
+            sys.path.remove(folder)  # the one at the end
+            sys.path.reverse()
+
+
+def _told(error: BaseException, path: Path) -> ModelError:
+    """What went wrong in the file, with its line, in one line."""
+    line = _line(error, path)
+    where = f"line {line}: " if line else ""
+    if isinstance(error, InputError):
+        problem, key, value, hint = error.problem, error.key, error.value, error.hint
+        return ModelError(where + problem, file=path, key=key, value=value, hint=hint)
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    problem = f"{where}{type(error).__name__}: {text}".rstrip(": ")
+    return ModelError(problem, file=path, hint="correct the model file")
+
+
+def _line(error: BaseException, path: Path) -> int | None:
+    """Number of the last line of the file that was being run."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return error.lineno
+    lines = [
+        frame.lineno
+        for frame in traceback.extract_tb(error.__traceback__)
+        if frame.filename == str(path)
+    ]
+    return lines[-1] if lines else None

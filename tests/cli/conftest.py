@@ -1,0 +1,145 @@
+"""A small good campaign and model to break, and the ways to run a command."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bayesoleo.cli import app
+
+TREE = Path(__file__).parents[1] / "plots" / "synthetic_tree.py"
+
+CAMPAIGN = """
+format = 1
+name = "mass on a spring"
+
+[channels.force]
+column = "f_N"
+unit = "N"
+[channels.displacement]
+column = "x_mm"
+unit = "mm"
+
+[[runs]]
+label = "slow"
+file = "slow.csv"
+frequency = 1.0
+role = "fit"
+[[runs]]
+label = "fast"
+file = "fast.csv"
+frequency = 2.0
+role = "hold-out"
+"""
+
+MODEL = """
+from bayesoleo import Model, Output, Parameter
+
+model = Model(
+    "linear oscillator",
+    inputs={"force": "N"},
+    dofs={"position": "m"},
+    parameters={
+        "mass": Parameter(1.0, "kg", fixed=True),
+        "damping": Parameter(5.0, "N*s/m", relative_sd=1.0),
+        "stiffness": Parameter(2e3, "N/m", relative_sd=0.5),
+    },
+    equations={
+        "position": "mass*ddot(position) + damping*dot(position) + stiffness*position - force"
+    },
+    outputs={"displacement": Output("position", "m")},
+)
+"""
+
+
+def rows(frequency: float) -> np.ndarray:
+    """Time, force in N and displacement in mm over four periods."""
+    rng = np.random.default_rng(5)
+    time = np.arange(400) / (100 * frequency)
+    w = 2 * np.pi * frequency
+    force = 20 * np.cos(w * time)
+    answer = (20 / (2e3 - w**2 + 5j * w) * np.exp(1j * w * time)).real * 1e3
+    noise = rng.normal(size=(2, time.size)) * [[0.02], [0.01]]
+    return np.column_stack([time, force + noise[0], answer + noise[1]])
+
+
+def write_rows(path: Path, values: np.ndarray, header: str = "time_s,f_N,x_mm") -> None:
+    np.savetxt(path, values, delimiter=",", header=header, comments="", fmt="%.10g")
+
+
+@pytest.fixture
+def campaign(tmp_path: Path) -> Path:
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    (folder / "campaign.toml").write_text(CAMPAIGN)
+    for label, frequency in (("slow", 1.0), ("fast", 2.0)):
+        write_rows(folder / f"{label}.csv", rows(frequency))
+    return folder
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "spring.py"
+    path.write_text(MODEL)
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """Run a command in an empty folder, ``work``."""
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.delenv("BAYESOLEO_DEBUG", raising=False)
+
+    def invoke(*arguments: object):
+        return CliRunner().invoke(app, [str(item) for item in arguments])
+
+    return invoke
+
+
+@pytest.fixture
+def refused(run: Callable, tmp_path: Path) -> Callable:
+    """Run a command that cannot be done: one line, exit status 2, nothing written anywhere."""
+
+    def invoke(*arguments: object) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        result = run(*arguments)
+        assert result.exit_code == 2, result.output
+        assert result.stdout == ""
+        (line,) = result.stderr.splitlines()
+        assert line.startswith("error: ")
+        assert "Traceback" not in line
+        assert sorted(tmp_path.rglob("*")) == before
+        return line
+
+    return invoke
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Callable:
+    """Run the real command in a process of its own."""
+
+    def start(*arguments: object, **options: object) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-W", "error", "-m", "bayesoleo", *map(str, arguments)]
+        return subprocess.run(
+            command, capture_output=True, text=True, cwd=tmp_path, timeout=120, **options
+        )
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def made_up():
+    """Results from closed formulas, made for the plots' tests."""
+    spec = importlib.util.spec_from_file_location("synthetic_tree_of_commands", TREE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

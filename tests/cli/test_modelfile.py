@@ -1,0 +1,58 @@
+"""A model by the name of a built-in system or from a file, which leaves no trace behind."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from conftest import MODEL
+
+from bayesoleo.errors import ModelError
+from bayesoleo.modelfile import load_model
+
+
+def test_built_in_and_file(model):
+    assert load_model("duffing").name == "duffing"
+    for text in (f"{model}", f"{model}:", f"{model}:model"):
+        assert load_model(text).name == "linear oscillator"
+
+
+def test_module_and_path_are_as_before(model, tmp_path):
+    (tmp_path / "masses.py").write_text("MASS = 2.5\n")
+    text = MODEL.replace("Parameter(1.0,", "Parameter(MASS,")
+    model.write_text("from dataclasses import dataclass\nfrom masses import MASS\n" + text)
+    path, before = list(sys.path), sorted(tmp_path.rglob("*"))
+    modules = {name for name, module in sys.modules.items() if module is not None}
+    try:
+        assert load_model(str(model)).parameters["mass"].value == 2.5
+        assert set(sys.modules) - modules == {"masses"}
+    finally:
+        sys.modules.pop("masses", None)
+    assert sys.path == path
+    assert "spring" not in sys.modules
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_dataclasses_work_in_a_model_file(model):
+    lines = [
+        "from __future__ import annotations",
+        "from dataclasses import dataclass",
+        "@dataclass",
+        "class Mass:",
+        "    value: float = 1.0",
+    ]
+    model.write_text("\n".join(lines) + MODEL)
+    assert load_model(str(model)).name == "linear oscillator"
+
+
+def test_error_names_the_line_of_the_file_and_not_of_what_it_calls(model):
+    model.write_text("import json\n\njson.loads('{')\n")
+    with pytest.raises(ModelError, match=r"spring.py: line 3: JSONDecodeError: ") as caught:
+        load_model(str(model))
+    assert "\n" not in str(caught.value)
+
+
+def test_folder_cannot_be_a_model(tmp_path):
+    (tmp_path / "a.py").mkdir()
+    with pytest.raises(ModelError, match=r"a.py: cannot be read: Is a directory"):
+        load_model(str(tmp_path / "a.py"))

@@ -1,0 +1,105 @@
+"""How errors, warnings and interrupts reach the terminal, and where results go."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import pytest
+
+from bayesoleo import workflow
+from bayesoleo.cli import shell
+from bayesoleo.errors import DataWarning, InputError
+
+
+def test_error_in_a_process_of_its_own(process):
+    done = process("effects", "nothing")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: unknown effect (got 'nothing'); ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_debug_shows_the_traceback(process):
+    done = process("systems", "nothing", env={**os.environ, "BAYESOLEO_DEBUG": "1"})
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+    assert "ModelError: unknown system (got 'nothing')" in done.stderr
+
+
+def test_unexpected_exceptions_are_not_hidden(run, monkeypatch, campaign):
+    def broken(*_, **__):
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(workflow, "reduce", broken)
+    result = run("reduce", campaign)
+    assert isinstance(result.exception, RuntimeError)
+
+
+def test_warning_is_one_line(run, monkeypatch, campaign):
+    def warns(*_, **__):
+        warnings.warn("noise\nis large", DataWarning, stacklevel=1)
+        raise InputError("stop here")
+
+    monkeypatch.setattr(workflow, "reduce", warns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        result = run("reduce", campaign)
+    assert result.stderr.splitlines() == ["warning: noise is large", "error: stop here"]
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_interrupt_says_what_is_kept(run, monkeypatch, campaign, model, tmp_path, kept):
+    out = tmp_path / "out"
+
+    def interrupted(*_, out, **__):
+        if kept:
+            (out / "checkpoints" / "a").mkdir(parents=True)
+            (out / "checkpoints" / "a" / "segment-000000.npz").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workflow, "close", interrupted)
+    result = run("close", campaign, "--model", model, "--out", out)
+    assert result.exit_code == 130
+    (line,) = result.stderr.splitlines()
+    if kept:
+        assert line.startswith(f"stopped: an older result in {out} is as it was; draws made so far")
+    else:
+        assert line == "stopped: nothing was written"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_interrupt_of_a_process(tmp_path):
+    # The model file waits, so that the signal comes while a command is at work.
+    file = tmp_path / "slow.py"
+    file.write_text("import time\nprint('waiting', flush=True)\ntime.sleep(60)\n")
+    command = [sys.executable, "-m", "bayesoleo", "systems", str(file)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "waiting\n"
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert errors == "stopped; nothing was written\n"
+
+
+def test_default_folder_carries_the_name_of_the_campaign(campaign):
+    toml = campaign / "campaign.toml"
+    assert shell.campaign_name(campaign) == "mass-on-a-spring"
+    toml.write_text(toml.read_text().replace("mass on a spring", "../a:b/ c/"))
+    assert shell.campaign_name(toml) == "a-b-c"
+
+
+def test_probing_a_folder_leaves_nothing(tmp_path):
+    shell.check_writable(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_paragraphs_flow_but_for_marked_ones():
+    text = "Head.\n\n    One\n    two.\n\n    \b\n    a\n      b\n    "
+    assert shell.flowing(text) == "Head.\n\nOne two.\n\n\b\na\n  b"
