@@ -57,7 +57,7 @@ class BackwardDifferences:
 
     def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and differences at the nodes."""
-        z[lanes] = self._node_rows(x[lanes, :, :, None], step)[:, :, 0]
+        _rows(x, lanes, step, np.array(self.orders, dtype=np.int64), FIRST, SECOND, z)
 
     def _node_rows(self, x: Array, step: float) -> Array:
         """Values and differences at the nodes, shape (L, nz, C, n)."""
@@ -113,6 +113,26 @@ class BackwardDifferences:
         orders = np.array(self.orders, dtype=np.int64)
         _linear(gz, right, lanes, step, orders, FIRST, SECOND, initial, dx, monodromy, ok)
         return dx, monodromy, ok
+
+
+@jit
+def _rows(x, lanes, h, orders, first, second, z):
+    """``z (L, nz, n)``: values and differences; indices below zero count from the period's end."""
+    n = x.shape[1]
+    for lane in lanes:
+        row = 0
+        for j in range(orders.size):
+            for m in range(n):
+                rate = bend = 0.0
+                for past in range(4):
+                    value = x[lane, m - past, j]
+                    rate += first[past] * value
+                    bend += second[past] * value
+                z[lane, row, m] = x[lane, m, j]
+                z[lane, row + 1, m] = rate / h
+                if orders[j] == 2:
+                    z[lane, row + 2, m] = bend / (h * h)
+            row += orders[j] + 1
 
 
 #: Nodes whose equations are solved together, innermost in memory.
