@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -158,4 +160,5 @@ def settings(
         steps=steps,
         max_effects=max_effects,
         drive=drive,
+        command=shlex.join(["bayesoleo", *sys.argv[1:]]),
     )
