@@ -9,6 +9,8 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
+from threadpoolctl import threadpool_limits
+
 
 def available_cores() -> int:
     """Number of cores that this process may use."""
@@ -39,5 +41,9 @@ def thread_map[T, R](function: Callable[[T], R], items: Iterable[T], jobs: int |
     jobs = available_cores() if jobs is None else jobs
     if jobs <= 1 or len(work) <= 1:
         return [function(item) for item in work]
-    with ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool:
+    # Threads of ours that each call a linear algebra library with threads of its own would crowd each other out.
+    with (
+        threadpool_limits(limits=1, user_api="blas"),
+        ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool,
+    ):
         return list(pool.map(function, work))

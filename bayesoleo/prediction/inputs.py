@@ -28,7 +28,17 @@ def harmonics_of(record: Record, channel: str) -> Harmonics:
     return record.harmonics[channel]
 
 
-def input_rows(record: Record, rows: tuple[tuple[str, int], ...], phase: Array) -> Array:
+#: Rows computed before, by grid, channel and derivative; models of the same run share them.
+RowCache = dict[tuple[str, str, int], Array]
+
+
+def input_rows(
+    record: Record,
+    rows: tuple[tuple[str, int], ...],
+    phase: Array,
+    grid: str = "",
+    cache: RowCache | None = None,
+) -> Array:
     """Values of input rows ``(channel, derivative)``, shape (nu, N).
 
     Parameters
@@ -40,11 +50,20 @@ def input_rows(record: Record, rows: tuple[tuple[str, int], ...], phase: Array) 
         first sample.
     phase : ndarray, shape (N,)
         Cycles since the first sample.
+    grid : str
+        Names ``phase`` in the cache.
+    cache : dict, optional
+        Taken from and added to.
     """
+    known = {} if cache is None else cache
     table = np.empty((len(rows), phase.size))
     for k, (channel, derivative) in enumerate(rows):
         if channel == "time":
             table[k] = phase / record.frequency
         else:
-            table[k] = harmonics_of(record, channel).evaluate(phase, record.frequency, derivative)
+            key = (grid, channel, derivative)
+            if key not in known:
+                item = harmonics_of(record, channel)
+                known[key] = item.evaluate(phase, record.frequency, derivative)
+            table[k] = known[key]
     return table

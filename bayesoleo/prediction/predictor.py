@@ -58,6 +58,8 @@ class Predictor:
         Kernels; NumPy's are ready at once.
     jobs : int, optional
         Threads.
+    share : Predictor, optional
+        Of other models of the same runs; input rows are computed once for all.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class Predictor:
         scheme: str = DEFAULT_SCHEME,
         backend: str = "numba",
         jobs: int | None = None,
+        share: Predictor | None = None,
     ):
         self.model, self.records, self.steps, self.scheme, self.jobs = (
             model,
@@ -81,7 +84,12 @@ class Predictor:
         self.layout = Layout.of(model, [record.label for record in records])
         compiled = kernels(model, self.layout.active, backend)
         self.outputs = compiled.derived.outputs
-        build = _Builder(model, compiled, steps, scheme)
+        known = {} if share is None else {id(run.record): run.known_rows for run in share.runs}
+
+        def build(record: Record) -> RunPredictor:
+            rows = known.get(id(record))
+            return RunPredictor(model, compiled, record, steps, scheme, rows)
+
         self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
         self._base = np.stack([run.base_constants() for run in self.runs])
 
@@ -139,16 +147,3 @@ class Predictor:
         worst = status.max(axis=1, initial=0)
         total[worst != Status.CONVERGED.value] = np.nan
         return total, worst
-
-
-@dataclass(frozen=True)
-class _Builder:
-    """Builds the predictor of one run; a class because threads need no more than a callable."""
-
-    model: Model
-    compiled: object
-    steps: int
-    scheme: str
-
-    def __call__(self, record: Record) -> RunPredictor:
-        return RunPredictor(self.model, self.compiled, record, self.steps, self.scheme)  # type: ignore[arg-type]

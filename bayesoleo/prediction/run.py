@@ -13,7 +13,7 @@ from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.guess import Motion, guess_rows
-from bayesoleo.prediction.inputs import input_rows
+from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.continuation import solve_from_guess
 from bayesoleo.solvers.measures import positive, total
@@ -112,10 +112,18 @@ class RunPredictor:
         Steps of the mesh.
     scheme_name : str
         Discretisation.
+    known_rows : dict, optional
+        Input rows that another model of the same run has computed; this one adds to it.
     """
 
     def __init__(
-        self, model: Model, kernels: Kernels, record: Record, steps: int, scheme_name: str
+        self,
+        model: Model,
+        kernels: Kernels,
+        record: Record,
+        steps: int,
+        scheme_name: str,
+        known_rows: RowCache | None = None,
     ):
         self.model, self.kernels, self.record, self.steps = model, kernels, record, steps
         derived = kernels.derived
@@ -123,16 +131,20 @@ class RunPredictor:
         self.scheme = scheme(scheme_name, derived.orders)
         self.period = 1.0 / record.frequency
         self.points = self.scheme.phases(steps)
+        self.known_rows: RowCache = {} if known_rows is None else known_rows
+        grid = f"{scheme_name} {steps}"
         self.boundary = Boundary(
             equations=kernels,
             scheme=self.scheme,
             period=self.period,
-            inputs=input_rows(record, derived.inputs, self.points),
+            inputs=input_rows(record, derived.inputs, self.points, grid, self.known_rows),
             conditions=len(derived.admissible),
             active=len(derived.active),
         )
         self.plan = self.scheme.plan(record.phase, steps) if derived.dofs else None
-        self.sample_inputs = input_rows(record, derived.inputs, record.phase)
+        self.sample_inputs = input_rows(
+            record, derived.inputs, record.phase, "samples", self.known_rows
+        )
         self.measured = np.stack([record.samples[name] for name in derived.outputs])
         self.anchor: Anchor | None = None
         self.motions: dict[str, Motion] = {}

@@ -117,6 +117,7 @@ def fit_model(
     start: Array | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 50,
+    share: Predictor | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Estimate a model's parameters from runs.
@@ -135,6 +136,8 @@ def fit_model(
         Relative step at which the estimators stop.
     max_iterations : int
         Of each estimator.
+    share : Predictor, optional
+        Of the same runs; what does not depend on the model is taken from it.
     progress : callable, optional
         Told what is being done.
 
@@ -150,7 +153,7 @@ def fit_model(
     say = progress or (lambda _: None)
     steps = numerics.steps or first_steps(model, records)
     while True:
-        problem = _problem(model, records, numerics, steps)
+        problem = _problem(model, records, numerics, steps, share)
         say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
         mbe = estimate(problem, "mbe", start=start, tolerance=tolerance, max_iterations=max_iterations)
         say("posterior mode")
@@ -165,9 +168,11 @@ def fit_model(
         steps, start = 2 * steps, point.theta
 
 
-def _problem(model: Model, records: Sequence[Record], numerics: Numerics, steps: int) -> CampaignProblem:
+def _problem(
+    model: Model, records: Sequence[Record], numerics: Numerics, steps: int, share: Predictor | None
+) -> CampaignProblem:
     predictor = Predictor(
-        model, records, steps=steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs
+        model, records, steps=steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs, share=share
     )
     return CampaignProblem(predictor)
 
@@ -179,7 +184,7 @@ def _mesh_shift(
     coarse = problem.predictor
     theta = problem.full(point.theta[None])[0]
     fine = Predictor(
-        coarse.model, coarse.records, steps=2 * coarse.steps, scheme=coarse.scheme, backend=coarse.backend, jobs=coarse.jobs
+        coarse.model, coarse.records, steps=2 * coarse.steps, scheme=coarse.scheme, backend=coarse.backend, jobs=coarse.jobs, share=coarse
     )
     if any(status is not Status.CONVERGED for status in fine.set_anchor(theta)):
         return float("nan")

@@ -69,7 +69,7 @@ def predict_held_out(fit: Fit, records: Sequence[Record]) -> list[Prediction]:
 
 def _single(fit: Fit, record: Record) -> Predictor:
     numerics = fit.numerics
-    return Predictor(fit.model, [record], steps=fit.steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs)
+    return Predictor(fit.model, [record], steps=fit.steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs, share=fit.predictor)
 
 
 def _held_out(fit: Fit, record: Record) -> Prediction:

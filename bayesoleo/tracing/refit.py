@@ -84,8 +84,12 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     start = _start(base, score, model)
     # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
     quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
-    fit = fit_model(model, base.fit.records, quick, start=start, tolerance=1e-4, max_iterations=15)
-    return Refit(score, assembly.with_values(fit.shared), fit, share_of(base, fit))
+    fit = fit_model(
+        model, base.fit.records, quick, start=start, tolerance=1e-4, max_iterations=15, share=base.fit.predictor
+    )
+    share = share_of(base, fit)
+    # Where the extended model cannot be solved at its estimate it explains nothing.
+    return Refit(score, assembly.with_values(fit.shared), fit, share if np.isfinite(share) else -np.inf)
 
 
 def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
@@ -127,9 +131,8 @@ def _start(base: Base, score: Score, model: Model) -> Array:
 def share_of(base: Base, fit: Fit) -> float:
     """Part of the excess of the averaged residual that a refitted model takes away."""
     before = after = 0.0
-    for r in range(len(fit.records)):
-        w = base.weight[r][:, None]
-        before += float(np.sum(w * base.residual[r] ** 2))
-        residual = fit.predictor.runs[r].measured - fit.predictions[r].y
-        after += float(np.sum(w * residual**2))
+    for r, run in enumerate(base.runs):
+        before += float(run.residual @ run.residual)
+        residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
+        after += float(residual @ residual)
     return (before - after) / base.fall_back

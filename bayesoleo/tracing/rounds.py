@@ -142,7 +142,7 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
     for k, score in enumerate(scores):
         same = tuple(dict.fromkeys(scores[j].option.candidate.effect for j in groups[k]))
         fitted = refits.get(id(score))
-        gain = score.share if fitted is None else fitted.share
+        gain = score.share if fitted is None else max(fitted.share, 0.0)
         ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
     # What was estimated is known better than what was only scored, and comes first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
@@ -189,7 +189,7 @@ def _choose(
     tried = sorted((item for item in ranking if item.refitted), key=lambda item: -item.gain)
     reasons = []
     while tried:
-        near = [item for item in tried if item.gain >= tried[0].gain - AS_GOOD]
+        near = [item for item in tried if item.gain >= max(tried[0].gain, 0.0) - AS_GOOD]
         item = min(near, key=lambda one: refits[id(one.score)].size)
         tried.remove(item)
         result = refits[id(item.score)]

@@ -32,39 +32,54 @@ MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
 
 
 @dataclass(frozen=True)
-class InputNoise:
-    """Low-rank part of a run's noise covariance, ``diag(1/w) + B B'``, that comes from its input.
+class RunBase:
+    """One run in units of its noise: all arrays are divided by the noise of a sample, outputs one after the other.
+
+    The noise covariance is ``I + B' B`` in these units; ``B``, from the input's noise, is counted by Woodbury's identity.
 
     Parameters
     ----------
-    columns : ndarray, shape (ny, k, N)
-        ``B``: change of the outputs by one standard deviation of each input coefficient.
-    weight : ndarray, shape (ny,)
-        ``w``.
+    scale : ndarray, shape (m,)
+        Inverse standard deviation of a single sample's noise.
+    residual : ndarray, shape (m,)
+    sensitivity : ndarray, shape (l, m)
+        With respect to present unknowns and uncertain constants, each in units of its prior's standard deviation.
+    input_noise : ndarray, shape (k, m)
+        ``B``: change of the outputs by one standard deviation of each input coefficient that matters.
     inverse : ndarray, shape (k, k)
-        ``(I + B' w B)^-1``.
+        ``(I + B B')^-1``.
+    period : ndarray of int, shape (m,)
+        Number of the period that each sample lies in.
+    mixed, moved : ndarray, shapes (k, l) and (k,)
+        ``B J`` and ``B e``, kept because every candidate needs them.
     """
 
-    columns: Array
-    weight: Array
+    scale: Array
+    residual: Array
+    sensitivity: Array
+    input_noise: Array
     inverse: Array
+    period: NDArray[np.int64]
+    mixed: Array
+    moved: Array
 
     @classmethod
-    def of(cls, columns: Array, weight: Array) -> InputNoise:
-        """Keep the directions that matter against the noise of the samples."""
-        size = np.einsum("ykN,ykN,y->k", columns, columns, weight, optimize=True)
-        kept = columns[:, np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
-        inner = np.einsum("yjN,ykN,y->jk", kept, kept, weight, optimize=True)
-        return cls(kept, weight, np.linalg.inv(np.eye(inner.shape[0]) + inner))
+    def of(cls, scale: Array, residual: Array, sensitivity: Array, columns: Array, period: NDArray[np.int64]) -> RunBase:
+        """Keep the directions of input noise that matter against the noise of the samples."""
+        columns = columns * scale
+        size = np.sum(columns**2, axis=1)
+        kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
+        inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
+        e, J = residual * scale, sensitivity * scale
+        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e)
 
-    def product(self, left: Array, right: Array) -> Array:
-        """``left' W right`` for blocks of shapes (ny, a, N) and (ny, b, N), by Woodbury's identity."""
-        plain = np.einsum("yaN,ybN,y->ab", left, right, self.weight, optimize=True)
-        if self.inverse.size == 0:
-            return plain
-        a = np.einsum("ykN,yaN,y->ka", self.columns, left, self.weight, optimize=True)
-        b = np.einsum("ykN,ybN,y->kb", self.columns, right, self.weight, optimize=True)
-        return plain - a.T @ self.inverse @ b
+    def products(self, new: Array) -> tuple[Array, Array, Array]:
+        """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
+        moved = self.input_noise @ new.T
+        through = self.inverse @ moved
+        cross = self.sensitivity @ new.T - self.mixed.T @ through
+        own = new @ new.T - moved.T @ through
+        return cross, own, new @ self.residual - self.moved @ through
 
 
 @dataclass(frozen=True)
@@ -75,18 +90,10 @@ class Base:
     ----------
     fit : Fit
         The present model.
-    residual : list of ndarray, each shape (ny, N_r)
-        By run, SI.
-    weight : list of ndarray, each shape (ny,)
-        Inverse variance of a single sample's noise, by run.
-    sensitivity : list of ndarray, each shape (ny, l, N_r)
-        In units of the prior's standard deviation, so that the normal matrix is well scaled.
-    period : list of ndarray of int, each shape (N_r,)
-        Number of the period that each sample lies in.
-    input_noise : list of InputNoise
-        By run: directions in which the input's noise moves the outputs, counted in ``W``.
+    runs : list of RunBase
+        Residuals and sensitivities by run.
     gram : ndarray, shape (l, l)
-        ``J' W J``.
+        ``J' W J``, with the prior precision of uncertain constants.
     gradient : ndarray, shape (l,)
         ``J' W e``.
     noise : float
@@ -96,11 +103,7 @@ class Base:
     """
 
     fit: Fit
-    residual: list[Array]
-    weight: list[Array]
-    sensitivity: list[Array]
-    period: list[NDArray[np.int64]]
-    input_noise: list[InputNoise]
+    runs: list[RunBase]
     gram: Array
     gradient: Array
     noise: float
@@ -122,34 +125,43 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
     errors : mapping of (run, output) to (sigma, repeating, noise)
         Noise of a single sample, root mean square of the averaged residual, and its standard error, input noise included.
     """
-    scale = np.array([prior.sd for prior in fit.problem.priors])
+    unit = np.array([prior.sd for prior in fit.problem.priors])
     tolerances = _tolerance_columns(fit)
-    size, known = len(scale) + len(fit.model.uncertain()), len(scale)
-    gram, residual, weight, sensitivity, period = np.zeros((size, size)), [], [], [], []
+    size, known = len(unit) + len(fit.model.uncertain()), len(unit)
+    gram, gradient, runs = np.zeros((size, size)), np.zeros(size), []
     # A constant known to a tolerance is no free parameter: its prior's precision, one in this unit, stays with it.
     gram[known:, known:] += np.eye(size - known)
     noise = excess = 0.0
-    gradient, moved = np.zeros(size), []
     for r, record in enumerate(fit.records):
         run = fit.predictor.runs[r]
-        e = run.measured - fit.predictions[r].y
-        sigmas = np.array([max(errors[record.label, o][0], 1e-9 * float(np.ptp(m))) for o, m in zip(fit.predictor.outputs, run.measured, strict=True)])
-        w = 1.0 / sigmas**2
-        columns = fit.predictions[r].sensitivity[:, _free(fit)] * scale[:, None]
-        columns = np.concatenate([columns, tolerances[r]], axis=1)
-        from_input = InputNoise.of(input_columns(run, _present(fit, r)), w)
-        gram += from_input.product(columns, columns)
-        gradient += from_input.product(columns, e[:, None])[:, 0]
-        for b, output in enumerate(fit.predictor.outputs):
+        sigma = [_sigma(errors[record.label, o][0], m) for o, m in zip(fit.predictor.outputs, run.measured, strict=True)]
+        columns = np.concatenate([fit.predictions[r].sensitivity[:, _free(fit)] * unit[:, None], tolerances[r]], axis=1)
+        present = RunBase.of(
+            np.repeat(1.0 / np.array(sigma), record.time.size),
+            (run.measured - fit.predictions[r].y).ravel(),
+            _flat(columns),
+            _flat(input_columns(run, _present(fit, r))),
+            np.tile(np.floor(record.phase + 1e-9).astype(np.int64), len(sigma)),
+        )
+        cross, _, _ = present.products(present.sensitivity)
+        gram += cross
+        gradient += present.products(present.sensitivity)[2]
+        for output, value in zip(fit.predictor.outputs, sigma, strict=True):
             _, repeating, floor = errors[record.label, output]
-            noise += record.time.size * w[b] * floor**2
-            excess += record.time.size * w[b] * (repeating**2 - floor**2)
-        residual.append(e)
-        weight.append(w)
-        sensitivity.append(columns)
-        period.append(np.floor(record.phase + 1e-9).astype(np.int64))
-        moved.append(from_input)
-    return Base(fit, residual, weight, sensitivity, period, moved, gram, gradient, noise, excess)
+            noise += record.time.size * (floor / value) ** 2
+            excess += record.time.size * (repeating**2 - floor**2) / value**2
+        runs.append(present)
+    return Base(fit, runs, gram, gradient, noise, excess)
+
+
+def _sigma(noise: float, measured: Array) -> float:
+    """Noise of a sample; data without noise get a floor far below what any record resolves."""
+    return max(noise, 1e-9 * float(np.ptp(measured)), 1e-300)
+
+
+def _flat(columns: Array) -> Array:
+    """Columns of shape (ny, k, N) as (k, ny N), outputs one after the other."""
+    return np.moveaxis(columns, 1, 0).reshape(columns.shape[1], -1)
 
 
 def _present(fit: Fit, r: int) -> Array:
@@ -271,7 +283,9 @@ def _columns(base: Base, option: Option, shapes: Sequence[Mapping[str, float]]) 
 
 def _sensitivities(fit: Fit, model: Model, shapes: Sequence[Mapping[str, float]]) -> list[_Block] | Status:
     """Derivatives with respect to a model's estimated parameters at the present estimate."""
-    predictor = Predictor(model, fit.records, steps=fit.steps, scheme=fit.numerics.scheme, backend="numpy", jobs=1)
+    predictor = Predictor(
+        model, fit.records, steps=fit.steps, scheme=fit.numerics.scheme, backend="numpy", jobs=1, share=fit.predictor
+    )
     if predictor.outputs != fit.predictor.outputs:
         return Status.SINGULAR
     layout = predictor.layout
@@ -310,29 +324,26 @@ def _set_present(fit: Fit, r: int, predictor: Predictor, p: Array) -> None:
 def _evaluate(base: Base, option: Option, values: Mapping[str, float], block: _Block) -> Score | None:
     k, size = len(block.names), base.gram.shape[0]
     cross, own, score = np.zeros((size, k)), np.zeros((k, k)), np.zeros(k)
-    for r, C in enumerate(block.by_run):
-        inner = base.input_noise[r]
-        cross += inner.product(base.sensitivity[r], C)
-        own += inner.product(C, C)
-        score += inner.product(C, base.residual[r][:, None])[:, 0]
-    regular = base.gram + 1e-12 * np.diag(np.diag(base.gram)) if size else base.gram
-    project = np.linalg.lstsq(regular, cross, rcond=None)[0] if size else np.zeros((0, k))
+    columns = [_flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
+    for run, new in zip(base.runs, columns, strict=True):
+        parts = run.products(new)
+        cross, own, score = cross + parts[0], own + parts[1], score + parts[2]
+    project = np.linalg.lstsq(base.gram, cross, rcond=1e-13)[0] if size else np.zeros((0, k))
     information = own - cross.T @ project
     score = score - project.T @ base.gradient
     keep = np.diag(information) > 1e-8 * np.diag(own)
     if not keep.any() or not np.isfinite(information).all():
         return None
     expected = np.zeros(k)
-    scale = np.sqrt(np.diag(information)[keep])
-    inner = information[np.ix_(keep, keep)] / np.outer(scale, scale)
-    expected[keep] = np.linalg.lstsq(inner, score[keep] / scale, rcond=1e-10)[0] / scale
+    unit = np.sqrt(np.diag(information)[keep])
+    inner = information[np.ix_(keep, keep)] / np.outer(unit, unit)
+    expected[keep] = np.linalg.lstsq(inner, score[keep] / unit, rcond=1e-10)[0] / unit
     if not _allowed(option, block.names, expected):
         expected = np.zeros(k)
     fall = float(expected @ score)
-    inflation = _inflation(base, block, project, expected)
-    thin = _thinned(base, block, project)
+    thin = _thinned(base, columns, project)
     norms = np.linalg.norm(thin, axis=1, keepdims=True)
-    z = float(np.sign(expected[0]) * np.sqrt(max(fall, 0.0))) if k == 1 else float(np.sqrt(max(fall, 0.0)))
+    root = float(np.sqrt(max(fall, 0.0)))
     return Score(
         option=option,
         names=block.names,
@@ -340,10 +351,10 @@ def _evaluate(base: Base, option: Option, values: Mapping[str, float], block: _B
         shapes=dict(values),
         fall=fall,
         share=fall / base.fall_back,
-        inflation=inflation,
+        inflation=_inflation(base, columns, project, expected),
         columns=(thin / np.where(norms > 0, norms, 1.0))[keep],
         contribution=expected @ thin,
-        z=z,
+        z=root * float(np.sign(expected[0])) if k == 1 else root,
     )
 
 
@@ -356,31 +367,25 @@ def _allowed(option: Option, names: Sequence[str], expected: Array) -> bool:
     return True
 
 
-def _thinned(base: Base, block: _Block, project: Array) -> Array:
-    """Weighted ``C_perp`` at some samples, shape (k, n)."""
+def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
+    """``C_perp`` in noise units at some samples, shape (k, n)."""
     rows = []
-    for r, C in enumerate(block.by_run):
-        part = slice(None, None, THINNING)
-        rest = C[:, :, part] - np.einsum("ylN,lk->ykN", base.sensitivity[r][:, :, part], project)
-        weighted = rest * np.sqrt(base.weight[r])[:, None, None]
-        rows.append(np.moveaxis(weighted, 1, 0).reshape(C.shape[1], -1))
+    for run, new in zip(base.runs, columns, strict=True):
+        rows.append(new[:, ::THINNING] - project.T @ run.sensitivity[:, ::THINNING])
     return np.concatenate(rows, axis=1)
 
 
-def _inflation(base: Base, block: _Block, project: Array, expected: Array) -> float:
+def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: Array) -> float:
     """Variance of the score between periods relative to white noise's, along the expected direction."""
     if not np.any(expected):
         return 1.0
     measured = assumed = 0.0
-    for r, C in enumerate(block.by_run):
-        direction = np.einsum("ykN,k->yN", C, expected) - np.einsum("ylN,l->yN", base.sensitivity[r], project @ expected)
-        product_ = np.sum(direction * base.residual[r] * base.weight[r][:, None], axis=0)
-        own = np.sum(direction**2 * base.weight[r][:, None], axis=0)
-        sums = np.bincount(base.period[r], product_)
-        periods = sums.size
-        if periods < 2:
+    for run, new in zip(base.runs, columns, strict=True):
+        direction = expected @ new - (project @ expected) @ run.sensitivity
+        sums = np.bincount(run.period, direction * run.residual)
+        if sums.size < 2:
             continue
-        measured += periods * float(np.var(sums, ddof=1))
-        assumed += float(np.sum(own))
+        measured += sums.size * float(np.var(sums, ddof=1))
+        assumed += float(direction @ direction)
     # Slow noise makes the score vary more than its formula says; too few periods can only feign less, which is not believed.
     return max(1.0, measured / assumed) if assumed > 0 else 1.0
