@@ -41,6 +41,10 @@ _NEAR = 0.1
 # A step that turns back by more than this part of the last one overshoots: linear equations that
 # lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
 _OVERSHOOT = 0.3
+# After so many steps in a row along one line, each longer than that part of the one before, steps
+# are lengthened, at most so far: the same equations can also fall short for ever.
+_STEADY = 4
+_LONGEST = 10.0
 # Cosine from which two steps lie on one line; off it nothing is known of the overshoot.
 _ON_ONE_LINE = 0.9
 # So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
@@ -164,11 +168,12 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Pace:
-    """How the last step compares with the one before it, by which the next one is shortened.
+    """How a step compares with the one before it, by which it is shortened or lengthened.
 
     Near the fixed point the error along one line shrinks from ``e`` to ``(1 - s k) e``, where ``s``
-    is the part of the proposed step that was taken and ``k`` its overshoot. Two proposals on that
-    line tell ``k``, and the part ``1/k`` ends the zigzag (Aitken's process, 1926).
+    is the part of the proposed step that was taken and ``k`` how far a whole one goes. Two
+    proposals on that line tell ``k``, and the part ``1/k`` goes all the way (Aitken's process,
+    1926): at once where steps turn back, with care where they creep.
 
     Parameters
     ----------
@@ -180,15 +185,18 @@ class _Pace:
         Iterations in a row that were slow and gained nothing.
     slow : bool
         The present proposal is not much shorter than the last step.
-    overshoot : float
-        The present estimate of ``k``; one where nothing says otherwise.
+    steady : int
+        Steps in a row that crept along one line.
+    wanted : float
+        Part of the present proposal to take; one where nothing says otherwise.
     """
 
     taken: Array | None = None
     part: float = 1.0
     idle: int = 0
     slow: bool = False
-    overshoot: float = 1.0
+    steady: int = 0
+    wanted: float = 1.0
 
     def look(self, proposal: Array, rows: Array) -> _Pace:
         """Compare a proposal with the last step in the metric ``rows' rows``."""
@@ -196,18 +204,24 @@ class _Pace:
             return self
         new, old = rows @ proposal, rows @ self.taken
         lengths = float(np.linalg.norm(new)), float(np.linalg.norm(old))
-        if lengths[1] == 0 or lengths[0] == 0:
-            return replace(self, slow=False, overshoot=1.0)
+        if min(lengths) == 0:
+            return replace(self, slow=False, steady=0, wanted=1.0)
         cosine = float(new @ old) / (lengths[0] * lengths[1])
         ratio = lengths[0] / lengths[1]
-        overshoot = 1 / self.part - np.sign(cosine) * ratio
-        if abs(cosine) < _ON_ONE_LINE or overshoot < 1 + _OVERSHOOT:
-            overshoot = 1.0
-        return replace(self, slow=ratio > _OVERSHOOT, overshoot=float(overshoot))
+        reach = 1 / self.part - float(np.sign(cosine)) * ratio
+        on_line = abs(cosine) >= _ON_ONE_LINE
+        creeps = on_line and 0 < reach < 1 - _OVERSHOOT
+        steady = self.steady + 1 if creeps else 0
+        wanted = 1.0
+        if on_line and reach > 1 + _OVERSHOOT:
+            wanted = 1 / reach
+        elif steady >= _STEADY:
+            wanted = min(1 / reach, _LONGEST)
+        return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
 
     def after(self, taken: Array, part: float, idle: bool) -> _Pace:
         """Pace after a step that was a part of its proposal and gained nothing, or something."""
-        return _Pace(taken, part, self.idle + 1 if idle and self.slow else 0)
+        return _Pace(taken, part, self.idle + 1 if idle and self.slow else 0, steady=self.steady)
 
 
 class _Loop:
@@ -258,10 +272,10 @@ class _Loop:
                 return Status.NOT_FINITE
             weight = self.step.rows(self.state, equations.jacobian)
             proposal = equations.solve(weight)
-            small = self.is_small(proposal, equations, tolerance)
             pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
+            part = self.part_of(proposal, pace, equations)
+            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance)
             before = self.point
-            part = 1 / pace.overshoot
             trial, halvings, taken = self.shorten(part * proposal, equations, variance)
             if halvings >= _MANY_HALVINGS:
                 gain = 0.5 * float(proposal @ equations.gradient)
@@ -282,6 +296,14 @@ class _Loop:
             ratio = won / expected if expected > 0 else 1.0
             self.state = self.step.accept(self.state, equations.jacobian, ratio)
         return Status.NO_CONVERGENCE
+
+    def part_of(self, proposal: Array, pace: _Pace, equations: Equations) -> float:
+        """How much of a proposal to take: more than all of it only well inside the support."""
+        if pace.wanted <= 1:
+            return pace.wanted
+        if self.step.locks or is_cut(pace.wanted * proposal, equations.room):
+            return 1.0  # steps of an estimator that locks up creep by design
+        return pace.wanted
 
     def shorten(
         self, proposal: Array, equations: Equations, variance: Array
