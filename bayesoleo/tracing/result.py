@@ -73,6 +73,7 @@ def _units(fit: Fit) -> list[str]:
 def posterior_groups(fit: Fit, samples: Samples, seed: int) -> dict[str, xr.Dataset]:
     """The groups posterior, prior, sample_stats and log_likelihood."""
     units = dict(zip(fit.problem.names, _units(fit), strict=True))
+    units |= {name: fit.model.outputs[name].unit for name in fit.predictor.outputs}
     return to_datasets(samples, fit.problem.priors, units=units, seed=seed)
 
 

@@ -1,0 +1,74 @@
+"""Every way of holding data out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_campaigns import DAMPER_RUNS, damper, damper_campaign
+
+from bayesoleo.errors import CampaignError
+from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.tracing.roles import assign
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory):
+    return damper_campaign(tmp_path_factory.mktemp("roles")).records
+
+
+def test_declared_roles_are_kept(records):
+    roles = assign(records)
+    assert roles.strategy == "declared"
+    assert [r.label for r in roles.fitted] == ["a", "b", "c"]
+    assert [r.label for r in roles.held_out] == ["d", "e"]
+    assert roles.description == "2 declared hold-out runs"
+
+
+def test_without_hold_out_every_run_is_left_out_once(records):
+    roles = assign([r for r in records if r.role == "fit"])
+    assert roles.strategy == "leave-one-run-out"
+    assert roles.fitted == roles.held_out
+    assert "leave-one-run-out" in roles.description
+
+
+@pytest.mark.parametrize("periods", [4, 7])
+def test_halves_of_a_lone_run_are_predicted_as_the_whole_is(tmp_path, periods):
+    (whole,) = damper_campaign(tmp_path, runs=DAMPER_RUNS[:1], periods=periods).records
+    roles = assign([whole])
+    (first,), (second,) = roles.fitted, roles.held_out
+    assert roles.strategy == "split periods"
+    assert first.periods + second.periods == whole.periods == periods
+    assert {first.role, second.role} == {"fit", "hold-out"}
+    assert first.label != second.label
+    time = np.concatenate([first.time, second.time])
+    assert np.array_equal(time, whole.time)
+    model = damper()
+    predicted = [
+        Predictor(model, [record], backend="numpy", jobs=1)
+        .predict(np.array([200.0, 1000.0, 2e6]))[0]
+        .y
+        for record in (whole, first, second)
+    ]
+    together = np.concatenate(predicted[1:], axis=1)
+    assert together == pytest.approx(predicted[0], rel=1e-9, abs=1e-9)
+
+
+def test_a_lone_short_run_cannot_be_split(tmp_path):
+    (whole,) = damper_campaign(tmp_path, runs=DAMPER_RUNS[:1], periods=3).records
+    roles = assign([whole])
+    assert roles.strategy == "none"
+    assert roles.held_out == ()
+    assert "nothing could be held out" in roles.description
+
+
+def test_no_run_to_fit_is_an_error(records):
+    with pytest.raises(CampaignError, match="no run has the role fit"):
+        assign([r for r in records if r.role != "fit"])
+
+
+def test_a_transient_is_an_error_that_names_the_run(records):
+    with pytest.raises(CampaignError, match=r"transient run cannot be fitted.*") as caught:
+        assign([replace(records[0], kind="transient"), *records[1:]])
+    assert "'a'" in str(caught.value) or "run a" in str(caught.value)

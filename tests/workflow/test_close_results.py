@@ -1,0 +1,301 @@
+"""The verbs on a small campaign: what they give back, write, and leave alone."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
+
+from bayesoleo import schema, workflow
+from bayesoleo.effects import find_effect
+from bayesoleo.errors import BayesoleoError, InputError
+from bayesoleo.storage import read_tree
+from bayesoleo.systems import system
+from bayesoleo.workflow import Settings
+
+EFFECTS = tuple(
+    map(find_effect, ("coulomb_friction", "quintic_stiffness", "mass_error", "constant_force"))
+)
+SETTINGS = Settings(quick=True, jobs=1, effects=EFFECTS, seed=5, command="as typed")
+MODEL = damper(offsets=True)
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("campaign")
+    damper_campaign(folder, offsets={"a": 2.0, "d": -3.0})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def closed(campaign, tmp_path_factory) -> tuple[xr.DataTree, Path]:
+    out = tmp_path_factory.mktemp("results") / "out"
+    return workflow.close(campaign, MODEL, SETTINGS, out=out), out
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Every file below a folder with its hash."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def posterior(tree: xr.DataTree) -> xr.Dataset:
+    return tree[schema.POSTERIOR].to_dataset()
+
+
+def test_close_writes_result_report_and_summary(closed):
+    _, out = closed
+    assert {"results.nc", "report.html", "summary.json"} <= {item.name for item in out.iterdir()}
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    schema.validate_summary(summary)
+    assert summary["effects"] == ["coulomb_friction"]
+    assert summary["verdict"] == schema.EFFECT_ADDED
+    assert summary["seed"] == 5
+    assert all(Path(path).exists() for path in summary["files"].values())
+    report = (out / "report.html").read_text(encoding="utf-8")
+    assert "coulomb_friction" in report or "Coulomb" in report
+    assert "<script src=" not in report
+
+
+def test_the_truth_lies_in_the_posteriors_interval(closed):
+    summary = json.loads(closed[0].attrs[schema.SUMMARY])
+    for name, true in {"damping": 200.0, "stiffness": 1000.0, "cubic": 2e6}.items():
+        entry = summary["parameters"][name]
+        assert abs(entry["mean"] - true) < 5 * entry["sd"]
+        assert entry["interval"][0] < entry["mean"] < entry["interval"][1]
+        # A linear model with tiny noise: the posterior is the Laplace approximation.
+        assert entry["estimate"] == pytest.approx(entry["mean"], abs=entry["sd"])
+    assert summary["parameters"]["coulomb_friction"]["mean"] == pytest.approx(FRICTION, rel=0.05)
+
+
+def test_the_file_reads_back_as_the_tree(closed):
+    tree, out = closed
+    back = read_tree(out / "results.nc")
+    assert set(back.children) == set(schema.GROUPS) == set(tree.children)
+    for group in schema.GROUPS:
+        xr.testing.assert_equal(back[group].to_dataset(), tree[group].to_dataset())
+    assert back.attrs[schema.SUMMARY] == (out / "summary.json").read_text(encoding="utf-8")
+    assert back.attrs[schema.FORMAT_ATTRIBUTE] == schema.FORMAT
+    assert back.attrs[schema.COMMAND] == "as typed"
+    assert back.attrs[schema.SEED] == 5
+
+
+def test_names_dims_and_units_are_those_of_the_schema(closed):
+    tree, _ = closed
+    observed, residual = tree[schema.OBSERVED_DATA], tree[schema.RESIDUAL]
+    assert observed["force"].dims == (schema.RUN, schema.SAMPLE)
+    assert observed["force"].attrs["units"] == "N"
+    assert observed["displacement"].attrs["units"] == "m"
+    for stage in (schema.before("force"), schema.after("force")):
+        assert tree[schema.PREDICTION][stage].dims == (schema.RUN, schema.SAMPLE)
+        assert residual[stage].attrs["units"] == "N"
+        assert residual[schema.mean(stage)].dims == (schema.RUN, schema.PHASE)
+    assert residual[schema.noise("force")].dims == (schema.RUN,)
+    assert residual[schema.VELOCITY].attrs["units"] == "m/s"
+    draws = posterior(tree)
+    assert draws["damping"].attrs["units"] == "N*s/m"
+    assert draws[schema.by_run("offset", "a")].attrs["units"] == "N"
+    assert draws[schema.log_variance("force")].attrs["units"] == "ln((N)^2)"
+    for group in schema.GROUPS:
+        for name, item in tree[group].data_vars.items():
+            if np.issubdtype(item.dtype, np.floating):
+                assert schema.UNITS in item.attrs, f"{group}/{name}"
+
+
+def test_residuals_are_measured_less_predicted(closed):
+    tree, _ = closed
+    measured = tree[schema.OBSERVED_DATA]["force"]
+    for stage in (schema.before("force"), schema.after("force")):
+        predicted, residual = tree[schema.PREDICTION][stage], tree[schema.RESIDUAL][stage]
+        there = measured.sel(run=predicted.run)
+        assert np.allclose(there - predicted, residual, equal_nan=True, atol=1e-9)
+
+
+def test_discovery_holds_every_round_and_candidate(closed):
+    tree, _ = closed
+    found, summary = tree[schema.DISCOVERY], json.loads(tree.attrs[schema.SUMMARY])
+    assert found.sizes[schema.ROUND] == len(summary["rounds"])
+    assert list(found[schema.ACCEPTED].values) == ["coulomb_friction", ""]
+    key = "coulomb_friction at force"
+    assert found[schema.GAIN].sel(effect=key).values[0] > 0.9
+    for k, entry in enumerate(summary["rounds"]):
+        for run, error in entry["error"]["force"].items():
+            there = found.to_dataset().isel(round=k).sel(output="force", run=run)
+            assert float(there[schema.RMS]) == pytest.approx(error["rms"])
+            assert float(there[schema.RATIO_TO_NOISE]) == pytest.approx(error["ratio_to_noise"])
+
+
+def test_a_second_close_takes_up_the_checkpoints_and_agrees(closed, campaign):
+    tree, out = closed
+    store = out / "checkpoints"
+    before = {path: path.stat().st_mtime_ns for path in store.rglob("*") if path.is_file()}
+    assert before
+    said: list[str] = []
+    again = workflow.close(campaign, MODEL, SETTINGS, out=out, say=said.append)
+    xr.testing.assert_identical(posterior(again), posterior(tree))
+    after = {path: path.stat().st_mtime_ns for path in store.rglob("*") if path.is_file()}
+    draws = {path for path in before if path.suffix not in (".lock", ".json")}
+    assert {path: after[path] for path in draws} == {path: before[path] for path in draws}
+
+
+def test_results_depend_neither_on_threads_nor_on_the_folder(closed, campaign):
+    tree, _ = closed
+    other = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2))
+    xr.testing.assert_equal(posterior(other), posterior(tree))
+    one, two = (json.loads(item.attrs[schema.SUMMARY]) for item in (tree, other))
+    for summary in (one, two):
+        summary.pop("files")
+    assert one == two
+
+
+def test_another_seed_draws_other_samples_of_the_same_posterior(closed, campaign):
+    tree, _ = closed
+    other = workflow.sample(
+        campaign, damper(), replace(SETTINGS, seed=6, effects=()), progress=False
+    )
+    same = workflow.sample(
+        campaign, damper(), replace(SETTINGS, seed=5, effects=()), progress=False
+    )
+    a, b = posterior(other)["damping"], posterior(same)["damping"]
+    assert not np.array_equal(a.values[:, :5], b.values[:, :5])
+    # Quick draws have an effective size of some hundred: a tenth of a standard deviation.
+    assert float(a.mean()) == pytest.approx(float(b.mean()), abs=0.5 * float(a.std()))
+    assert schema.DISCOVERY in tree.children
+
+
+def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
+    records = {schema.OBSERVED_DATA, schema.CONSTANT_DATA, schema.NOISE}
+    point = workflow.estimate(campaign, MODEL, SETTINGS, out=tmp_path / "estimate")
+    assert set(point.children) == records | {schema.POINT}
+    assert set(read_tree(tmp_path / "estimate" / "results.nc").children) == set(point.children)
+    sampled = workflow.sample(campaign, MODEL, SETTINGS, out=tmp_path / "sample")
+    more = {schema.POSTERIOR, schema.PRIOR, schema.SAMPLE_STATS, schema.LOG_LIKELIHOOD}
+    assert set(sampled.children) == set(point.children) | more
+    xr.testing.assert_identical(
+        sampled[schema.POINT].to_dataset(), point[schema.POINT].to_dataset()
+    )
+
+
+def test_trace_ranks_and_adds_nothing(campaign, tmp_path):
+    tree = workflow.trace(campaign, MODEL, SETTINGS, out=tmp_path)
+    summary = json.loads(tree.attrs[schema.SUMMARY])
+    assert summary["effects"] == []
+    assert len(summary["rounds"]) == 1
+    assert summary["rounds"][0]["candidates"][0]["effect"] == "coulomb_friction"
+    assert summary["rounds"][0]["accepted"] is None
+    assert summary["error_before"] == summary["error_after"]
+    assert summary["parameters"]["damping"]["mean"] is None
+    assert schema.POSTERIOR not in tree.children
+    assert set(read_tree(tmp_path / "results.nc").children) == set(tree.children)
+
+
+def test_what_was_reduced_can_be_given_instead_of_the_folder(campaign):
+    reduced = workflow.reduce(campaign)
+    assert workflow.reduce(reduced) is reduced
+    one, two = (workflow.estimate(source, MODEL, SETTINGS) for source in (campaign, reduced))
+    xr.testing.assert_identical(one[schema.POINT].to_dataset(), two[schema.POINT].to_dataset())
+
+
+def test_check_says_what_would_be_done_and_touches_nothing(campaign, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = contents(campaign)
+    found = workflow.check(campaign, MODEL, SETTINGS)
+    assert contents(campaign) == before
+    assert list(tmp_path.iterdir()) == []
+    assert found["fit"] == ["a", "b", "c"]
+    assert found["hold_out"] == ["d", "e"]
+    assert found["outputs"] == ["force"]
+    assert found["inputs"] == ["displacement"]
+    assert set(found["unknowns"]) == {
+        "damping", "stiffness", "cubic", "offset[a]", "offset[b]", "offset[c]",
+    }  # fmt: skip
+    assert found["effects"] == len(EFFECTS)
+
+
+def bad_campaign(folder: Path) -> Path:
+    damper_campaign(folder)
+    path = folder / "b.csv"
+    lines = path.read_text().splitlines()
+    lines[7] = lines[7].rsplit(",", 1)[0] + ",nan"
+    path.write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize("verb", ["close", "trace", "sample", "estimate"])
+def test_bad_input_leaves_an_older_result_alone(verb, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("results.nc", "report.html", "summary.json"):
+        (out / name).write_text("older")
+    before = contents(out)
+    run = getattr(workflow, verb)
+    with pytest.raises(BayesoleoError, match="b"):
+        run(bad_campaign(tmp_path / "nan"), MODEL, SETTINGS, out=out)
+    good = tmp_path / "good"
+    damper_campaign(good)
+    with pytest.raises(InputError, match=r"input_voltage|force"):
+        run(good, system("f16n2d2"), replace(SETTINGS, drive="pressure"), out=out)
+    assert contents(out) == before
+
+
+def test_a_folder_that_cannot_be_written_is_found_out_first(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        workflow.check_writable(blocked / "out")
+    workflow.check_writable(tmp_path / "new" / "deeper")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.fixture(scope="module")
+def by_displacement(tmp_path_factory):
+    """The rig controls the displacement."""
+    return damper_campaign(tmp_path_factory.mktemp("drive")).campaign
+
+
+def test_drive_the_controlled_channel_drives_if_it_can(by_displacement):
+    model = system("linear_oscillator")
+    assert workflow.choose_drive(model, by_displacement, None) == "displacement"
+
+
+def test_drive_the_models_own_inputs_need_no_exchange(by_displacement):
+    assert workflow.choose_drive(damper(), by_displacement, None) is None
+
+
+def test_drive_it_can_be_told(by_displacement):
+    model = system("linear_oscillator")
+    assert workflow.choose_drive(model, by_displacement, "model") is None
+    assert workflow.choose_drive(model, by_displacement, "force") is None
+    assert workflow.choose_drive(model, by_displacement, "displacement") == "displacement"
+
+
+def test_drive_nothing_controlled_leaves_the_model_as_it_is(by_displacement):
+    free = replace(by_displacement, controlled=None)
+    assert workflow.choose_drive(system("linear_oscillator"), free, None) is None
+
+
+def test_drive_what_has_no_inverse_is_an_error_only_if_asked_for(by_displacement):
+    assert (
+        workflow.choose_drive(damper(), replace(by_displacement, controlled="force"), None) is None
+    )
+    with pytest.raises(BayesoleoError, match="cannot be driven by 'force'"):
+        workflow.choose_drive(damper(), by_displacement, "force")
+
+
+def test_an_oscillator_is_closed_in_the_drive_of_the_rig(tmp_path):
+    """Displacement-controlled: the oscillator's force is the answer, and no equation is solved."""
+    reduced = damper_campaign(tmp_path, runs=DAMPER_RUNS[:4])
+    tree = workflow.trace(
+        reduced, system("linear_oscillator"), replace(SETTINGS, effects=EFFECTS[:1])
+    )
+    assert tree.attrs[schema.DRIVE] == "displacement"
+    assert tree[schema.RESIDUAL][schema.before("force")].attrs["units"] == "N"
