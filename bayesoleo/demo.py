@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +12,8 @@ import numpy as np
 from bayesoleo.data import SimulatedRun, write_campaign
 from bayesoleo.effects import Scales, find_effect
 from bayesoleo.model import Model, driven_by
-from bayesoleo.prediction.simulate import RunPlan, Simulation, motion, simulate_run
+from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
+from bayesoleo.simulation import to_simulated_run
 from bayesoleo.systems import system
 
 #: The model that the demonstration fits, and the effect that it lacks.
@@ -131,34 +131,6 @@ def demo_campaign(folder: str | os.PathLike[str], seed: int = 0) -> Path:
         controlled="displacement",
         channels=CHANNELS,
         runs=runs,
-    )
-
-
-def to_simulated_run(
-    made: Simulation, units: Mapping[str, str], frequency: float | None = None
-) -> SimulatedRun:
-    """Arrange a simulation to be written.
-
-    Parameters
-    ----------
-    made : Simulation
-    units : mapping of str to str
-        SI unit of each condition.
-    frequency : float, optional
-        The approximate one to declare, Hz; by default the true one.
-
-    Returns
-    -------
-    SimulatedRun
-    """
-    return SimulatedRun(
-        made.label,
-        made.time,
-        made.samples,
-        frequency=made.frequency if frequency is None else frequency,
-        group=made.group,
-        role=made.role,
-        conditions={name: (value, units[name]) for name, value in made.conditions.items()},
     )
 
 

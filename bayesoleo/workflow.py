@@ -16,12 +16,15 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo.data import Campaign, ReducedCampaign, load_campaign, reduce_campaign
 from bayesoleo.effects import Effect
-from bayesoleo.errors import InputError
+from bayesoleo.data.units import parse_unit
+from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Model, driven_by, possible_drives
+from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, laplace_mixture
 from bayesoleo.posterior import sample as draw_samples
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.report import write_report
+from bayesoleo.simulation import merged, model_of, parameter_sets, simulate_like
 from bayesoleo.solvers.schemes import DEFAULT_SCHEME
 from bayesoleo.storage import provenance, write_text_atomic, write_tree
 from bayesoleo.systems import equations, equations_latex
@@ -161,7 +164,31 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     # Building a predictor of one step checks channels, conditions and priors of every run without solving anything.
     predictor = Predictor(driven, reduced.records, steps=8, backend="numpy", jobs=1)
     predictor.layout.priors(driven)
+    _check_units(driven, reduced.campaign)
     return Task(reduced, roles, assembly, settings)
+
+
+def _check_units(model: Model, campaign: Campaign) -> None:
+    """Data come in SI: a model in other units, or of another quantity, is a mistake that no estimate survives."""
+    declared = dict(model.inputs) | {name: output.unit for name, output in model.outputs.items()}
+    for name, unit in declared.items():
+        channel, wanted = campaign.channels[name], parse_unit(unit or "1")
+        if not unit:
+            continue
+        if wanted.si_name != channel.si_unit:
+            raise CampaignError(
+                f"channel {name!r} is in {channel.unit}, model {model.name!r} expects {unit}",
+                file=campaign.path / "campaign.toml",
+                key=f"channels.{name}.unit",
+                value=channel.unit,
+                hint=f"write a unit that converts to {unit}, or declare the model's channel otherwise",
+            )
+        if wanted.factor != 1.0 or wanted.shift != 0.0:
+            raise ModelError(
+                f"model {model.name!r}: channel {name!r} is declared in {unit}, but data come in SI",
+                value=unit,
+                hint=f"declare the model in {wanted.si_name}",
+            )
 
 
 def choose_drive(model: Model, campaign: Campaign, wanted: str | None) -> str | None:
@@ -375,6 +402,7 @@ def _finish(
         schema.EQUATIONS: "\n".join(f"{name}: {text}" for name, text in equations(fit.model).items()),
         schema.EQUATIONS_LATEX: list(equations_latex(fit.model)),
         schema.COMMAND: task.settings.command,
+        schema.MODEL_DOCUMENT: json.dumps(to_document(fit.model)),
     }
     if summary is not None:
         more |= {
@@ -389,16 +417,60 @@ def _finish(
     return tree
 
 
-def check_writable(out: Path) -> None:
-    """Find out before any work whether a folder can be written.
+def simulate(
+    source: Model | xr.DataTree,
+    campaign: Source,
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    out: Path,
+    values: Mapping[str, float] | None = None,
+    draws: int | None = None,
+    noise: Mapping[str, float] | None = None,
+) -> Path:
+    """Simulate a campaign with the runs, inputs and conditions of another.
+
+    Parameters
+    ----------
+    source : Model or xarray.DataTree
+        A model at its nominal values, or a result: its extended model at the estimate.
+    campaign : path-like, Campaign or ReducedCampaign
+        Gives inputs, sampling, conditions, channels and the noise.
+    settings : Settings
+        Seed, drive (of a model), scheme and steps.
+    out : Path
+        Folder of the new campaign; must not hold files.
+    values : mapping of str to float, optional
+        Parameters at other values, SI.
+    draws : int, optional
+        Simulate with so many draws of the result's posterior, each a copy of every run.
+    noise : mapping of str to float, optional
+        Standard deviations by channel, SI, instead of the measured ones.
+
+    Returns
+    -------
+    Path
+        The folder.
 
     Raises
     ------
     InputError
-        If it cannot.
+        If a name is unknown, or the model cannot be solved.
     """
-    existing = out
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError("the output folder cannot be written", file=out, hint="choose another with --out")
+    reduced = reduce(campaign, jobs=settings.jobs)
+    if isinstance(source, Model):
+        drive = choose_drive(source, reduced.campaign, settings.drive)
+        model = source if drive is None else driven_by(source, drive)
+        sets: list[dict[str, float]] = [{}]
+    else:
+        model, sets = model_of(source), parameter_sets(source, draws, settings.seed)
+    return simulate_like(
+        model,
+        reduced.campaign,
+        reduced.records,
+        merged(sets, values, model),
+        out=out,
+        noise=noise,
+        seed=settings.seed,
+        scheme=settings.scheme,
+        steps=settings.steps,
+    )
