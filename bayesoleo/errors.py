@@ -1,8 +1,9 @@
 """Exceptions and warnings that carry their data.
 
-Three kinds of failure are kept apart: bad input raises an :class:`InputError` whose one-line message says where, what
-value and what to write instead; a numerical failure is a :class:`~bayesoleo.solvers.status.Status`, never an exception;
-inside a log density a failure becomes minus infinity and is counted by reason.
+Three kinds of failure are kept apart: bad input raises an :class:`InputError` whose one-line
+message says where, what value and what to write instead; a numerical failure is a
+:class:`~bayesoleo.solvers.status.Status`, never an exception; inside a log density a failure
+becomes minus infinity and is counted by reason.
 """
 
 from __future__ import annotations
@@ -45,7 +46,12 @@ class InputError(BayesoleoError, ValueError):
         super().__init__(self._message())
 
     def _message(self) -> str:
-        places = (("file", self.file), ("run", self.run), ("column", self.column), ("key", self.key))
+        places = (
+            ("file", self.file),
+            ("run", self.run),
+            ("column", self.column),
+            ("key", self.key),
+        )
         where = ", ".join(f"{name} {place!s}" for name, place in places if place is not None)
         text = f"{where}: {self.problem}" if where else self.problem
         if self.value is not None:

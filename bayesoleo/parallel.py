@@ -20,7 +20,9 @@ def available_cores() -> int:
         return os.cpu_count() or 1
 
 
-def thread_map[T, R](function: Callable[[T], R], items: Iterable[T], jobs: int | None = None) -> list[R]:
+def thread_map[T, R](
+    function: Callable[[T], R], items: Iterable[T], jobs: int | None = None
+) -> list[R]:
     """Apply ``function`` to every item and keep the order.
 
     Parameters
@@ -41,7 +43,8 @@ def thread_map[T, R](function: Callable[[T], R], items: Iterable[T], jobs: int |
     jobs = available_cores() if jobs is None else jobs
     if jobs <= 1 or len(work) <= 1:
         return [function(item) for item in work]
-    # Threads of ours that each call a linear algebra library with threads of its own would crowd each other out.
+    # Threads of ours that each call a linear algebra library with threads of its own would crowd
+    # each other out.
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool,

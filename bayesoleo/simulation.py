@@ -1,4 +1,5 @@
-"""Simulate a campaign like another one, with a model or with the model and posterior of a result."""
+"""Simulate a campaign like another one, with a model or with the model and posterior of a
+result."""
 
 from __future__ import annotations
 
@@ -32,7 +33,9 @@ def model_of(tree: xr.DataTree) -> Model:
     """
     text = tree.attrs.get(schema.MODEL_DOCUMENT)
     if text is None or schema.POINT not in tree.children:
-        raise ResultsError("the result holds no estimated model", hint="run bayesoleo close or estimate again")
+        raise ResultsError(
+            "the result holds no estimated model", hint="run bayesoleo close or estimate again"
+        )
     return from_document(json.loads(text))
 
 
@@ -55,7 +58,11 @@ def parameter_sets(tree: xr.DataTree, draws: int | None, seed: int) -> list[dict
     if schema.POSTERIOR not in tree.children:
         raise ResultsError("the result holds no posterior to draw from", hint="leave --draws out")
     posterior = tree[schema.POSTERIOR].to_dataset()
-    names = [str(name) for name in posterior.data_vars if not str(name).startswith(schema.log_variance(""))]
+    names = [
+        str(name)
+        for name in posterior.data_vars
+        if not str(name).startswith(schema.log_variance(""))
+    ]
     flat = {name: posterior[name].values.ravel() for name in names}
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(next(iter(flat.values()))), size=draws, replace=False)
@@ -106,7 +113,9 @@ def simulate_like(
     for k, values in enumerate(sets):
         for r, record in enumerate(records):
             label = record.label if len(sets) == 1 else f"{record.label}, draw {k + 1}"
-            made = _simulated(model, record, values, noise, streams[k * len(records) + r], scheme, steps)
+            made = _simulated(
+                model, record, values, noise, streams[k * len(records) + r], scheme, steps
+            )
             runs.append(replace(to_simulated_run(made, units), label=label))
     wanted = (*model.inputs, *model.outputs)
     channels = {n: (c.column, c.unit) for n, c in campaign.channels.items() if n in wanted}

@@ -1,4 +1,5 @@
-"""From a campaign folder and a model to results: the verbs that the command line and scripts call."""
+"""From a campaign folder and a model to results: the verbs that the command line and scripts
+call."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.data import Campaign, ReducedCampaign, load_campaign, reduce_campaign
-from bayesoleo.effects import Effect
 from bayesoleo.data.units import parse_unit
+from bayesoleo.effects import Effect
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.document import to_document
@@ -62,8 +63,8 @@ class Settings:
     max_effects : int
         Effects added at most.
     drive : str, optional
-        Channel that drives the model; ``"model"`` keeps the model's own inputs. By default the channel that the rig controls, if the model can
-        be driven by it.
+        Channel that drives the model; ``"model"`` keeps the model's own inputs. By default the
+        channel that the rig controls, if the model can be driven by it.
     effects : tuple of Effect, optional
         Instead of the catalogue.
     command : str
@@ -161,7 +162,8 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     roles = assign(reduced.records)
     assembly = Assembly(model, drive)
     driven = assembly.model()
-    # Building a predictor of one step checks channels, conditions and priors of every run without solving anything.
+    # Building a predictor of one step checks channels, conditions and priors of every run without
+    # solving anything.
     predictor = Predictor(driven, reduced.records, steps=8, backend="numpy", jobs=1)
     predictor.layout.priors(driven)
     _check_units(driven, reduced.campaign)
@@ -169,7 +171,8 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
 
 
 def _check_units(model: Model, campaign: Campaign) -> None:
-    """Data come in SI: a model in other units, or of another quantity, is a mistake that no estimate survives."""
+    """Data come in SI: a model in other units, or of another quantity, is a mistake that no
+    estimate survives."""
     declared = dict(model.inputs) | {name: output.unit for name, output in model.outputs.items()}
     for name, unit in declared.items():
         channel, wanted = campaign.channels[name], parse_unit(unit or "1")
@@ -181,11 +184,11 @@ def _check_units(model: Model, campaign: Campaign) -> None:
                 file=campaign.path / "campaign.toml",
                 key=f"channels.{name}.unit",
                 value=channel.unit,
-                hint=f"write a unit that converts to {unit}, or declare the model's channel otherwise",
+                hint=f"write a unit that converts to {unit}, or declare the model otherwise",
             )
         if wanted.factor != 1.0 or wanted.shift != 0.0:
             raise ModelError(
-                f"model {model.name!r}: channel {name!r} is declared in {unit}, but data come in SI",
+                f"model {model.name!r}: channel {name!r} is in {unit}, but data come in SI",
                 value=unit,
                 hint=f"declare the model in {wanted.si_name}",
             )
@@ -204,13 +207,14 @@ def choose_drive(model: Model, campaign: Campaign, wanted: str | None) -> str | 
     return controlled
 
 
-def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:  # noqa: B008 - frozen
+def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:
     """Say what would be done; write nothing.
 
     Returns
     -------
     dict
-        Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh and number of candidate effects.
+        Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh and number of
+        candidate effects.
     """
     from bayesoleo.effects import catalogue
 
@@ -232,7 +236,12 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
 
 
 def estimate(
-    campaign: Source, model: Model, settings: Settings = Settings(), *, out: Path | None = None, say: Say = _silent  # noqa: B008
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: Path | None = None,
+    say: Say = _silent,
 ) -> xr.DataTree:
     """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
 
@@ -258,7 +267,7 @@ def estimate(
 def sample(
     campaign: Source,
     model: Model,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),
     *,
     out: Path | None = None,
     say: Say = _silent,
@@ -266,7 +275,8 @@ def sample(
 ) -> xr.DataTree:
     """Estimate, then sample the posterior from there with emcee.
 
-    Parameters are those of :func:`close`; the tree has the groups of the records, the point and the posterior.
+    Parameters are those of :func:`close`; the tree has the groups of the records, the point and the
+    posterior.
     """
     task = prepare(campaign, model, settings)
     fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
@@ -278,7 +288,7 @@ def sample(
 def trace(
     campaign: Source,
     model: Model,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),
     *,
     out: Path | None = None,
     say: Say = _silent,
@@ -296,13 +306,14 @@ def trace(
 def close(
     campaign: Source,
     model: Model,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),
     *,
     out: Path | None = None,
     say: Say = _silent,
     progress: bool = False,
 ) -> xr.DataTree:
-    """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before and after.
+    """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
+    and after.
 
     Parameters
     ----------
@@ -313,7 +324,8 @@ def close(
     settings : Settings
         Seed, threads, drive and so on.
     out : Path, optional
-        Folder for ``results.nc``, ``report.html``, ``summary.json`` and the sampler's checkpoints, from which a run that was stopped goes on.
+        Folder for ``results.nc``, ``report.html``, ``summary.json`` and the sampler's checkpoints,
+        from which a run that was stopped goes on.
     say : callable
         Told what is being done.
     progress : bool
@@ -369,7 +381,9 @@ def _sample(task: Task, fit: Fit, out: Path | None, say: Say, progress: bool) ->
     )
 
 
-def _result(task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | None, say: Say) -> xr.DataTree:
+def _result(
+    task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | None, say: Say
+) -> xr.DataTree:
     seed, fit = task.settings.seed, loop.final.fit
     files = {} if out is None else {name: str(out / name) for name in (RESULTS, REPORT, SUMMARY)}
     summary = summarise(loop, samples, {**task.about(), "files": files})
@@ -387,7 +401,11 @@ def _result(task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | N
 
 
 def _finish(
-    task: Task, groups: Mapping[str, xr.Dataset], fit: Fit, out: Path | None, summary: Mapping[str, Any] | None = None
+    task: Task,
+    groups: Mapping[str, xr.Dataset],
+    fit: Fit,
+    out: Path | None,
+    summary: Mapping[str, Any] | None = None,
 ) -> xr.DataTree:
     """One tree with provenance; written if a folder is given."""
     roles = task.roles
@@ -399,7 +417,9 @@ def _finish(
         schema.CAMPAIGN_SHA256: task.campaign.sha256,
         schema.MODEL: task.assembly.native.name,
         schema.DRIVE: task.about()["drive"],
-        schema.EQUATIONS: "\n".join(f"{name}: {text}" for name, text in equations(fit.model).items()),
+        schema.EQUATIONS: "\n".join(
+            f"{name}: {text}" for name, text in equations(fit.model).items()
+        ),
         schema.EQUATIONS_LATEX: list(equations_latex(fit.model)),
         schema.COMMAND: task.settings.command,
         schema.MODEL_DOCUMENT: json.dumps(to_document(fit.model)),
@@ -420,7 +440,7 @@ def _finish(
 def simulate(
     source: Model | xr.DataTree,
     campaign: Source,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),
     *,
     out: Path,
     values: Mapping[str, float] | None = None,

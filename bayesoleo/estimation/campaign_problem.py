@@ -26,7 +26,9 @@ class CampaignProblem:
         See :meth:`holding`.
     """
 
-    def __init__(self, predictor: Predictor, free: NDArray[np.int64] | None = None, full: Array | None = None):
+    def __init__(
+        self, predictor: Predictor, free: NDArray[np.int64] | None = None, full: Array | None = None
+    ):
         self.predictor = predictor
         layout = predictor.layout
         self._all_priors = layout.priors(predictor.model)
@@ -36,10 +38,12 @@ class CampaignProblem:
         self.priors: tuple[Prior, ...] = tuple(self._all_priors[k] for k in self._free)
         self.outputs = predictor.outputs
         self.runs = layout.runs
-        self.counts = np.array([[record.time.size] * len(self.outputs) for record in predictor.records])
+        self.counts = np.array(
+            [[record.time.size] * len(self.outputs) for record in predictor.records]
+        )
 
     def holding(self, values: dict[str, float]) -> CampaignProblem:
-        """The same problem with some unknowns held at given values (e.g. shared ones on a hold-out run)."""
+        """The same problem with some unknowns held, e.g. the shared ones on a hold-out run."""
         names = self.predictor.layout.names
         full = self._full.copy()
         for name, value in values.items():
@@ -62,13 +66,15 @@ class CampaignProblem:
     def evaluate(self, theta: Array) -> Evaluation:
         """Residuals and sensitivities at one vector, shape (l,).
 
-        Every evaluation re-anchors the solver at ``theta``: an estimate walks, and starts each solve where it stands.
+        Every evaluation re-anchors the solver at ``theta``: an estimate walks, and starts each
+        solve where it stands.
         """
         full = self.full(theta[None])[0]
         self.predictor.set_anchor(full)
         runs = self.predictor.predict(full)
         residual: Sequence[Sequence[Array]] = [
-            list(record.measured - run.y) for record, run in zip(self.predictor.runs, runs, strict=True)
+            list(record.measured - run.y)
+            for record, run in zip(self.predictor.runs, runs, strict=True)
         ]
         outputs = range(len(self.outputs))
         return Evaluation(
@@ -84,5 +90,5 @@ class CampaignProblem:
         return Misfit(*self.predictor.sum_of_squares(self.full(theta)))
 
     def freeze(self, theta: Array) -> Status:
-        """Fix the anchor from which :meth:`misfit` starts, so that it is a function of the vector alone."""
+        """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""
         return max(self.predictor.set_anchor(self.full(theta[None])[0]), default=Status.CONVERGED)

@@ -1,7 +1,8 @@
 """The contract between whatever can be fitted and whatever fits it.
 
-Estimators and samplers see a :class:`Problem`: names, priors, and the residuals ``e = y - yhat(theta)`` of ``s`` output channels in
-``N`` runs. They never see a model, so that a closed formula and a campaign of measured runs are estimated by the same code.
+Estimators and samplers see a :class:`Problem`: names, priors, and the residuals ``e = y -
+yhat(theta)`` of ``s`` output channels in ``N`` runs. They never see a model, so that a closed
+formula and a campaign of measured runs are estimated by the same code.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class Evaluation:
     residual : tuple of ndarray, each shape (n_b,)
         ``y - yhat`` of each output channel, runs one after the other, in the channel's SI unit.
     sensitivity : tuple of ndarray, each shape (n_b, l)
-        Derivatives of the prediction ``yhat`` with respect to the ``l`` unknowns (so the residual's are its negative).
+        Derivatives of the prediction ``yhat`` with respect to the ``l`` unknowns (so the residual's
+        are its negative).
     status : Status
         Unless it is ``CONVERGED`` the arrays hold NaN.
     """
@@ -84,4 +86,7 @@ class Problem(Protocol):
         """Residuals and sensitivities at one vector, shape (l,)."""
 
     def misfit(self, theta: Array) -> Misfit:
-        """Sums of squares at many vectors, shape (L, l); each depends on its own vector alone, bit for bit."""
+        """Sums of squares at many vectors, shape (L, l).
+
+        Each depends on its own vector alone, bit for bit.
+        """

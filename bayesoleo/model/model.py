@@ -244,7 +244,9 @@ class Model:
 
     def uncertain(self) -> tuple[str, ...]:
         """Names of the parameters that are fixed, but known to a tolerance only."""
-        return tuple(name for name, item in self.parameters.items() if item.fixed and item.prior is not None)
+        return tuple(
+            name for name, item in self.parameters.items() if item.fixed and item.prior is not None
+        )
 
     def nominal(self) -> dict[sp.Symbol, float]:
         """Values of parameters and of conditions that have a default, for substitution."""

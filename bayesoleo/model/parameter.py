@@ -31,8 +31,9 @@ class Parameter:
     prior : Prior, optional
         Any other prior, instead of ``sd``, ``relative_sd`` and ``bounds``.
     fixed : bool
-        Not estimated: keeps ``value``. With a prior it is known to that tolerance only: effects are scored with its uncertainty
-        counted, and it is freed when a lack of fit remains that it may explain.
+        Not estimated: keeps ``value``. With a prior it is known to that tolerance only: effects are
+        scored with its uncertainty counted, and it is freed when a lack of fit remains that it may
+        explain.
     by_run : bool
         One independent value for every run.
     description : str

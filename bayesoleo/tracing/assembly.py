@@ -1,7 +1,8 @@
-"""A model in the making: the declared equations, the channel that drives them, and the effects added so far.
+"""A model in the making: the declared equations, the channel that drives them, and the effects
+added so far.
 
-Effects of physics change the model in its own drive, sensor effects the channels of the driven one; both are kept apart so that
-either can be added after the other.
+Effects of physics change the model in its own drive, sensor effects the channels of the driven one;
+both are kept apart so that either can be added after the other.
 """
 
 from __future__ import annotations
@@ -114,7 +115,9 @@ class Assembly:
     def with_values(self, values: Mapping[str, float]) -> Assembly:
         """Set nominal values, the starts of later estimates."""
         present = self.model().parameters
-        return self.with_parameters({name: replace(present[name], value=value) for name, value in values.items()})
+        return self.with_parameters(
+            {name: replace(present[name], value=value) for name, value in values.items()}
+        )
 
     def without(self, step: Step) -> Assembly:
         """The same assembly with one effect left out."""
@@ -143,7 +146,8 @@ class Assembly:
         return found
 
     def _with_step(self, effect: Effect, target: str, scales: Scales) -> tuple[Candidate, Assembly]:
-        """Add an effect: to the driven model's channels if it is a sensor's, else to the equations."""
+        """Add an effect: to the driven model's channels if it is a sensor's, else to the
+        equations."""
         sensor = effect.family == "sensor"
         base = self.model() if sensor else self.native
         candidate = effect.extend(base, target, scales)
@@ -151,6 +155,10 @@ class Assembly:
         grown = replace(self, steps=(*self.steps, step), declared=self.declared or self.native)
         if not sensor:
             return candidate, replace(grown, native=candidate.model)
-        new = {name: item for name, item in candidate.model.parameters.items() if name not in base.parameters}
+        new = {
+            name: item
+            for name, item in candidate.model.parameters.items()
+            if name not in base.parameters
+        }
         sensors = (*self.sensors, (effect, target, scales))
         return candidate, replace(grown, sensors=sensors, parameters={**self.parameters, **new})

@@ -105,7 +105,9 @@ class ErrorTable:
     def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
         """As in the summary: role, output, then rms, repeating and ratio."""
         roles = dict.fromkeys(entry.role for entry in self.entries)
-        return {role: {output: self.pooled(role, output) for output in self.outputs} for role in roles}
+        return {
+            role: {output: self.pooled(role, output) for output in self.outputs} for role in roles
+        }
 
 
 def error_table(
@@ -140,5 +142,7 @@ def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
         residual = record.samples[output] - prediction.y[b]
         average = periodic_average(residual, step, record.frequency)
         rms = float(np.sqrt(np.mean(residual**2)))
-        entries.append(RunError(record.label, roles[record.label], output, rms, average, float(spread[b])))
+        entries.append(
+            RunError(record.label, roles[record.label], output, rms, average, float(spread[b]))
+        )
     return entries

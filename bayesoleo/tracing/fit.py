@@ -1,4 +1,5 @@
-"""Fit an assembled model to runs: MBE, then the posterior's mode, on a mesh fine enough not to matter."""
+"""Fit an assembled model to runs: MBE, then the posterior's mode, on a mesh fine enough not to
+matter."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
-#: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior standard deviations.
+#: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior
+#: standard deviations.
 LARGEST_SHIFT = 0.1
 #: Steps for each harmonic of the inputs, and limits.
 STEPS_PER_HARMONIC = 8
@@ -66,7 +68,8 @@ class Fit:
     numerics : Numerics
         As asked for.
     shift : float
-        Largest movement of a parameter by halving the mesh's steps, in posterior standard deviations.
+        Largest movement of a parameter by halving the mesh's steps, in posterior standard
+        deviations.
     """
 
     model: Model
@@ -102,7 +105,12 @@ class Fit:
 def first_steps(model: Model, records: Sequence[Record]) -> int:
     """Steps to start from: a few for each significant harmonic of the inputs, a power of two."""
     highest = max(
-        (int(record.harmonics[name].orders[-1]) for record in records for name in model.inputs if name in record.harmonics),
+        (
+            int(record.harmonics[name].orders[-1])
+            for record in records
+            for name in model.inputs
+            if name in record.harmonics
+        ),
         default=1,
     )
     wanted = max(FEWEST_STEPS, STEPS_PER_HARMONIC * highest)
@@ -155,7 +163,9 @@ def fit_model(
     while True:
         problem = _problem(model, records, numerics, steps, share)
         say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
-        mbe = estimate(problem, "mbe", start=start, tolerance=tolerance, max_iterations=max_iterations)
+        mbe = estimate(
+            problem, "mbe", start=start, tolerance=tolerance, max_iterations=max_iterations
+        )
         say("posterior mode")
         point = polish(problem, mbe, tolerance=tolerance, max_iterations=max_iterations)
         problem.freeze(point.theta)
@@ -164,7 +174,8 @@ def fit_model(
         fine = not shift > LARGEST_SHIFT
         if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
             return Fit(model, problem, mbe, point, predictions, steps, numerics, shift)
-        # One-step collocation gains more than a factor of four by halving, so one look ahead usually suffices.
+        # One-step collocation gains more than a factor of four by halving, so one look ahead
+        # usually suffices.
         steps, start = 2 * steps, point.theta
 
 
@@ -172,19 +183,35 @@ def _problem(
     model: Model, records: Sequence[Record], numerics: Numerics, steps: int, share: Predictor | None
 ) -> CampaignProblem:
     predictor = Predictor(
-        model, records, steps=steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs, share=share
+        model,
+        records,
+        steps=steps,
+        scheme=numerics.scheme,
+        backend=numerics.backend,
+        jobs=numerics.jobs,
+        share=share,
     )
     return CampaignProblem(predictor)
 
 
 def _mesh_shift(
-    problem: CampaignProblem, point: PointEstimate, predictions: list[RunPrediction], numerics: Numerics
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    numerics: Numerics,
 ) -> float:
-    """Shift of the estimate that the discretisation causes, ``(J' W J)^-1 J' W delta``, in standard deviations."""
+    """Shift of the estimate that the discretisation causes, ``(J' W J)^-1 J' W delta``, in standard
+    deviations."""
     coarse = problem.predictor
     theta = problem.full(point.theta[None])[0]
     fine = Predictor(
-        coarse.model, coarse.records, steps=2 * coarse.steps, scheme=coarse.scheme, backend=coarse.backend, jobs=coarse.jobs, share=coarse
+        coarse.model,
+        coarse.records,
+        steps=2 * coarse.steps,
+        scheme=coarse.scheme,
+        backend=coarse.backend,
+        jobs=coarse.jobs,
+        share=coarse,
     )
     if any(status is not Status.CONVERGED for status in fine.set_anchor(theta)):
         return float("nan")

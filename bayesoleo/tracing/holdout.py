@@ -1,4 +1,5 @@
-"""Predict runs that were not used: shared parameters stay, by-run parameters are estimated on the run itself."""
+"""Predict runs that were not used: shared parameters stay, by-run parameters are estimated on the
+run itself."""
 
 from __future__ import annotations
 
@@ -54,7 +55,11 @@ def predict_fitted(fit: Fit) -> list[Prediction]:
     """Predictions of the runs that were fitted."""
     found = []
     for run, record in zip(fit.predictions, fit.records, strict=True):
-        mine = {name: v for name, v in fit.values.items() if name in fit.model.parameters or name.endswith(f"[{record.label}]")}
+        mine = {
+            name: v
+            for name, v in fit.values.items()
+            if name in fit.model.parameters or name.endswith(f"[{record.label}]")
+        }
         predictor = _single(fit, record)
         prediction = Prediction(record, run.y, mine, 0, run.status, predictor)
         predictor.set_anchor(prediction.vector)
@@ -69,7 +74,15 @@ def predict_held_out(fit: Fit, records: Sequence[Record]) -> list[Prediction]:
 
 def _single(fit: Fit, record: Record) -> Predictor:
     numerics = fit.numerics
-    return Predictor(fit.model, [record], steps=fit.steps, scheme=numerics.scheme, backend=numerics.backend, jobs=numerics.jobs, share=fit.predictor)
+    return Predictor(
+        fit.model,
+        [record],
+        steps=fit.steps,
+        scheme=numerics.scheme,
+        backend=numerics.backend,
+        jobs=numerics.jobs,
+        share=fit.predictor,
+    )
 
 
 def _held_out(fit: Fit, record: Record) -> Prediction:

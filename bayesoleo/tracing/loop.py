@@ -54,7 +54,11 @@ class ClosedLoop:
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
         if not self.effects:
-            return schema.NOTHING_MISSING if self.final.worst_ratio < FLOOR_RATIO else schema.UNEXPLAINED
+            return (
+                schema.NOTHING_MISSING
+                if self.final.worst_ratio < FLOOR_RATIO
+                else schema.UNEXPLAINED
+            )
         if self.final.worst_ratio < FLOOR_RATIO:
             return schema.EFFECT_ADDED
         explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
@@ -128,7 +132,8 @@ def _ratios(state: State) -> str:
 
 
 def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
-    """Estimate constants known to a tolerance where a lack of fit remains and the data know them better.
+    """Estimate constants known to a tolerance where a lack of fit remains and the data know them
+    better.
 
     A wrong constant is no missing effect, and must not be mistaken for one.
     """
@@ -140,16 +145,22 @@ def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say
     chosen = []
     for k, name in enumerate(names, start=known):
         others = [j for j in range(base.gram.shape[0]) if j != k]
-        inner = np.linalg.lstsq(base.gram[np.ix_(others, others)], base.gram[others, k], rcond=None)[0]
+        inner = np.linalg.lstsq(
+            base.gram[np.ix_(others, others)], base.gram[others, k], rcond=None
+        )[0]
         from_data = base.gram[k, k] - base.gram[k, others] @ inner - 1.0
         if from_data > FREED_BY**2:
             chosen.append(name)
     if not chosen:
         return state
     say(f"free {', '.join(chosen)}, known to a tolerance only")
-    notes.append(f"{', '.join(chosen)}: fixed within a tolerance, freed because a lack of fit remained")
+    notes.append(
+        f"{', '.join(chosen)}: fixed within a tolerance, freed because a lack of fit remained"
+    )
     values = state.assembly.model().parameters
-    assembly = state.assembly.with_parameters({name: replace(values[name], fixed=False) for name in chosen})
+    assembly = state.assembly.with_parameters(
+        {name: replace(values[name], fixed=False) for name in chosen}
+    )
     return fit_state(assembly, roles, numerics, progress=say)
 
 
@@ -175,9 +186,13 @@ def _superfluous(fit: Fit, step: Step) -> bool:
 def _warnings(fit: Fit) -> list[str]:
     found = []
     if not fit.point.status.ok:
-        found.append(f"the estimate of the final model did not converge: {fit.point.status.message}")
+        found.append(
+            f"the estimate of the final model did not converge: {fit.point.status.message}"
+        )
     if fit.point.on_limit:
         found.append(f"at the limit of their prior's support: {', '.join(fit.point.on_limit)}")
     if fit.shift > 0.1:
-        found.append(f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd")
+        found.append(
+            f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd"
+        )
     return found

@@ -17,7 +17,8 @@ from bayesoleo.tracing.score import Base, Score
 
 Array = NDArray[np.float64]
 
-#: A new amplitude's prior is normal about its null, this many times as wide as the score expects it to be: weak, but proper.
+#: A new amplitude's prior is normal about its null, this many times as wide as the score expects it
+#: to be: weak, but proper.
 PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
@@ -52,7 +53,8 @@ class Refit:
     def excludes_null(self, level: float = 0.975) -> bool:
         """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
 
-        One amplitude: the probability of its own side of zero is at least ``level``; several: zero lies outside their joint region.
+        One amplitude: the probability of its own side of zero is at least ``level``; several: zero
+        lies outside their joint region.
         """
         names = [name for name in self.fit.problem.names if name in self.score.names]
         index = [self.fit.problem.names.index(name) for name in names]
@@ -85,11 +87,19 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
     quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
     fit = fit_model(
-        model, base.fit.records, quick, start=start, tolerance=1e-4, max_iterations=15, share=base.fit.predictor
+        model,
+        base.fit.records,
+        quick,
+        start=start,
+        tolerance=1e-4,
+        max_iterations=15,
+        share=base.fit.predictor,
     )
     share = share_of(base, fit)
     # Where the extended model cannot be solved at its estimate it explains nothing.
-    return Refit(score, assembly.with_values(fit.shared), fit, share if np.isfinite(share) else -np.inf)
+    return Refit(
+        score, assembly.with_values(fit.shared), fit, share if np.isfinite(share) else -np.inf
+    )
 
 
 def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
@@ -97,7 +107,11 @@ def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
     present = assembly.model().parameters
     changed: dict[str, Parameter] = {}
     for name in score.option.candidate.parameters:
-        own = [abs(v) for key, v in zip(score.names, score.expected, strict=True) if key.split("[")[0] == name]
+        own = [
+            abs(v)
+            for key, v in zip(score.names, score.expected, strict=True)
+            if key.split("[")[0] == name
+        ]
         size = max(max(own), 1e-30)
         sign = score.option.candidate.sign.get(name, 0)
         value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0
@@ -115,7 +129,9 @@ def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
 def _start(base: Base, score: Score, model: Model) -> Array:
     """Present estimates, by-run ones included, and the expected values of the new unknowns."""
     layout = Layout.of(model, [record.label for record in base.fit.records])
-    known: Mapping[str, float] = base.fit.values | dict(zip(score.names, map(float, score.expected), strict=True))
+    known: Mapping[str, float] = base.fit.values | dict(
+        zip(score.names, map(float, score.expected), strict=True)
+    )
     start = layout.start(model)
     for k, name in enumerate(layout.names):
         if "[" in name and name in known:

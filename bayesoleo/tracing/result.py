@@ -35,21 +35,32 @@ def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.
     labels = [record.label for record in records]
     channels = [name for name in units if all(name in record.samples for record in records)]
     rows = (schema.RUN, schema.SAMPLE)
-    observed = {name: _padded([r.samples[name] for r in records], rows, units[name], name) for name in channels}
-    observed[schema.TIME] = _padded([r.time - r.time[0] for r in records], rows, "s", "time since the first sample")
+    observed = {
+        name: _padded([r.samples[name] for r in records], rows, units[name], name)
+        for name in channels
+    }
+    observed[schema.TIME] = _padded(
+        [r.time - r.time[0] for r in records], rows, "s", "time since the first sample"
+    )
     observed[schema.PHASE] = _padded([r.phase for r in records], rows, "1", "phase in cycles")
     constant = {
         schema.FREQUENCY: _by_run([r.frequency for r in records], "Hz", "fundamental frequency"),
-        schema.FREQUENCY_SD: _by_run([r.frequency_sd for r in records], "Hz", "its standard deviation"),
+        schema.FREQUENCY_SD: _by_run(
+            [r.frequency_sd for r in records], "Hz", "its standard deviation"
+        ),
         schema.PERIODS: _by_run([r.periods for r in records], "1", "whole periods"),
         schema.ROLE: (schema.RUN, [r.role for r in records]),
         schema.RUN_GROUP: (schema.RUN, [r.group for r in records]),
     }
-    condition_units = {name: unit for run in campaign.runs for name, unit in run.condition_units.items()}
+    condition_units = {
+        name: unit for run in campaign.runs for name, unit in run.condition_units.items()
+    }
     for name, unit in condition_units.items():
         constant[name] = _by_run([r.conditions.get(name, np.nan) for r in records], unit, name)
     noise = {
-        name: _by_run([r.signal_noise[name] for r in records], units[name], f"noise of a sample of {name}")
+        name: _by_run(
+            [r.signal_noise[name] for r in records], units[name], f"noise of a sample of {name}"
+        )
         for name in channels
     }
     coords = {schema.RUN: labels}
@@ -67,7 +78,10 @@ def point_group(fit: Fit) -> xr.Dataset:
 
 def _units(fit: Fit) -> list[str]:
     layout = fit.predictor.layout
-    return [fit.model.parameters[layout.parameters[layout.names.index(name)]].unit for name in fit.problem.names]
+    return [
+        fit.model.parameters[layout.parameters[layout.names.index(name)]].unit
+        for name in fit.problem.names
+    ]
 
 
 def posterior_groups(fit: Fit, samples: Samples, seed: int) -> dict[str, xr.Dataset]:
@@ -89,7 +103,7 @@ def loop_groups(loop: ClosedLoop, samples: Samples | None, seed: int) -> dict[st
     return groups
 
 
-# -- pieces ----------------------------------------------------------------------------------------------------------------
+# -- pieces ---------------------------------------------------------------------------
 
 
 def _padded(values: Sequence[Array], dims: tuple[str, str], unit: str, name: str) -> xr.Variable:
@@ -111,7 +125,9 @@ def ordered(state: State) -> list[Prediction]:
 
 
 def _stages(loop: ClosedLoop) -> list[tuple[str, State]]:
-    return [("before", loop.first)] + ([("after", loop.final)] if loop.final is not loop.first else [])
+    return [("before", loop.first)] + (
+        [("after", loop.final)] if loop.final is not loop.first else []
+    )
 
 
 def _predictions(loop: ClosedLoop) -> xr.Dataset:
@@ -120,7 +136,9 @@ def _predictions(loop: ClosedLoop) -> xr.Dataset:
         found = ordered(state)
         for b, output in enumerate(state.fit.predictor.outputs):
             unit = state.fit.model.outputs[output].unit
-            data[f"{output}_{stage}"] = _padded([p.y[b] for p in found], (schema.RUN, schema.SAMPLE), unit, f"predicted {output}")
+            data[f"{output}_{stage}"] = _padded(
+                [p.y[b] for p in found], (schema.RUN, schema.SAMPLE), unit, f"predicted {output}"
+            )
     return xr.Dataset(data, coords={schema.RUN: [p.record.label for p in ordered(loop.first)]})
 
 
@@ -131,20 +149,36 @@ def _residuals(loop: ClosedLoop) -> xr.Dataset:
         for b, output in enumerate(state.fit.predictor.outputs):
             unit = state.fit.model.outputs[output].unit
             errors = [state.errors.at(output, p.record.label) for p in found]
-            data[f"{output}_{stage}"] = _padded([p.record.samples[output] - p.y[b] for p in found], rows, unit, f"residual of {output}")
+            data[f"{output}_{stage}"] = _padded(
+                [p.record.samples[output] - p.y[b] for p in found],
+                rows,
+                unit,
+                f"residual of {output}",
+            )
             means = np.stack([e.average.on_phase(PHASES) for e in errors])
             data[f"{output}_{stage}_mean"] = xr.Variable(
-                (schema.RUN, schema.PHASE), means, {schema.UNITS: unit, schema.LONG_NAME: f"residual of {output}, average over periods"}
+                (schema.RUN, schema.PHASE),
+                means,
+                {
+                    schema.UNITS: unit,
+                    schema.LONG_NAME: f"residual of {output}, average over periods",
+                },
             )
-            data[schema.noise(output)] = _by_run([e.noise for e in errors], unit, "standard error of that average")
+            data[schema.noise(output)] = _by_run(
+                [e.noise for e in errors], unit, "standard error of that average"
+            )
     for name, (values, unit) in _coordinate(loop.final).items():
         data[name] = _padded(values, rows, unit, name)
-    coords = {schema.RUN: [p.record.label for p in ordered(loop.first)], schema.PHASE: np.arange(PHASES) / PHASES}
+    coords = {
+        schema.RUN: [p.record.label for p in ordered(loop.first)],
+        schema.PHASE: np.arange(PHASES) / PHASES,
+    }
     return xr.Dataset(data, coords=coords)
 
 
 def _coordinate(state: State) -> dict[str, tuple[list[Array], str]]:
-    """Position and velocity of the first coordinate that has a velocity, for plots of the residual."""
+    """Position and velocity of the first coordinate that has a velocity, for plots of the
+    residual."""
     native = state.assembly.native
     place = next((c for c in native.coordinates() if c.velocity is not None), None)
     if place is None:
@@ -165,14 +199,20 @@ def _coordinate(state: State) -> dict[str, tuple[list[Array], str]]:
         item = record.harmonics[channel]
         position.append(item.evaluate(record.phase, record.frequency))
         velocity.append(item.evaluate(record.phase, record.frequency, 1))
-    return {schema.STROKE: (position, unit), schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s")}
+    return {
+        schema.STROKE: (position, unit),
+        schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s"),
+    }
 
 
 def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
     keys = list(dict.fromkeys(_key(item) for entry in rounds for item in entry.ranking))
     shape = (len(rounds), len(keys))
     numbers = {name: np.full(shape, np.nan) for name in (schema.GAIN, schema.P_VALUE, schema.Z)}
-    texts = {name: np.full(shape, "", dtype=object) for name in (schema.EXPECTED, schema.INDISTINGUISHABLE)}
+    texts = {
+        name: np.full(shape, "", dtype=object)
+        for name in (schema.EXPECTED, schema.INDISTINGUISHABLE)
+    }
     family = np.full(len(keys), "", dtype=object)
     for r, entry in enumerate(rounds):
         for item in entry.ranking:
@@ -184,11 +224,15 @@ def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
             texts[schema.INDISTINGUISHABLE][r, k] = json.dumps(list(item.same))
             family[k] = item.score.option.candidate.family
     dims = (schema.ROUND, schema.EFFECT)
-    data: dict[str, xr.Variable] = {name: xr.Variable(dims, values, {schema.UNITS: "1"}) for name, values in numbers.items()}
+    data: dict[str, xr.Variable] = {
+        name: xr.Variable(dims, values, {schema.UNITS: "1"}) for name, values in numbers.items()
+    }
     data |= {name: xr.Variable(dims, values.astype(str)) for name, values in texts.items()}
     data[schema.CANDIDATE_FAMILY] = xr.Variable(schema.EFFECT, family.astype(str))
     data |= _error_tables(rounds)
-    data[schema.ACCEPTED] = xr.Variable(schema.ROUND, np.array([e.accepted.effect if e.accepted else "" for e in rounds]))
+    data[schema.ACCEPTED] = xr.Variable(
+        schema.ROUND, np.array([e.accepted.effect if e.accepted else "" for e in rounds])
+    )
     data[schema.REASON] = xr.Variable(schema.ROUND, np.array([e.reason for e in rounds]))
     first = rounds[0].before
     coords = {
@@ -209,12 +253,28 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
     dims = (schema.ROUND, schema.OUTPUT, schema.RUN)
     first = rounds[0].before
     runs = [p.record.label for p in ordered(first)]
-    names = {schema.RMS: "rms", schema.REPEATING: "repeating", schema.NOISE: "noise", schema.RATIO_TO_NOISE: "ratio"}
+    names = {
+        schema.RMS: "rms",
+        schema.REPEATING: "repeating",
+        schema.NOISE: "noise",
+        schema.RATIO_TO_NOISE: "ratio",
+    }
     return {
         name: xr.Variable(
             dims,
-            np.array([[[getattr(e.before.errors.at(o, run), field) for run in runs] for o in first.errors.outputs] for e in rounds]),
-            {schema.LONG_NAME: name, schema.UNITS: "1" if field == "ratio" else "SI unit of each output"},
+            np.array(
+                [
+                    [
+                        [getattr(e.before.errors.at(o, run), field) for run in runs]
+                        for o in first.errors.outputs
+                    ]
+                    for e in rounds
+                ]
+            ),
+            {
+                schema.LONG_NAME: name,
+                schema.UNITS: "1" if field == "ratio" else "SI unit of each output",
+            },
         )
         for name, field in names.items()
     }
@@ -229,9 +289,9 @@ def _predictive(state: State, samples: Samples, seed: int) -> xr.Dataset:
     outputs = state.fit.predictor.outputs
     values = np.full((len(outputs), theta.shape[0], len(found), PHASES), np.nan)
     for r, prediction in enumerate(found):
-        vectors = np.stack(
-            [names.get(name, np.full(theta.shape[0], value)) for name, value in prediction.theta.items()], axis=1
-        ) if prediction.theta else np.zeros((theta.shape[0], 0))  # fmt: skip
+        vectors = np.zeros((theta.shape[0], len(prediction.theta)))
+        for k, (name, value) in enumerate(prediction.theta.items()):
+            vectors[:, k] = names.get(name, value)
         y = _on_phases(prediction, vectors)
         noise = rng.standard_normal(y.shape) * np.sqrt(variance)[:, :, None]
         values[:, :, r] = np.moveaxis(y + noise, 1, 0)
@@ -239,7 +299,10 @@ def _predictive(state: State, samples: Samples, seed: int) -> xr.Dataset:
         output: xr.Variable(
             (schema.CHAIN, schema.DRAW, schema.RUN, schema.PHASE),
             values[b][None],
-            {schema.UNITS: state.fit.model.outputs[output].unit, schema.LONG_NAME: f"predicted {output}"},
+            {
+                schema.UNITS: state.fit.model.outputs[output].unit,
+                schema.LONG_NAME: f"predicted {output}",
+            },
         )
         for b, output in enumerate(outputs)
     }
@@ -254,7 +317,12 @@ def _on_phases(prediction: Prediction, theta: Array) -> Array:
     blank = {name: np.zeros(PHASES) for name in record.samples}
     grid: Mapping[str, Array] = blank
     predictor = Predictor(
-        old.model, [replace(record, time=time, samples=grid)], steps=old.steps, scheme=old.scheme, backend=old.backend, jobs=1
+        old.model,
+        [replace(record, time=time, samples=grid)],
+        steps=old.steps,
+        scheme=old.scheme,
+        backend=old.backend,
+        jobs=1,
     )
     predictor.runs[0].anchor = old.runs[0].anchor
     found = predictor.simulate(theta, 0)

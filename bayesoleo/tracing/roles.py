@@ -51,16 +51,23 @@ def assign(records: Sequence[Record]) -> Roles:
     fitted = tuple(record for record in records if record.role == "fit")
     held_out = tuple(record for record in records if record.role != "fit")
     if not fitted:
-        raise CampaignError("no run has the role fit", hint='write role = "fit" in at least one run')
+        raise CampaignError(
+            "no run has the role fit", hint='write role = "fit" in at least one run'
+        )
     if held_out:
         return Roles(fitted, held_out, "declared", f"{len(held_out)} declared hold-out runs")
     if len(fitted) >= 2:
-        text = "no hold-out run is declared: every run is predicted by a fit to the others (leave-one-run-out)"
+        text = (
+            "no hold-out run is declared: every run is predicted by a fit to the others"
+            " (leave-one-run-out)"
+        )
         return Roles(fitted, fitted, "leave-one-run-out", text)
     (only,) = fitted
     if only.periods >= FEWEST_PERIODS_TO_SPLIT:
         first, second = _halves(only)
-        text = "one run and no hold-out: fitted to the first half of its periods, held out the second"
+        text = (
+            "one run and no hold-out: fitted to the first half of its periods, held out the second"
+        )
         return Roles((first,), (second,), "split periods", text)
     return Roles(fitted, (), "none", "one run of too few periods: nothing could be held out")
 
@@ -78,7 +85,9 @@ def _part(record: Record, samples: slice, periods: int, name: str, role: str) ->
     time = record.time[samples]
     shift = record.frequency * (time[0] - record.time[0])
     harmonics = {
-        channel: replace(item, coefficients=item.coefficients * np.exp(2j * np.pi * item.orders * shift))
+        channel: replace(
+            item, coefficients=item.coefficients * np.exp(2j * np.pi * item.orders * shift)
+        )
         for channel, item in record.harmonics.items()
     }
     return replace(

@@ -1,4 +1,5 @@
-"""One round of the search: score every effect, estimate the best few, confirm one on runs that were not used."""
+"""One round of the search: score every effect, estimate the best few, confirm one on runs that were
+not used."""
 
 from __future__ import annotations
 
@@ -17,15 +18,18 @@ from bayesoleo.tracing.score import Base, Score, score_all
 from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
 from bayesoleo.tracing.state import State, fit_state
 
-#: The floor is reached if the pooled ratio of every output is below this and no candidate explains this part of the excess.
+#: The floor is reached if the pooled ratio of every output is below this and no candidate explains
+#: this part of the excess.
 FLOOR_RATIO, FLOOR_SHARE = 1.15, 0.10
 #: Nominal probability of adding an effect to data that lack none.
 LEVEL = 0.01
 #: Least part of the present excess that is worth another effect.
 LEAST_SHARE = 0.05
-#: Candidates estimated before one is chosen, and how far behind the best a score may lie to be among them.
+#: Candidates estimated before one is chosen, and how far behind the best a score may lie to be
+#: among them.
 MOST_REFITS, NEAR = 6, 0.25
-#: Effects after estimation within this share of the best are as good; the simplest of them is taken.
+#: Effects after estimation within this share of the best are as good; the simplest of them is
+#: taken.
 AS_GOOD = 0.02
 
 Say = Callable[[str], None]
@@ -161,8 +165,11 @@ def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
     return None
 
 
-def _refit_best(base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say) -> dict[int, Refit]:
-    """Estimate the best few: effects of physics first, what merely varies from run to run if nothing else explains much."""
+def _refit_best(
+    base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say
+) -> dict[int, Refit]:
+    """Estimate the best few: effects of physics first, what merely varies from run to run if
+    nothing else explains much."""
     chosen: list[Score] = []
     significant = [item for item in ranking if item.p_value < LEVEL and item.gain > 0]
     named = [item for item in significant if item.score.option.candidate.family != "run-to-run"]
@@ -194,7 +201,9 @@ def _choose(
         tried.remove(item)
         result = refits[id(item.score)]
         if result.share < LEAST_SHARE:
-            reasons.append(f"{item.effect} would explain only {100 * result.share:.0f} % of the excess")
+            reasons.append(
+                f"{item.effect} would explain only {100 * result.share:.0f} % of the excess"
+            )
             continue
         if not result.excludes_null():
             reasons.append(f"the posterior of {item.effect} does not exclude its null")
@@ -202,8 +211,11 @@ def _choose(
         say(f"confirm {item.effect} on runs that were not used")
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         fall, error = fall_on_hold_out(state, after)
-        # Parameters estimated on the held-out run itself fit its noise: each lowers the sum by one on average.
-        flattery = sum(p.re_estimated for p in after.held_out) - sum(p.re_estimated for p in state.held_out)
+        # Parameters estimated on the held-out run itself fit its noise: each lowers the sum by one
+        # on average.
+        flattery = sum(p.re_estimated for p in after.held_out) - sum(
+            p.re_estimated for p in state.held_out
+        )
         if after.hold_errors.entries and not fall - flattery > error:
             reasons.append(f"{item.effect} does not lower the error on hold-out runs")
             continue
@@ -214,7 +226,8 @@ def _choose(
 def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
     """Fall of the weighted sum of squares on held-out runs, and its standard error.
 
-    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise of variance ``1/w`` in ``y`` gives it the variance
+    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise of
+    variance ``1/w`` in ``y`` gives it the variance
     ``4 sum w (b - a)^2``.
     """
     fall = variance = 0.0
@@ -230,5 +243,7 @@ def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
 def _accepted_reason(before: State, after: State, item: Ranked, fall: float, error: float) -> str:
     text = f"{item.effect} explains {100 * item.gain:.0f} % of the excess"
     if after.hold_errors.entries:
-        text += f" and lowers the weighted squared error on hold-out runs by {fall:.3g} ± {error:.1g}"
+        text += (
+            f" and lowers the weighted squared error on hold-out runs by {fall:.3g} ± {error:.1g}"
+        )
     return text

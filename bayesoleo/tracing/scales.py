@@ -13,7 +13,8 @@ POINTS = 512
 def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:
     """Ranges of every coordinate over all fitted runs.
 
-    A dof that the drive replaced moves as the driving channel does; offsets and gains on it are small.
+    A dof that the drive replaced moves as the driving channel does; offsets and gains on it are
+    small.
     """
     position: dict[str, tuple[float, float]] = {}
     velocity: dict[str, float] = {}

@@ -1,8 +1,12 @@
-"""Score an effect at its null: how much of the residual it would explain, without estimating anything anew.
+"""Score an effect at its null: how much of the residual it would explain, without estimating
+anything anew.
 
-With residual ``e``, sensitivities ``J`` of the present parameters, ``C`` of the candidate's and weights ``W``, what the candidate adds is
-``C_perp = C - J (J' W J)^-1 J' W C``; its score is ``s = C_perp' W e`` with information ``I = C_perp' W C_perp``. The expected parameter is
-``I^-1 s`` and the sum of squares falls by ``s' I^-1 s`` (Rao's score test). Shape parameters that the null leaves undefined are scanned.
+With residual ``e``, sensitivities ``J`` of the present parameters, ``C`` of the candidate's and
+weights ``W``, what the candidate adds is
+``C_perp = C - J (J' W J)^-1 J' W C``; its score is ``s = C_perp' W e`` with information ``I =
+C_perp' W C_perp``. The expected parameter is
+``I^-1 s`` and the sum of squares falls by ``s' I^-1 s`` (Rao's score test). Shape parameters that
+the null leaves undefined are scanned.
 """
 
 from __future__ import annotations
@@ -27,15 +31,18 @@ Array = NDArray[np.float64]
 
 #: Samples kept for comparing candidates with each other: every one of this many.
 THINNING = 7
-#: Directions of input noise that are counted in a run, and the squared size, in noise units, below which one is not worth it.
+#: Directions of input noise that are counted in a run, and the squared size, in noise units, below
+#: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
 
 
 @dataclass(frozen=True)
 class RunBase:
-    """One run in units of its noise: all arrays are divided by the noise of a sample, outputs one after the other.
+    """One run in units of its noise: all arrays are divided by the noise of a sample, outputs one
+    after the other.
 
-    The noise covariance is ``I + B' B`` in these units; ``B``, from the input's noise, is counted by Woodbury's identity.
+    The noise covariance is ``I + B' B`` in these units; ``B``, from the input's noise, is counted
+    by Woodbury's identity.
 
     Parameters
     ----------
@@ -43,9 +50,11 @@ class RunBase:
         Inverse standard deviation of a single sample's noise.
     residual : ndarray, shape (m,)
     sensitivity : ndarray, shape (l, m)
-        With respect to present unknowns and uncertain constants, each in units of its prior's standard deviation.
+        With respect to present unknowns and uncertain constants, each in units of its prior's
+        standard deviation.
     input_noise : ndarray, shape (k, m)
-        ``B``: change of the outputs by one standard deviation of each input coefficient that matters.
+        ``B``: change of the outputs by one standard deviation of each input coefficient that
+        matters.
     inverse : ndarray, shape (k, k)
         ``(I + B B')^-1``.
     period : ndarray of int, shape (m,)
@@ -64,7 +73,14 @@ class RunBase:
     moved: Array
 
     @classmethod
-    def of(cls, scale: Array, residual: Array, sensitivity: Array, columns: Array, period: NDArray[np.int64]) -> RunBase:
+    def of(
+        cls,
+        scale: Array,
+        residual: Array,
+        sensitivity: Array,
+        columns: Array,
+        period: NDArray[np.int64],
+    ) -> RunBase:
         """Keep the directions of input noise that matter against the noise of the samples."""
         columns = columns * scale
         size = np.sum(columns**2, axis=1)
@@ -123,19 +139,26 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
     fit : Fit
         The present model.
     errors : mapping of (run, output) to (sigma, repeating, noise)
-        Noise of a single sample, root mean square of the averaged residual, and its standard error, input noise included.
+        Noise of a single sample, root mean square of the averaged residual, and its standard error,
+        input noise included.
     """
     unit = np.array([prior.sd for prior in fit.problem.priors])
     tolerances = _tolerance_columns(fit)
     size, known = len(unit) + len(fit.model.uncertain()), len(unit)
     gram, gradient, runs = np.zeros((size, size)), np.zeros(size), []
-    # A constant known to a tolerance is no free parameter: its prior's precision, one in this unit, stays with it.
+    # A constant known to a tolerance is no free parameter: its prior's precision, one in this unit,
+    # stays with it.
     gram[known:, known:] += np.eye(size - known)
     noise = excess = 0.0
     for r, record in enumerate(fit.records):
         run = fit.predictor.runs[r]
-        sigma = [_sigma(errors[record.label, o][0], m) for o, m in zip(fit.predictor.outputs, run.measured, strict=True)]
-        columns = np.concatenate([fit.predictions[r].sensitivity[:, _free(fit)] * unit[:, None], tolerances[r]], axis=1)
+        sigma = [
+            _sigma(errors[record.label, o][0], m)
+            for o, m in zip(fit.predictor.outputs, run.measured, strict=True)
+        ]
+        columns = np.concatenate(
+            [fit.predictions[r].sensitivity[:, _free(fit)] * unit[:, None], tolerances[r]], axis=1
+        )
         present = RunBase.of(
             np.repeat(1.0 / np.array(sigma), record.time.size),
             (run.measured - fit.predictions[r].y).ravel(),
@@ -170,15 +193,22 @@ def _present(fit: Fit, r: int) -> Array:
 
 
 def _tolerance_columns(fit: Fit) -> list[Array]:
-    """Sensitivities to the constants known to a tolerance only, in units of their priors' standard deviations."""
+    """Sensitivities to the constants known to a tolerance only, in units of their priors' standard
+    deviations."""
     names = fit.model.uncertain()
     if not names:
-        return [np.zeros((run.measured.shape[0], 0, run.measured.shape[1])) for run in fit.predictor.runs]
+        return [
+            np.zeros((run.measured.shape[0], 0, run.measured.shape[1]))
+            for run in fit.predictor.runs
+        ]
     model = fit.model.fixing(*fit.model.estimated()).freeing(*names)
     scale = np.array([prior.sd for prior in Layout.of(model, ["any"]).priors(model)])
     blocks = _sensitivities(fit, model, [{}])
     if isinstance(blocks, Status):
-        return [np.zeros((run.measured.shape[0], len(scale), run.measured.shape[1])) for run in fit.predictor.runs]
+        return [
+            np.zeros((run.measured.shape[0], len(scale), run.measured.shape[1]))
+            for run in fit.predictor.runs
+        ]
     return [block * scale[:, None] for block in blocks[0].by_run]
 
 
@@ -208,7 +238,8 @@ class Score:
     inflation : float
         Variance of the score between periods over what white noise gives; at least one.
     columns : ndarray, shape (m, n)
-        Thinned, weighted, normalised ``C_perp`` of all scanned shapes, for the correction for the search.
+        Thinned, weighted, normalised ``C_perp`` of all scanned shapes, for the correction for the
+        search.
     contribution : ndarray, shape (n,)
         Thinned, weighted ``C_perp I^-1 s``, for comparing candidates.
     z : float
@@ -228,11 +259,14 @@ class Score:
 
     @property
     def statistic(self) -> float:
-        """Chi-square statistic with ``len(names)`` degrees of freedom, corrected for coloured noise."""
+        """Chi-square statistic with ``len(names)`` degrees of freedom, corrected for coloured
+        noise."""
         return self.fall / self.inflation
 
 
-def score_all(base: Base, options: Sequence[Option], jobs: int | None = None) -> tuple[list[Score], dict[str, str]]:
+def score_all(
+    base: Base, options: Sequence[Option], jobs: int | None = None
+) -> tuple[list[Score], dict[str, str]]:
     """Score every candidate.
 
     Returns
@@ -244,13 +278,20 @@ def score_all(base: Base, options: Sequence[Option], jobs: int | None = None) ->
     """
     results = thread_map(lambda option: _attempt(base, option), list(options), jobs)
     scores = [item for item in results if isinstance(item, Score)]
-    failed = {f"{o.key[0]} at {o.key[1]}": r.message for o, r in zip(options, results, strict=True) if isinstance(r, Status)}
+    failed = {
+        f"{o.key[0]} at {o.key[1]}": r.message
+        for o, r in zip(options, results, strict=True)
+        if isinstance(r, Status)
+    }
     return sorted(scores, key=lambda item: -item.share), failed
 
 
 def _attempt(base: Base, option: Option) -> Score | Status:
     candidate = option.candidate
-    shapes = [dict(zip(candidate.shapes, values, strict=True)) for values in product(*candidate.shapes.values())]
+    shapes = [
+        dict(zip(candidate.shapes, values, strict=True))
+        for values in product(*candidate.shapes.values())
+    ]
     columns = _columns(base, option, shapes)
     if isinstance(columns, Status):
         return columns
@@ -275,16 +316,26 @@ class _Block:
     by_run: list[Array]  # each (ny, k, N)
 
 
-def _columns(base: Base, option: Option, shapes: Sequence[Mapping[str, float]]) -> list[_Block] | Status:
+def _columns(
+    base: Base, option: Option, shapes: Sequence[Mapping[str, float]]
+) -> list[_Block] | Status:
     """Derivatives of the outputs with respect to the new unknowns, for each set of shapes."""
     fixed = [name for name in option.model.estimated() if name not in option.candidate.parameters]
     return _sensitivities(base.fit, option.model.fixing(*fixed), shapes)
 
 
-def _sensitivities(fit: Fit, model: Model, shapes: Sequence[Mapping[str, float]]) -> list[_Block] | Status:
+def _sensitivities(
+    fit: Fit, model: Model, shapes: Sequence[Mapping[str, float]]
+) -> list[_Block] | Status:
     """Derivatives with respect to a model's estimated parameters at the present estimate."""
     predictor = Predictor(
-        model, fit.records, steps=fit.steps, scheme=fit.numerics.scheme, backend="numpy", jobs=1, share=fit.predictor
+        model,
+        fit.records,
+        steps=fit.steps,
+        scheme=fit.numerics.scheme,
+        backend="numpy",
+        jobs=1,
+        share=fit.predictor,
     )
     if predictor.outputs != fit.predictor.outputs:
         return Status.SINGULAR
@@ -321,7 +372,9 @@ def _set_present(fit: Fit, r: int, predictor: Predictor, p: Array) -> None:
             p[:, position[name]] = value
 
 
-def _evaluate(base: Base, option: Option, values: Mapping[str, float], block: _Block) -> Score | None:
+def _evaluate(
+    base: Base, option: Option, values: Mapping[str, float], block: _Block
+) -> Score | None:
     k, size = len(block.names), base.gram.shape[0]
     cross, own, score = np.zeros((size, k)), np.zeros((k, k)), np.zeros(k)
     columns = [_flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
@@ -376,7 +429,8 @@ def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
 
 
 def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: Array) -> float:
-    """Variance of the score between periods relative to white noise's, along the expected direction."""
+    """Variance of the score between periods relative to white noise's, along the expected
+    direction."""
     if not np.any(expected):
         return 1.0
     measured = assumed = 0.0
@@ -387,5 +441,6 @@ def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: A
             continue
         measured += sums.size * float(np.var(sums, ddof=1))
         assumed += float(direction @ direction)
-    # Slow noise makes the score vary more than its formula says; too few periods can only feign less, which is not believed.
+    # Slow noise makes the score vary more than its formula says; too few periods can only feign
+    # less, which is not believed.
     return max(1.0, measured / assumed) if assumed > 0 else 1.0

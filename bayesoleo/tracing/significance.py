@@ -1,4 +1,5 @@
-"""How sure an effect is, given that the best of many was picked; and which effects the data cannot tell apart."""
+"""How sure an effect is, given that the best of many was picked; and which effects the data cannot
+tell apart."""
 
 from __future__ import annotations
 
@@ -20,8 +21,9 @@ DRAWS = 4000
 def effective_tests(scores: Sequence[Score], seed: int) -> float:
     """Number of independent tests that a search over correlated candidates amounts to.
 
-    Noise is drawn in the space of all candidates' columns, scanned shapes included; its largest statistic has the distribution of the
-    largest of ``m`` independent ones, and ``m`` is read off at the median (Westfall and Young 1993, max-T; Sidak 1967).
+    Noise is drawn in the space of all candidates' columns, scanned shapes included; its largest
+    statistic has the distribution of the largest of ``m`` independent ones, and ``m`` is read off
+    at the median (Westfall and Young 1993, max-T; Sidak 1967).
     """
     columns = np.concatenate([score.columns for score in scores]) if scores else np.zeros((0, 1))
     if columns.shape[0] < 2:
@@ -51,7 +53,9 @@ def classes(scores: Sequence[Score]) -> list[list[int]]:
         for j in range(i + 1, size):
             if lengths[i] == 0 or lengths[j] == 0:
                 continue
-            cosine = float(scores[i].contribution @ scores[j].contribution) / (lengths[i] * lengths[j])
+            cosine = float(scores[i].contribution @ scores[j].contribution) / (
+                lengths[i] * lengths[j]
+            )
             if cosine > 0 and cosine**2 > SAME:
                 found[i].append(j)
                 found[j].append(i)

@@ -59,13 +59,19 @@ class State:
     def base(self) -> Base:
         """What candidates are scored against."""
         entries = self.fit_errors.entries
-        return base_of(self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.noise) for e in entries})
+        return base_of(
+            self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.noise) for e in entries}
+        )
 
 
 def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
     """Predict all runs at a fit and compare with what was measured."""
     fitted = predict_fitted(fit)
-    held_out = _left_out(fit, roles) if roles.strategy == "leave-one-run-out" else predict_held_out(fit, roles.held_out)
+    held_out = (
+        _left_out(fit, roles)
+        if roles.strategy == "leave-one-run-out"
+        else predict_held_out(fit, roles.held_out)
+    )
     jobs = fit.numerics.jobs
     return State(
         assembly.with_values(fit.shared),
@@ -82,7 +88,9 @@ def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:
     predictions = []
     for record in roles.held_out:
         others = [other for other in fit.records if other.label != record.label]
-        keep = [k for k, name in enumerate(fit.problem.names) if not name.endswith(f"[{record.label}]")]
+        keep = [
+            k for k, name in enumerate(fit.problem.names) if not name.endswith(f"[{record.label}]")
+        ]
         numerics = replace(fit.numerics, steps=fit.steps)
         partial = fit_model(fit.model, others, numerics, start=fit.point.theta[keep])
         predictions += predict_held_out(partial, [record])

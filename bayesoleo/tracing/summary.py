@@ -15,7 +15,9 @@ from bayesoleo.tracing.rounds import Ranked, Round
 from bayesoleo.tracing.state import State
 
 
-def summarise(loop: ClosedLoop, samples: Samples | None, about: Mapping[str, Any]) -> dict[str, Any]:
+def summarise(
+    loop: ClosedLoop, samples: Samples | None, about: Mapping[str, Any]
+) -> dict[str, Any]:
     """Describe a closed loop in the terms of the summary's JSON Schema.
 
     Parameters
@@ -87,21 +89,30 @@ def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, An
         if samples is not None:
             draws = samples.draws[:, :, samples.names.index(name)]
             low, high = np.quantile(draws, [0.025, 0.975])
-            entry |= {"mean": float(draws.mean()), "sd": float(draws.std()), "interval": [float(low), float(high)]}
+            entry |= {
+                "mean": float(draws.mean()),
+                "sd": float(draws.std()),
+                "interval": [float(low), float(high)],
+            }
         table[name] = entry
     return table
 
 
 def _input_noise_notes(state: State) -> list[str]:
-    """Say where the noise of the input, sent through the model, is the larger part of the noise floor."""
+    """Say where the noise of the input, sent through the model, is the larger part of the noise
+    floor."""
     notes = []
     for output in state.errors.outputs:
-        entries = [e for e in state.errors.entries if e.output == output and e.input_noise > e.average.noise]
+        entries = [
+            e
+            for e in state.errors.entries
+            if e.output == output and e.input_noise > e.average.noise
+        ]
         if entries:
             worst = max(entries, key=lambda e: e.input_noise / e.average.noise)
             notes.append(
-                f"input noise dominates the noise of {output} in {len(entries)} runs: in run {worst.run} it is"
-                f" {worst.input_noise / worst.average.noise:.1f} times the output's own"
+                f"input noise dominates the noise of {output} in {len(entries)} runs: in run"
+                f" {worst.run} it is {worst.input_noise / worst.average.noise:.1f} times the output's own"
             )
     return notes
 

@@ -1,0 +1,94 @@
+"""The marks on measured and simulated campaigns that everybody is held to."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from bayesoleo import schema, workflow
+from bayesoleo.modelfile import load_model
+from bayesoleo.workflow import Settings
+
+pytestmark = pytest.mark.reference
+STUDIES = Path(__file__).parents[2] / "studies" / "measured"
+
+
+def summary_of(folder: Path, model: str) -> dict:
+    """Close the loop but for the sampling, which changes no error and no verdict."""
+    reduced = workflow.reduce(folder)
+    task = workflow.prepare(reduced, load_model(model), Settings())
+    loop = workflow._loop(task, Settings().max_effects, lambda _: None)
+    tree = workflow._result(task, loop, None, None, lambda _: None)
+    return json.loads(tree.attrs[schema.SUMMARY])
+
+
+def on_hold_out(summary: dict, key: str, when: int = -1) -> dict[tuple[str, str], float]:
+    """A figure of every held-out run by output and run, of the last round or another."""
+    return {
+        (output, run): entry[key]
+        for output, runs in summary["rounds"][when]["error"].items()
+        for run, entry in runs.items()
+        if entry["role"] == schema.HOLD_OUT
+    }
+
+
+def present(folder: Path) -> Path:
+    """A set's folder; a test of an absent one skips, and fails in CI."""
+    if folder.is_dir():
+        return folder
+    if os.environ.get("CI") == "true":
+        pytest.fail(f"{folder} is absent")
+    pytest.skip(f"{folder} is absent")
+
+
+@pytest.mark.slow
+def test_a_complete_oleo_lacks_nothing(data_folder):
+    folder = present(data_folder / "campaigns" / "shaker-plain")
+    summary = summary_of(folder, "f16n2d2")
+    assert summary["verdict"] == schema.NOTHING_MISSING
+    assert summary["effects"] == []
+    ratios = on_hold_out(summary, "ratio_to_noise")
+    assert {output for output, _ in ratios} == {"force", "pressure"}
+    assert max(ratios.values()) <= 1.15
+
+
+@pytest.mark.slow
+def test_a_polytropic_oleo_lacks_heat_exchange_and_solubility(data_folder):
+    folder = present(data_folder / "campaigns" / "shaker-plain")
+    summary = summary_of(folder, "f16n1d2")
+    found = set()
+    for entry in summary["rounds"]:
+        accepted = next((c for c in entry["candidates"] if c["effect"] == entry["accepted"]), None)
+        if accepted is not None:
+            found |= {accepted["effect"], *accepted["indistinguishable_from"]}
+    assert {"heat_exchange", "gas_solubility"} <= found
+    assert max(on_hold_out(summary, "ratio_to_noise", 0).values()) > 3
+    assert max(on_hold_out(summary, "ratio_to_noise").values()) <= 1.3
+
+
+@pytest.mark.slow
+def test_the_silverbox_lacks_a_cubic_spring_first(data_folder):
+    present(data_folder / "measured" / "silverbox")
+    folder = STUDIES / "silverbox"
+    summary = summary_of(folder, f"{folder / 'model.py'}:model")
+    assert summary["effects"][0] == "cubic_stiffness"
+    before, after = (on_hold_out(summary, "repeating", k) for k in (0, -1))
+    assert all(value > 5e-3 for value in before.values())
+    assert all(value <= 0.39e-3 for value in after.values())
+
+
+@pytest.mark.slow
+def test_the_mr_damper_lacks_friction_with_memory_then_stiffness(data_folder):
+    present(data_folder / "measured" / "mr_damper")
+    folder = STUDIES / "mr_damper"
+    summary = summary_of(folder, f"{folder / 'model.py'}:model")
+    memory = {"dahl_friction", "bouc_wen_friction", "lugre_friction"}
+    assert summary["effects"][0] in memory
+    assert any("stiffness" in name for name in summary["effects"][1:])
+    assert summary["re_estimated"] == 1
+    before, after = (on_hold_out(summary, "rms", k) for k in (0, -1))
+    assert all(value > 25.0 for value in before.values())
+    assert all(value <= 9.0 for value in after.values())
