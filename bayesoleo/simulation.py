@@ -18,7 +18,7 @@ from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.model import Model
 from bayesoleo.model.document import from_document
 from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.simulate import RunPlan, Simulation, simulate_run
+from bayesoleo.prediction.simulate import STEPS, RunPlan, Simulation, simulate_run
 
 Array = NDArray[np.float64]
 
@@ -52,9 +52,9 @@ def parameter_sets(tree: xr.DataTree, draws: int | None, seed: int) -> list[dict
         Chooses the draws.
     """
     if draws is None:
-        point = tree[schema.POINT]
-        names, values = point[schema.PARAMETER].values, point[schema.ESTIMATE].values
-        return [dict(zip(map(str, names), map(float, values), strict=True))]
+        point = tree[schema.POINT].to_dataset()
+        labels = [str(name) for name in point[schema.PARAMETER].values]
+        return [dict(zip(labels, map(float, point[schema.ESTIMATE].values), strict=True))]
     if schema.POSTERIOR not in tree.children:
         raise ResultsError("the result holds no posterior to draw from", hint="leave --draws out")
     posterior = tree[schema.POSTERIOR].to_dataset()
@@ -158,8 +158,7 @@ def _simulated(
         shared, _, run = name.partition("[")
         if not run or run == f"{record.label}]":
             own[shared] = value
-    more = {} if steps is None else {"steps": steps}
-    return simulate_run(model, plan, own, noise=given, rng=rng, scheme=scheme, **more)
+    return simulate_run(model, plan, own, noise=given, rng=rng, scheme=scheme, steps=steps or STEPS)
 
 
 def merged(

@@ -80,7 +80,7 @@ def _text(body: Any) -> Any:
 def _parameter(item: Parameter) -> dict[str, Any]:
     prior = None
     if item.prior is not None:
-        values = {key: repr(float(value)) for key, value in asdict(item.prior).items()}
+        values = {key: repr(float(value)) for key, value in vars(item.prior).items()}
         prior = {"kind": type(item.prior).__name__, **values}
     return {
         "value": item.value,

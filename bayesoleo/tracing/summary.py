@@ -110,9 +110,10 @@ def _input_noise_notes(state: State) -> list[str]:
         ]
         if entries:
             worst = max(entries, key=lambda e: e.input_noise / e.average.noise)
+            times = worst.input_noise / worst.average.noise
             notes.append(
                 f"input noise dominates the noise of {output} in {len(entries)} runs: in run"
-                f" {worst.run} it is {worst.input_noise / worst.average.noise:.1f} times the output's own"
+                f" {worst.run} it is {times:.1f} times the output's own"
             )
     return notes
 
