@@ -40,7 +40,6 @@ bayesoleo.print_summary(summary, Console(width=100))
 # tell apart.
 
 ranking = plots.ranking(tree, most=10)
-ranking
 
 # %%
 # The truth is known here. The effect that was put in is the one found, and most parameters lie
@@ -55,11 +54,10 @@ for name, found in summary["parameters"].items():
         print(f"{name:26}{row}{off:8.1f}")
 
 # %%
-# The error of every run, before and after. At 1 the part of the residual that repeats from period to
-# period is what noise alone would leave in the average: nothing is missing any more.
+# The error of every run, before and after. At 1 the part of the residual that repeats from period
+# to period is what noise alone would leave in the average: nothing is missing any more.
 
 error = plots.error(tree)
-error
 
 # %%
 # Where the model went wrong: the force that it could not explain, over one period. The grey band is
@@ -67,4 +65,3 @@ error
 # each reversal.
 
 residual = plots.residual(tree, "force")
-residual

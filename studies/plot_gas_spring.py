@@ -4,15 +4,15 @@ A gas spring with an error that nobody declared
 
 A narrow prior says that a parameter is well known. If the model itself is wrong, the classical
 Bayesian estimator believes the prior, explains the difference as noise, and stays near its start.
-The modified Bayesian estimator (MBE) uses the same prior only to scale its steps and arrives at what
-the data say. This page repeats the numerical experiment of Verbeek (1993), section 3.4.2.
+The modified Bayesian estimator (MBE) uses the same prior only to scale its steps and arrives at
+what the data say. This page repeats the numerical experiment of Verbeek (1993), section 3.4.2.
 """
 
 # %%
-# The measured force of an ideal gas spring is :math:`y = (1 - x)^{-\theta}` with :math:`\theta = 1.2`
-# and noise of :math:`2\sigma` = 1 % of full scale. The model that is fitted to it has a factor 0.95
-# in front, as if the initial pressure had been read 5 % too low. The prior is centred on 1.0, where
-# every estimate starts.
+# The measured force of an ideal gas spring is :math:`y = (1 - x)^{-\theta}` with :math:`\theta =
+# 1.2` and noise of :math:`2\sigma` = 1 % of full scale. The model that is fitted to it has a
+# factor 0.95 in front, as if the initial pressure had been read 5 % too low. The prior is centred
+# on 1.0, where every estimate starts.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -41,8 +41,8 @@ problems = {
 }
 
 # %%
-# Four estimators from the same start. BE is the Bayesian estimator; MVE, MMVE and MBE move or rescale
-# the prior in every iteration, so that it no longer decides where they end.
+# Four estimators from the same start. BE is the Bayesian estimator; MVE, MMVE and MBE move or
+# rescale the prior in every iteration, so that it no longer decides where they end.
 
 METHODS = ("be", "mve", "mmve", "mbe")
 points = {
@@ -58,10 +58,10 @@ for sd, found in points.items():
         )
 
 # %%
-# With the wide prior it does not matter. With the narrow one BE converges, without complaint, to an
-# exponent near the prior and to far too much noise. MVE locks up: its steps shrink as the reciprocal
-# of the iteration, so that a test of their size alone would take it for converged. Its status says
-# otherwise, because the distance to the fixed point is tested as well.
+# With the wide prior it does not matter. With the narrow one BE converges, without complaint, to
+# an exponent near the prior and to far too much noise. MVE locks up: its steps shrink as the
+# reciprocal of the iteration, so that a test of their size alone would take it for converged. Its
+# status says otherwise, because the distance to the fixed point is tested as well.
 #
 # BE has not failed as an optimiser. The posterior has two modes, and it found the one on its side:
 
@@ -74,10 +74,10 @@ for mode in modes:
     )
 
 # %%
-# The figure shows the log posterior :math:`\Phi_B(\theta, v)`, dark where it is high, and the way that
-# each estimator took. On the right BE ends at the upper mode; the others pass by it and go on to the
-# maximum of the likelihood, close to the lower one. From there a few steps of BE reach that mode:
-# what the package calls the estimate.
+# The figure shows the log posterior :math:`\Phi_B(\theta, v)`, dark where it is high, and the way
+# that each estimator took. On the right BE ends at the upper mode; the others pass by it and go on
+# to the maximum of the likelihood, close to the lower one. From there a few steps of BE reach that
+# mode: what the package calls the estimate.
 
 
 def height(problem, exponents, log_v):
