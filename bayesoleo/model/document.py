@@ -5,6 +5,7 @@ Nothing is pickled: a document holds declarations only, and is parsed like any o
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import asdict
 from typing import Any
 
@@ -80,7 +81,9 @@ def _text(body: Any) -> Any:
 def _parameter(item: Parameter) -> dict[str, Any]:
     prior = None
     if item.prior is not None:
-        values = {key: repr(float(value)) for key, value in vars(item.prior).items()}
+        fields = dataclasses.fields(item.prior)  # type: ignore[arg-type]
+        stated = [(field.name, getattr(item.prior, field.name)) for field in fields]
+        values = {key: repr(float(value)) for key, value in stated}
         prior = {"kind": type(item.prior).__name__, **values}
     return {
         "value": item.value,

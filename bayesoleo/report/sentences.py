@@ -21,7 +21,8 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 
 def headline(summary: Mapping[str, Any]) -> str:
     """The verdict as a sentence."""
-    found = " and ".join(summary["effects"])
+    names = summary["effects"]
+    found = " and ".join([part for part in (", ".join(names[:-1]), *names[-1:]) if part])
     lacked = "an effect" if len(summary["effects"]) == 1 else "effects"
     if summary["verdict"] == schema.NOTHING_MISSING:
         return "Nothing is missing: the model explains the measurements down to their noise."

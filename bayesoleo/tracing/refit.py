@@ -14,6 +14,7 @@ from bayesoleo.prediction.layout import Layout
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.score import Base, Score
+from bayesoleo.tracing.significance import SAME
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
+#: Two effects explain the data equally well if what they leave differs by less than this factor.
+AS_WELL = 1.25
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,27 @@ class Refit:
         On the fitted runs.
     share : float
         Part of the present excess that it explains after estimation.
+    contribution : ndarray, shape (n,)
+        What it changes in the prediction, thinned, in noise units.
+    remaining : float
+        Sum of squares that it leaves beyond the noise's, and what of that noise alone could feign.
     """
 
     score: Score
     assembly: Assembly
     fit: Fit
     share: float
+    contribution: Array
+    remaining: float
+
+    def resembles(self, other: Refit) -> bool:
+        """Whether the data cannot tell two estimated effects apart."""
+        lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
+        if not (np.isfinite(self.share) and np.isfinite(other.share)) or lengths == 0:
+            return False
+        cosine = float(self.contribution @ other.contribution) / float(lengths)
+        low, high = sorted((self.remaining, other.remaining))
+        return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
 
     @property
     def size(self) -> int:
@@ -95,11 +113,12 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         max_iterations=15,
         share=base.fit.predictor,
     )
-    share = share_of(base, fit)
-    # Where the extended model cannot be solved at its estimate it explains nothing.
-    return Refit(
-        score, assembly.with_values(fit.shared), fit, share if np.isfinite(share) else -np.inf
-    )
+    share, contribution = compare(base, fit)
+    if not np.isfinite(share):
+        share = -np.inf  # what cannot be solved at its estimate explains nothing
+    remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
+    grown = assembly.with_values(fit.shared)
+    return Refit(score, grown, fit, share, contribution, remaining)
 
 
 def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
@@ -144,11 +163,13 @@ def _start(base: Base, score: Score, model: Model) -> Array:
     return start
 
 
-def share_of(base: Base, fit: Fit) -> float:
-    """Part of the excess of the averaged residual that a refitted model takes away."""
+def compare(base: Base, fit: Fit) -> tuple[float, Array]:
+    """Part of the excess that a refitted model takes away, and how it changes the prediction."""
     before = after = 0.0
+    changes = []
     for r, run in enumerate(base.runs):
-        before += float(run.residual @ run.residual)
         residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
+        before += float(run.residual @ run.residual)
         after += float(residual @ residual)
-    return (before - after) / base.fall_back
+        changes.append((run.residual - residual)[run.chosen])
+    return (before - after) / base.fall_back, np.concatenate(changes)

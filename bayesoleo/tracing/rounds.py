@@ -144,12 +144,30 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
     groups = classes(scores)
     ranked = []
     for k, score in enumerate(scores):
-        same = tuple(dict.fromkeys(scores[j].option.candidate.effect for j in groups[k]))
+        same = _same(scores, k, groups[k], refits)
         fitted = refits.get(id(score))
         gain = score.share if fitted is None else max(fitted.share, 0.0)
         ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
     # What was estimated is known better than what was only scored, and comes first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
+
+
+def _same(
+    scores: Sequence[Score], k: int, group: Sequence[int], refits: dict[int, Refit]
+) -> tuple[str, ...]:
+    """Effects that look like number ``k``, by their estimates where both have one."""
+    own, found = refits.get(id(scores[k])), []
+    for j, other in enumerate(scores):
+        estimated = refits.get(id(other))
+        if j == k:
+            continue
+        if own is not None and estimated is not None:
+            alike = own.resembles(estimated)
+        else:
+            alike = j in group
+        if alike:
+            found.append(other.option.candidate.effect)
+    return tuple(dict.fromkeys(found))
 
 
 def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:

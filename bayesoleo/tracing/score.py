@@ -29,8 +29,9 @@ from bayesoleo.tracing.fit import Fit
 
 Array = NDArray[np.float64]
 
-#: Samples kept for comparing candidates with each other: every one of this many.
-THINNING = 7
+#: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
+#: would miss what repeats with it.
+MOST_SAMPLES = 1500
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
 #: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
@@ -61,6 +62,8 @@ class RunBase:
         Number of the period that each sample lies in.
     mixed, moved : ndarray, shapes (k, l) and (k,)
         ``B J`` and ``B e``, kept because every candidate needs them.
+    chosen : ndarray of int
+        Samples kept for comparing candidates with each other.
     """
 
     scale: Array
@@ -71,6 +74,7 @@ class RunBase:
     period: NDArray[np.int64]
     mixed: Array
     moved: Array
+    chosen: NDArray[np.int64]
 
     @classmethod
     def of(
@@ -87,7 +91,7 @@ class RunBase:
         kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
         inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
         e, J = residual * scale, sensitivity * scale
-        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e)
+        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, _choice(e.size))
 
     def products(self, new: Array) -> tuple[Array, Array, Array]:
         """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
@@ -128,7 +132,12 @@ class Base:
     @property
     def fall_back(self) -> float:
         """Denominator of shares: the excess, or what of it noise alone could feign."""
-        return max(self.excess, 0.0) + 2.0 * np.sqrt(2.0 * self.noise)
+        return max(self.excess, 0.0) + self.feigned
+
+    @property
+    def feigned(self) -> float:
+        """Excess that noise alone exceeds once in fifty times."""
+        return 2.0 * float(np.sqrt(2.0 * self.noise))
 
 
 def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float]]) -> Base:
@@ -244,6 +253,8 @@ class Score:
         Thinned, weighted ``C_perp I^-1 s``, for comparing candidates.
     z : float
         Signed root of the statistic for one new unknown, its root for several.
+    rank : int
+        Directions that the new unknowns can move the outputs in, beside the present ones.
     """
 
     option: Option
@@ -256,11 +267,11 @@ class Score:
     columns: Array
     contribution: Array
     z: float
+    rank: int = 1
 
     @property
     def statistic(self) -> float:
-        """Chi-square statistic with ``len(names)`` degrees of freedom, corrected for coloured
-        noise."""
+        """Chi-square statistic with ``rank`` degrees of freedom, corrected for coloured noise."""
         return self.fall / self.inflation
 
 
@@ -283,10 +294,15 @@ def score_all(
         for o, r in zip(options, results, strict=True)
         if isinstance(r, Status)
     }
+    failed |= {
+        f"{o.key[0]} at {o.key[1]}": "the model can already do what it would"
+        for o, r in zip(options, results, strict=True)
+        if r is None
+    }
     return sorted(scores, key=lambda item: -item.share), failed
 
 
-def _attempt(base: Base, option: Option) -> Score | Status:
+def _attempt(base: Base, option: Option) -> Score | Status | None:
     candidate = option.candidate
     shapes = [
         dict(zip(candidate.shapes, values, strict=True))
@@ -304,7 +320,7 @@ def _attempt(base: Base, option: Option) -> Score | Status:
         if best is None or score.fall > best.fall:
             best = score
     if best is None:
-        return Status.SINGULAR
+        return None
     return replace(best, columns=np.concatenate(thinned))
 
 
@@ -390,7 +406,8 @@ def _evaluate(
     expected = np.zeros(k)
     unit = np.sqrt(np.diag(information)[keep])
     inner = information[np.ix_(keep, keep)] / np.outer(unit, unit)
-    expected[keep] = np.linalg.lstsq(inner, score[keep] / unit, rcond=1e-10)[0] / unit
+    solution, _, rank, _ = np.linalg.lstsq(inner, score[keep] / unit, rcond=1e-10)
+    expected[keep] = solution / unit
     if not _allowed(option, block.names, expected):
         expected = np.zeros(k)
     fall = float(expected @ score)
@@ -408,6 +425,7 @@ def _evaluate(
         columns=(thin / np.where(norms > 0, norms, 1.0))[keep],
         contribution=expected @ thin,
         z=root * float(np.sign(expected[0])) if k == 1 else root,
+        rank=int(rank),
     )
 
 
@@ -420,11 +438,18 @@ def _allowed(option: Option, names: Sequence[str], expected: Array) -> bool:
     return True
 
 
+def _choice(size: int) -> NDArray[np.int64]:
+    """Some of so many samples, always the same."""
+    if size <= MOST_SAMPLES:
+        return np.arange(size)
+    return np.sort(np.random.default_rng(size).permutation(size)[:MOST_SAMPLES])
+
+
 def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
     """``C_perp`` in noise units at some samples, shape (k, n)."""
     rows = []
     for run, new in zip(base.runs, columns, strict=True):
-        rows.append(new[:, ::THINNING] - project.T @ run.sensitivity[:, ::THINNING])
+        rows.append(new[:, run.chosen] - project.T @ run.sensitivity[:, run.chosen])
     return np.concatenate(rows, axis=1)
 
 
@@ -436,7 +461,9 @@ def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: A
     measured = assumed = 0.0
     for run, new in zip(base.runs, columns, strict=True):
         direction = expected @ new - (project @ expected) @ run.sensitivity
-        sums = np.bincount(run.period, direction * run.residual)
+        # What the effect itself would explain is no noise, and must not count as such.
+        rest = run.residual - direction
+        sums = np.bincount(run.period, direction * rest)
         if sums.size < 2:
             continue
         measured += sums.size * float(np.var(sums, ddof=1))

@@ -38,8 +38,8 @@ def effective_tests(scores: Sequence[Score], seed: int) -> float:
 
 def corrected_p(score: Score, tests: float) -> float:
     """p-value of a score for the best of ``tests`` independent ones."""
-    local = float(stats.chi2.sf(score.statistic, len(score.names)))
-    one_sided = len(score.names) == 1 and any(score.option.candidate.sign.values())
+    local = float(stats.chi2.sf(score.statistic, score.rank))
+    one_sided = score.rank == 1 and any(score.option.candidate.sign.values())
     local = local / 2 if one_sided and score.fall > 0 else local
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
 
