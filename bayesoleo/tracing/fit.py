@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 #: standard deviations.
 LARGEST_SHIFT = 0.1
 #: Steps for each harmonic of the inputs, and limits.
-STEPS_PER_HARMONIC = 8
+STEPS_PER_HARMONIC = 4
 FEWEST_STEPS, MOST_STEPS = 128, 8192
 
 

@@ -193,7 +193,8 @@ def _sigma(noise: float, measured: Array) -> float:
 
 def _flat(columns: Array) -> Array:
     """Columns of shape (ny, k, N) as (k, ny N), outputs one after the other."""
-    return np.moveaxis(columns, 1, 0).reshape(columns.shape[1], -1)
+    outputs, count, samples = columns.shape
+    return np.moveaxis(columns, 1, 0).reshape(count, outputs * samples)
 
 
 def _present(fit: Fit, r: int) -> Array:
