@@ -41,6 +41,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",  # model files are no pages
+    "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ("matplotlib", "gallery_figures.scrape"),
     "ignore_repr_types": r"matplotlib\.",
     "download_all_examples": False,

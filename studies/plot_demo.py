@@ -65,3 +65,4 @@ error = plots.error(tree)
 # each reversal.
 
 residual = plots.residual(tree, "force")
+# sphinx_gallery_thumbnail_number = -1

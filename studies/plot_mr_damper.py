@@ -94,3 +94,4 @@ def loops():
 
 
 figure = study.figure("loops", loops)
+# sphinx_gallery_thumbnail_number = -1

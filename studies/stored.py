@@ -44,13 +44,13 @@ class Study:
         self.live = present and (self.storing or not slow)
         if not present:
             print(
-                f"The data set {data} is not on this machine (BAYESOLEO_DATA names no folder "
-                "that holds it): shown are the stored results of the last run."
+                f"The data set {data} is not on this machine (BAYESOLEO_DATA).\n"
+                "Shown are the stored results of the last run."
             )
         elif not self.live:
             print(
-                "This takes minutes: shown are the stored results of the last run. "
-                "Set BAYESOLEO_STORE_FIGURES=1 to run it."
+                "This takes minutes: shown are the stored results of the last run.\n"
+                "To run it, set BAYESOLEO_STORE_FIGURES=1."
             )
 
     def run(self, work: Callable[[], Result]) -> Result | None:

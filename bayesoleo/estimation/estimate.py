@@ -125,8 +125,10 @@ def _checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Arr
             value=theta.tolist(),
             hint=f"the unknowns are {', '.join(problem.names)}",
         )
-    for name, value, low, high in zip(problem.names, theta, scale.low, scale.high, strict=True):
-        if not low <= value <= high:
+    inside = scale.inside(theta)
+    columns = (problem.names, theta, scale.low, scale.high, inside)
+    for name, value, low, high, fits in zip(*columns, strict=True):
+        if not fits:
             raise InputError(
                 "start lies outside the prior's support",
                 key=name,
@@ -151,8 +153,9 @@ def _summarise(
     if history:
         sums, counts = sums_of_squares(outcome.evaluation), output_counts(problem.counts)
         variance = staged_variance(sums, counts, unknowns, bias_corrected=bias_corrected)
-        rows = Linearised.of(outcome.evaluation, scale.sd).whitened(variance)[0]
-        units = np.outer(scale.sd, scale.sd)
+        unit = scale.unit(outcome.theta)
+        rows = Linearised.of(outcome.evaluation, unit).whitened(variance)[0]
+        units = np.outer(unit, unit)
         covariance = units * inverse_gram(np.vstack((rows, np.eye(unknowns))))
         likelihood = units * inverse_gram(rows)
     held = on_limit(scale.room(outcome.theta))
@@ -171,8 +174,10 @@ def _summarise(
         objective=history[-1].objective if history else np.nan,
         distance=outcome.distance,
         start=start,
-        history=np.array([line.theta for line in history]).reshape(-1, unknowns),
-        history_variance=np.array([line.variance for line in history]).reshape(-1, outputs),
+        history=np.array([line.theta for line in history]).reshape(len(history), unknowns),
+        history_variance=np.array([line.variance for line in history]).reshape(
+            len(history), outputs
+        ),
         history_objective=np.array([line.objective for line in history]),
         history_halvings=np.array([line.halvings for line in history], dtype=np.int64),
         on_limit=tuple(name for name, at in zip(problem.names, held, strict=True) if at),

@@ -216,7 +216,7 @@ class _Pace:
         if on_line and reach > 1 + _OVERSHOOT:
             wanted = 1 / reach
         elif steady >= _STEADY:
-            wanted = min(1 / reach, _LONGEST)
+            wanted = min(1 / reach, _LONGEST * max(self.part, 1.0))
         return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
 
     def after(self, taken: Array, part: float, idle: bool) -> _Pace:
@@ -316,7 +316,7 @@ class _Loop:
         merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
         trial = self.point
         for halvings in range(_MAX_HALVINGS + 1):
-            trial = self.look(self.point.theta + self.scale.sd * proposal)
+            trial = self.look(self.scale.moved(self.point.theta, proposal))
             if trial.status.ok and self.merit(trial, variance) >= merit:
                 return trial, halvings, proposal
             softer = self.step.refuse(self.state)
@@ -342,7 +342,7 @@ class _Loop:
 
     def equations(self, variance: Array) -> Equations:
         theta = self.point.theta
-        rows = Linearised.of(self.point.evaluation, self.scale.sd).whitened(variance)
+        rows = Linearised.of(self.point.evaluation, self.scale.unit(theta)).whitened(variance)
         fixed = self.step.fixed_prior
         slope = self.scale.slope(theta) if fixed else np.zeros(theta.size)
         return Equations(*rows, slope, self.scale.room(theta))
@@ -350,8 +350,9 @@ class _Loop:
     def is_small(self, proposal: Array, equations: Equations, tolerance: float) -> bool:
         if is_cut(proposal, equations.room):
             return False
-        size = np.abs(self.scale.sd * proposal)
-        unit = np.maximum(np.abs(self.point.theta), self.scale.sd * equations.sd())
+        unit = self.scale.unit(self.point.theta)
+        size = np.abs(unit * proposal)
+        unit = np.maximum(np.abs(self.point.theta), unit * equations.sd())
         return bool(np.all(size <= tolerance * unit))
 
     def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:

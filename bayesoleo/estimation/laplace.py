@@ -42,18 +42,19 @@ def mode_covariance(problem: Problem, theta: Array) -> Array:
     scale = PriorScale.of(problem.priors, problem.names)
     counts = output_counts(problem.counts)
     variance = staged_variance(sums_of_squares(evaluation), counts)
-    rows = Linearised.of(evaluation, scale.sd).whitened(variance)[0]
+    chain = scale.unit(theta)
+    rows = Linearised.of(evaluation, chain).whitened(variance)[0]
     covariance = inverse_gram(np.vstack((rows, np.eye(unknowns))))
     cross = np.column_stack(
         [
-            scale.sd * (sensitivity.T @ residual) / v
+            chain * (sensitivity.T @ residual) / v
             for sensitivity, residual, v in zip(
                 evaluation.sensitivity, evaluation.residual, variance, strict=True
             )
         ]
     )
     joint = _block_inverse(covariance, cross, counts / 2)
-    unit = np.concatenate((scale.sd, np.ones(outputs)))
+    unit = np.concatenate((chain, np.ones(outputs)))
     return joint * np.outer(unit, unit)
 
 

@@ -80,6 +80,8 @@ def inverse_gram(rows: Array) -> Array:
     """``(rows' rows)^-1``, shape (l, l); NaN where the columns are linearly dependent."""
     length = np.linalg.norm(rows, axis=0)
     unknowns = rows.shape[1]
+    if unknowns == 0:
+        return np.empty((0, 0))
     missing = np.full((unknowns, unknowns), np.nan)
     if rows.shape[0] < unknowns or not np.isfinite(length).all() or (length == 0).any():
         return missing

@@ -1,4 +1,15 @@
-"""The priors as an iteration needs them: a scale for each unknown, a slope and the room left."""
+"""The coordinates in which an iteration steps: a scale for each unknown, a slope and the room left.
+
+An unknown with a log-normal prior is stepped in its logarithm, all others as they are. Such an
+unknown is a positive scale or shape whose prior says that halving it is as likely as doubling it:
+in the logarithm that prior is normal, no step leaves the support, and a linear step that would cut
+the unknown to a tenth is one of moderate length.
+
+Only the steps are in these coordinates. The objectives stay functions of the unknown itself, with
+``Prior.log_density`` the density per unit of the unknown, so the maximum-likelihood point and the
+mode of ``Phi_B`` do not depend on them. (The mode of the density per unit of the logarithm, which
+is where a sampler's coordinates have theirs, is another point.)
+"""
 
 from __future__ import annotations
 
@@ -6,21 +17,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Array
-from bayesoleo.model.priors import Normal, Prior
+from bayesoleo.model.priors import LogNormal, Normal, Prior
 
 # A centred difference over this fraction of the prior's sd is exact for a quadratic log density and
 # good to about 1e-8 for the others.
 _SLOPE_STEP = 1e-4
+# Room for one step of a logarithm, of which at most the part 0.9 is taken: a factor of six. Where
+# an unknown sets a scale, as in atan(slope * velocity), the sensitivity to its logarithm changes by
+# about the factor of the unknown itself, so further away the linear equations know nothing.
+_FARTHEST = 2.0
 
 
 @dataclass(frozen=True)
 class PriorScale:
-    """Unknowns in units of their priors' standard deviations.
+    """Unknowns, or their logarithms, in units of their priors' standard deviations.
 
     Physical parameters range over twelve decades in SI units; in these units they are of order one.
+    These are the scaled unknowns.
 
     Parameters
     ----------
@@ -28,6 +45,10 @@ class PriorScale:
         The priors.
     mean, sd, low, high : ndarray, shape (l,)
         Their moments and the limits of their support.
+    logarithmic : ndarray of bool, shape (l,)
+        Which unknowns are stepped in their logarithm.
+    spread : ndarray, shape (l,)
+        Standard deviation of what is stepped: of the unknown or of its logarithm.
     """
 
     priors: tuple[Prior, ...]
@@ -35,6 +56,8 @@ class PriorScale:
     sd: Array
     low: Array
     high: Array
+    logarithmic: NDArray[np.bool_]
+    spread: Array
 
     @classmethod
     def of(cls, priors: Sequence[Prior], names: Sequence[str]) -> PriorScale:
@@ -56,15 +79,35 @@ class PriorScale:
                 )
         mean = np.array([prior.mean for prior in priors], dtype=float)
         low, high = np.array([prior.support for prior in priors], dtype=float).reshape(-1, 2).T
-        return cls(tuple(priors), mean, sd, low, high)
+        logarithmic = np.array([isinstance(prior, LogNormal) for prior in priors], dtype=bool)
+        spread = sd.copy()
+        for index, prior in enumerate(priors):
+            if isinstance(prior, LogNormal):
+                spread[index] = prior.log_spread
+        return cls(tuple(priors), mean, sd, low, high, logarithmic, spread)
 
-    def inside(self, theta: Array) -> bool:
-        """Whether every unknown, shape (l,), lies in its prior's support."""
-        return bool(np.all((theta >= self.low) & (theta <= self.high)))
+    def inside(self, theta: Array) -> NDArray[np.bool_]:
+        """Which unknowns lie in their prior's support; zero has no logarithm. Shape (l,)."""
+        return (theta >= self.low) & (theta <= self.high) & ~(self.logarithmic & (theta <= 0))
+
+    def unit(self, theta: Array) -> Array:
+        """Derivative of each unknown with respect to its scaled one, shape (l,)."""
+        return np.where(self.logarithmic, theta * self.spread, self.spread)
+
+    def moved(self, theta: Array, step: Array) -> Array:
+        """Unknowns, shape (l,), after a step of the scaled ones, shape (l,)."""
+        with np.errstate(over="ignore"):  # the loop refuses what is not finite
+            factor = np.exp(np.where(self.logarithmic, self.spread * step, 0.0))
+        return np.where(self.logarithmic, theta * factor, theta + self.spread * step)
 
     def room(self, theta: Array) -> tuple[Array, Array]:
-        """Scaled distances down and up to the limits of the support, each shape (l,)."""
-        return (theta - self.low) / self.sd, (self.high - theta) / self.sd
+        """Scaled distances down and up to how far one step may go, each shape (l,).
+
+        To the limits of the support; for a logarithm as far as linear equations are worth anything.
+        """
+        farthest = _FARTHEST / self.spread
+        down, up = (theta - self.low) / self.sd, (self.high - theta) / self.sd
+        return np.where(self.logarithmic, farthest, down), np.where(self.logarithmic, farthest, up)
 
     def slope(self, theta: Array) -> Array:
         """Derivative of the log prior with respect to the scaled unknowns, shape (l,)."""
@@ -74,6 +117,9 @@ class PriorScale:
         prior, sd = self.priors[index], self.sd[index]
         if isinstance(prior, Normal):
             return float(-(value - self.mean[index]) / sd)
+        if isinstance(prior, LogNormal):  # the density is per unit of the value, hence the second
+            spread = prior.log_spread
+            return float(-np.log(value / prior.median) / spread - spread)
         room = min(value - self.low[index], self.high[index] - value)
         step = min(_SLOPE_STEP * sd, room / 2)
         if step <= 0:  # on the limit itself a one-sided look is all there is, and it is not needed

@@ -58,7 +58,8 @@ def row(job: str, result: dict) -> str:
 
     def cells(table: dict) -> str:
         parts = [
-            f"{output}: rms {v['rms']:.3g}, repeating {v['repeating']:.3g}, ratio {v['ratio_to_noise']:.2f}"
+            f"{output}: rms {v['rms']:.3g}, repeating {v['repeating']:.3g},"
+            f" ratio {v['ratio_to_noise']:.2f}"
             for output, v in table.items()
         ]
         return "; ".join(parts)
