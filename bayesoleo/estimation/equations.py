@@ -15,6 +15,8 @@ from bayesoleo.estimation.problem import Array
 class Equations:
     """Whitened least squares in scaled unknowns (the prior's standard deviation is one).
 
+    Of an unknown with a log-normal prior it is the logarithm that is scaled.
+
     Parameters
     ----------
     jacobian : ndarray, shape (k, l)
@@ -24,7 +26,7 @@ class Equations:
     slope : ndarray, shape (l,)
         Derivative of the log prior where the prior is fixed at its centre, zero otherwise.
     room : tuple of ndarray, each shape (l,)
-        Distances to the limits of the support.
+        Distances to the limits of the support, or to how far a logarithm may go in one step.
     """
 
     jacobian: Array

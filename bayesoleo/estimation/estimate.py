@@ -40,7 +40,9 @@ def estimate(
     method : str or Step, optional
         ``"be"``, ``"mve"``, ``"mmve"``, ``"mbe"``, ``"gauss-newton"`` or
         ``"levenberg-marquardt"``. All but the first end in the maximum-likelihood point, for which
-        the priors only scale the steps; ``"be"`` ends in a mode of the posterior.
+        the priors only scale the steps; ``"be"`` ends in a mode of the posterior. Unknowns with a
+        log-normal prior are stepped in their logarithm, but the mode is that of the density per
+        unit of the unknown itself.
     start : array_like, shape (l,), optional
         By default the problem's own.
     tolerance : float, optional

@@ -52,6 +52,11 @@ _IDLE = 3
 # Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
 # asks for certified digits gets them, if slowly.
 _IDLE_STEPS = 1e3
+# A logarithm of which the data leave more than this part of the prior's sd may have no optimum: the
+# likelihood levels off on the way to zero or infinity, and an estimator that follows it never ends.
+# What then lies nearer to the level than _NEAR is on it.
+_FLAT = 0.9
+_LEVEL = 0.5 * _NEAR**2
 
 
 @dataclass(frozen=True)
@@ -216,7 +221,7 @@ class _Pace:
         if on_line and reach > 1 + _OVERSHOOT:
             wanted = 1 / reach
         elif steady >= _STEADY:
-            wanted = min(1 / reach, _LONGEST * max(self.part, 1.0))
+            wanted = min(1 / reach, _LONGEST)
         return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
 
     def after(self, taken: Array, part: float, idle: bool) -> _Pace:
@@ -242,7 +247,6 @@ class _Loop:
         self.history: list[Iteration] = []
         self.evaluations, self.distance = 0, np.nan
         self.point: _Point
-        self.no_rows = np.zeros((0, len(self.scale.sd)))
 
     def look(self, theta: Array) -> _Point:
         self.evaluations += 1
@@ -351,15 +355,16 @@ class _Loop:
         if is_cut(proposal, equations.room):
             return False
         unit = self.scale.unit(self.point.theta)
-        size = np.abs(unit * proposal)
-        unit = np.maximum(np.abs(self.point.theta), unit * equations.sd())
-        return bool(np.all(size <= tolerance * unit))
+        least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
+        return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
 
     def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:
         """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
         nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
-        if won > nothing:
-            return False
-        # A prior that only scales the steps must not hide how far the optimum is.
-        rows = np.eye(len(equations.slope)) if self.step.fixed_prior else self.no_rows
-        return equations.expected_gain(equations.solve(rows)) <= nothing
+        rows = np.eye(len(equations.slope))
+        if not self.step.fixed_prior:
+            # A prior that only scales the steps must not hide how far the optimum is, if any.
+            flat = self.scale.logarithmic & (equations.sd() > _FLAT)
+            rows = rows[flat]
+            nothing = _LEVEL if flat.any() else nothing
+        return won <= nothing and equations.expected_gain(equations.solve(rows)) <= nothing

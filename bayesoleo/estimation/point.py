@@ -29,6 +29,7 @@ class PointEstimate:
         Error variances staged at the estimate (Verbeek 1993, eq. 3.17 or 3.18).
     covariance : ndarray, shape (l, l)
         Linearised with the prior's variances, ``[A + diag(w)^-1]^-1``; NaN after a failed start.
+        Where the prior is log-normal, ``w`` is that of the logarithm times the squared estimate.
     covariance_likelihood : ndarray, shape (l, l)
         Linearised without the prior, ``A^-1``; NaN where ``A`` is singular.
     method : str
