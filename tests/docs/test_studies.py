@@ -1,0 +1,92 @@
+"""Pages of the gallery: stored figures are there, small, and shown where the data are not."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+STUDIES = Path(__file__).resolve().parents[2] / "studies"
+PAGES = sorted(STUDIES.glob("plot_*.py"))
+
+
+@pytest.fixture
+def stored(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The helper of the pages, without data."""
+    monkeypatch.syspath_prepend(str(STUDIES))
+    monkeypatch.delenv("BAYESOLEO_DATA", raising=False)
+    monkeypatch.delenv("BAYESOLEO_STORE_FIGURES", raising=False)
+    import stored
+
+    yield stored
+    sys.modules.pop("stored", None)
+
+
+def wanted(page: Path) -> set[str]:
+    """Files that a page shows when its data are away."""
+    text = page.read_text(encoding="utf-8")
+    studies = dict(re.findall(r'^(\w+) = Study\("(\w+)"', text, re.MULTILINE))
+    shown = re.findall(r'(\w+)\.(text|figure)\(\s*"(\w+)"', text)
+    ends = {"text": "txt", "figure": "png"}
+    return {f"{studies[s]}-{name}.{ends[kind]}" for s, kind, name in shown if s in studies}
+
+
+def test_what_pages_show_without_data_is_stored_and_nothing_else() -> None:
+    names = set().union(*(wanted(page) for page in PAGES))
+    assert names == {path.name for path in (STUDIES / "figures").iterdir()}
+
+
+@pytest.mark.parametrize("path", sorted((STUDIES / "figures").iterdir()), ids=lambda p: p.name)
+def test_stored_file_is_small(path: Path) -> None:
+    assert path.stat().st_size <= 100_000
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_is_short_and_has_a_title(page: Path) -> None:
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert re.fullmatch("=+", lines[2])
+    assert len(lines) <= 150
+
+
+def test_study_without_data_says_so_and_shows_its_last_run(
+    stored: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study = stored.Study("silverbox", data="measured/silverbox")
+    assert "not on this machine" in capsys.readouterr().out
+    assert study.run(lambda: 1 / 0) is None
+    study.text("rounds", lambda: 1 / 0)
+    assert "cubic_stiffness" in capsys.readouterr().out
+    width, height = study.figure("spectrum", lambda: 1 / 0).get_size_inches()
+    assert (width, height) == (10.0, 4.2)
+
+
+def test_study_stores_what_it_shows(
+    stored: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "set").mkdir()
+    monkeypatch.setenv("BAYESOLEO_DATA", str(tmp_path))
+    monkeypatch.setenv("BAYESOLEO_STORE_FIGURES", "1")
+    monkeypatch.setattr(stored, "FIGURES", tmp_path)
+    study = stored.Study("page", data="set", slow=True)
+    assert study.run(lambda: 7) == 7
+    study.text("table", lambda: print("one  \ntwo"))
+    assert (tmp_path / "page-table.txt").read_text(encoding="utf-8") == "one\ntwo\n"
+    study.figure("picture", lambda: stored.Figure(figsize=(3, 2)))
+    shown = stored._framed(tmp_path / "page-picture.png")
+    assert tuple(shown.get_size_inches()) == (3.0, 2.0)
+
+
+def test_slow_study_is_shown_from_the_store(
+    stored: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "set").mkdir()
+    monkeypatch.setenv("BAYESOLEO_DATA", str(tmp_path))
+    assert not stored.Study("page", data="set", slow=True).live
+    assert "takes minutes" in capsys.readouterr().out
