@@ -9,8 +9,8 @@ dissolves in the oil.
 """
 
 # %%
-# Nothing is missing
-# ------------------
+# **Nothing is missing.**
+#
 # Driven by the displacement, which the rig controls, ``f16n2d2`` should be found complete.
 
 import json
@@ -39,8 +39,8 @@ complete.text("summary", lambda: show(tree))
 errors = complete.figure("error", lambda: plots.error(tree))
 
 # %%
-# Two effects are missing
-# -----------------------
+# **Two effects are missing.**
+#
 # ``f16n1d2`` takes the gas as polytropic, with one exponent for all frequencies. That was the
 # thesis's first model; heat exchange and solubility were the step to its second. Here the loop
 # takes that step by itself. It runs for a minute or two, hence the stored results; on the command
@@ -58,8 +58,8 @@ polytropic.text("summary", lambda: show(found))
 pressure = polytropic.figure("residual", lambda: plots.residual(found, "pressure"))
 
 # %%
-# Driven by force
-# ---------------
+# **Driven by force.**
+#
 # The thesis drives the model by the measured force and predicts the displacement. The same can be
 # asked for here, with ``bayesoleo close CAMPAIGN --model f16n2d1 --drive model --quick``.
 
