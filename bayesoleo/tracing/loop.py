@@ -119,6 +119,11 @@ def close_loop(
             break
         state = _pruned(outcome.after, roles, numerics, notes, say)
     notes += _warnings(state.fit)
+    if state.worst_ratio >= FLOOR_RATIO:
+        notes.append(
+            "intervals count independent noise only: while an error remains that repeats, they are"
+            " too narrow"
+        )
     return ClosedLoop(tuple(rounds), first, state, roles, tuple(notes))
 
 

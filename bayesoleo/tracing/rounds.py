@@ -146,7 +146,8 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
     for k, score in enumerate(scores):
         same = _same(scores, k, groups[k], refits)
         fitted = refits.get(id(score))
-        gain = score.share if fitted is None else max(fitted.share, 0.0)
+        # The excess is known up to noise: what explains all of it must not seem to explain more.
+        gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
         ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
     # What was estimated is known better than what was only scored, and comes first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
@@ -218,6 +219,9 @@ def _choose(
         item = min(near, key=lambda one: refits[id(one.score)].size)
         tried.remove(item)
         result = refits[id(item.score)]
+        if not np.isfinite(result.share):
+            reasons.append(f"{item.effect} could not be estimated")
+            continue
         if result.share < LEAST_SHARE:
             reasons.append(
                 f"{item.effect} would explain only {100 * result.share:.0f} % of the excess"
