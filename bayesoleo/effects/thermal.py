@@ -149,7 +149,7 @@ def _warm_wall(model: Model, target: str, names: Names) -> Model:
     equation = {
         "storage": names["time_constant"] * derivative_symbol(dof, 1),
         "to_ambient": excess,
-        "from_gas": -names["wall_heat_capacity"] * symbol(target),
+        "from_gas": -names["resistance"] * symbol(target),
     }
     described = Dof("K", 0.0, "wall temperature above ambient")
     return model.with_dof(dof, described, equation).with_definition(target, loss)
@@ -165,7 +165,7 @@ def _warm_oil(model: Model, target: str, names: Names) -> Model:
         "oil": excess,
         "gas": -above,
     }
-    loss = model.definitions[target] + names["oil_heat_capacity"] * (above - excess)
+    loss = model.definitions[target] + names["conduction"] * (above - excess)
     described = Dof("K", 0.0, "oil temperature above ambient")
     return model.with_dof(dof, described, equation).with_definition(target, loss)
 
@@ -180,9 +180,7 @@ WALL = Effect(
     title="Cylinder wall that stores heat",
     formula=r"\dot Q = G v (T - T_w), \quad \tau \dot T_w + T_w - T_0 = r \dot Q,"
     r" \quad \tau = r C_w",
-    amplitudes=(
-        Amplitude("wall_heat_capacity", "K/W", "r", "thermal resistance, wall to ambient", 1),
-    ),
+    amplitudes=(Amplitude("resistance", "K/W", "r", "thermal resistance, wall to ambient", 1),),
     places=_with_heat_loss,
     change=_warm_wall,
     shapes=(_STORAGE_TIME,),
@@ -195,7 +193,7 @@ OIL = Effect(
     family="thermal",
     title="Oil that stores heat",
     formula=r"\dot Q + G_o (T - T_o), \quad \tau \dot T_o + T_o = T, \quad \tau = C_o / G_o",
-    amplitudes=(Amplitude("oil_heat_capacity", "W/K", "G_o", "heat conduction into the oil", 1),),
+    amplitudes=(Amplitude("conduction", "W/K", "G_o", "heat conduction into the oil", 1),),
     places=_with_heat_loss,
     change=_warm_oil,
     shapes=(_STORAGE_TIME,),

@@ -74,7 +74,8 @@ class ErrorTable:
     def worst_ratio(self, role: str | None = None) -> float:
         """Largest ratio over outputs of the ratio pooled over runs of a role."""
         roles = {entry.role for entry in self.entries} if role is None else {role}
-        return max(self.pooled(r, o)["ratio_to_noise"] for r in roles for o in self.outputs)
+        ratios = [self.pooled(r, o)["ratio_to_noise"] for r in roles for o in self.outputs]
+        return float(np.max(ratios))  # not the built-in: a run that could not be solved must show
 
     def pooled(self, role: str, output: str) -> dict[str, float]:
         """Root mean squares over the runs of a role: ``rms``, ``repeating``, ``ratio_to_noise``."""

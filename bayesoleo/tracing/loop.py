@@ -13,7 +13,7 @@ from bayesoleo.effects import Effect
 from bayesoleo.tracing.assembly import Assembly, Step
 from bayesoleo.tracing.fit import Fit, Numerics
 from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.rounds import FLOOR_RATIO, Round, examine
+from bayesoleo.tracing.rounds import Round, examine
 from bayesoleo.tracing.state import State, fit_state
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
@@ -33,7 +33,8 @@ class ClosedLoop:
     rounds : tuple of Round
         The last one accepts nothing.
     first, final : State
-        The model as declared, and with all effects that were added.
+        The model as declared - constants that had to be freed are estimated in both - and with
+        all effects that were added.
     roles : Roles
     notes : tuple of str
         What a reader should know.
@@ -54,12 +55,8 @@ class ClosedLoop:
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
         if not self.effects:
-            return (
-                schema.NOTHING_MISSING
-                if self.final.worst_ratio < FLOOR_RATIO
-                else schema.UNEXPLAINED
-            )
-        if self.final.worst_ratio < FLOOR_RATIO:
+            return schema.NOTHING_MISSING if self.final.at_floor else schema.UNEXPLAINED
+        if self.final.at_floor:
             return schema.EFFECT_ADDED
         explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
         return schema.EFFECT_ADDED if explained > MOSTLY else schema.UNEXPLAINED
@@ -119,7 +116,8 @@ def close_loop(
             break
         state = _pruned(outcome.after, roles, numerics, notes, say)
     notes += _warnings(state.fit)
-    if state.worst_ratio >= FLOOR_RATIO:
+    notes += [f"could not be predicted: run {text}" for text in state.unsolved]
+    if not state.at_floor:
         notes.append(
             "intervals count independent noise only: while an error remains that repeats, they are"
             " too narrow"
@@ -143,7 +141,7 @@ def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say
     A wrong constant is no missing effect, and must not be mistaken for one.
     """
     names = state.fit.model.uncertain()
-    if not names or state.worst_ratio < FLOOR_RATIO:
+    if not names or state.at_floor:
         return state
     base = state.base()
     known = base.gram.shape[0] - len(names)
@@ -196,7 +194,7 @@ def _warnings(fit: Fit) -> list[str]:
         )
     if fit.point.on_limit:
         found.append(f"at the limit of their prior's support: {', '.join(fit.point.on_limit)}")
-    if fit.shift > 0.1:
+    if not fit.shift <= 0.1:
         found.append(
             f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd"
         )

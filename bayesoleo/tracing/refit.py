@@ -77,7 +77,9 @@ class Refit:
         names = [name for name in self.fit.problem.names if name in self.score.names]
         index = [self.fit.problem.names.index(name) for name in names]
         value = self.fit.point.theta[index]
-        covariance = self.fit.point.covariance[np.ix_(index, index)]
+        # Coloured noise, measured by its scatter between periods, widens the white covariance.
+        white = self.fit.point.covariance[np.ix_(index, index)]
+        covariance = white * self.score.inflation
         if not np.isfinite(covariance).all():
             return False
         if len(index) == 1:

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesoleo.effects import Effect
 from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.fit import Numerics
 from bayesoleo.tracing.refit import Refit, refit
 from bayesoleo.tracing.roles import Roles
@@ -18,9 +19,8 @@ from bayesoleo.tracing.score import Base, Score, score_all
 from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
 from bayesoleo.tracing.state import State, fit_state
 
-#: The floor is reached if the pooled ratio of every output is below this and no candidate explains
-#: this part of the excess.
-FLOOR_RATIO, FLOOR_SHARE = 1.15, 0.10
+#: The search ends at the floor if no candidate explains this part of the excess.
+FLOOR_SHARE = 0.10
 #: Nominal probability of adding an effect to data that lack none.
 LEVEL = 0.01
 #: Least part of the present excess that is worth another effect.
@@ -174,7 +174,7 @@ def _same(
 def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
     worst = state.worst_ratio
     best = max((item.gain for item in ranking), default=0.0)
-    if worst < FLOOR_RATIO and best < FLOOR_SHARE:
+    if state.at_floor and best < FLOOR_SHARE:
         return (
             f"nothing is missing: the residual is {worst:.2f} times its noise at most"
             f" and no effect explains more than {100 * best:.0f} % of the excess"
@@ -234,11 +234,11 @@ def _choose(
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         fall, error = fall_on_hold_out(state, after)
         # Parameters estimated on the held-out run itself fit its noise: each lowers the sum by one
-        # on average.
-        flattery = sum(p.re_estimated for p in after.held_out) - sum(
-            p.re_estimated for p in state.held_out
-        )
-        if after.hold_errors.entries and not fall - flattery > error:
+        # on average, and by more where noise is coloured, which scatters the sum more too.
+        more = sum(p.re_estimated for p in after.held_out)
+        more -= sum(p.re_estimated for p in state.held_out)
+        error *= float(np.sqrt(item.score.inflation))
+        if after.hold_errors.entries and not fall - item.score.inflation * more > error:
             reasons.append(f"{item.effect} does not lower the error on hold-out runs")
             continue
         return item, after, _accepted_reason(state, after, item, fall, error)
@@ -248,17 +248,27 @@ def _choose(
 def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
     """Fall of the weighted sum of squares on held-out runs, and its standard error.
 
-    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise of
-    variance ``1/w`` in ``y`` gives it the variance
-    ``4 sum w (b - a)^2``.
+    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise with the
+    covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
+    ``4 d' w (1/w + B B') w d`` with ``d = b - a``. Runs that could not be solved in both states do
+    not count.
     """
     fall = variance = 0.0
     for old, new in zip(before.held_out, after.held_out, strict=True):
+        if not (old.status.ok and new.status.ok):
+            continue
+        predictor = old.predictor
+        p = predictor.constants(old.vector[None], 0)[0]
+        moved = 0.0
+        from_input = input_columns(predictor.runs[0], p)
         for b, output in enumerate(new.predictor.outputs):
             weight = before.hold_errors.at(output, old.record.label).average.sigma ** -2
             measured = old.record.samples[output]
             fall += weight * float(np.sum((measured - old.y[b]) ** 2 - (measured - new.y[b]) ** 2))
-            variance += 4 * weight * float(np.sum((new.y[b] - old.y[b]) ** 2))
+            change = new.y[b] - old.y[b]
+            variance += 4 * weight * float(change @ change)
+            moved = moved + weight * (from_input[b] @ change)
+        variance += 4 * float(np.sum(np.square(moved)))
     return fall, float(np.sqrt(variance))
 
 

@@ -17,6 +17,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from bayesoleo.model import Model
 from bayesoleo.parallel import thread_map
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.
 MOST_SAMPLES = 1500
+#: Probability with which white noise may be taken for coloured.
+COLOURED = 0.05
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
 #: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
@@ -256,6 +259,8 @@ class Score:
         Signed root of the statistic for one new unknown, its root for several.
     rank : int
         Directions that the new unknowns can move the outputs in, beside the present ones.
+    freedom : int
+        Degrees of freedom that the inflation was measured with; zero where it was not needed.
     """
 
     option: Option
@@ -269,6 +274,7 @@ class Score:
     contribution: Array
     z: float
     rank: int = 1
+    freedom: int = 0
 
     @property
     def statistic(self) -> float:
@@ -427,6 +433,7 @@ def _evaluate(
         contribution=expected @ thin,
         z=root * float(np.sign(expected[0])) if k == 1 else root,
         rank=int(rank),
+        freedom=_freedom(base),
     )
 
 
@@ -454,6 +461,11 @@ def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
     return np.concatenate(rows, axis=1)
 
 
+def _freedom(base: Base) -> int:
+    """Periods beyond the first, over all runs."""
+    return sum(int(run.period[-1]) for run in base.runs)
+
+
 def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: Array) -> float:
     """Variance of the score between periods relative to white noise's, along the expected
     direction."""
@@ -469,6 +481,8 @@ def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: A
             continue
         measured += sums.size * float(np.var(sums, ddof=1))
         assumed += float(direction @ direction)
-    # Slow noise makes the score vary more than its formula says; too few periods can only feign
-    # less, which is not believed.
-    return max(1.0, measured / assumed) if assumed > 0 else 1.0
+    # Slow noise makes the score vary more than its formula says. That is believed where white noise
+    # would seldom scatter so much between so few periods; less than white is never believed.
+    ratio, freedom = (measured / assumed if assumed > 0 else 1.0), _freedom(base)
+    coloured = freedom > 0 and ratio > stats.chi2.isf(COLOURED, freedom) / freedom
+    return ratio if coloured else 1.0

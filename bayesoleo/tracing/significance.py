@@ -38,7 +38,11 @@ def effective_tests(scores: Sequence[Score], seed: int) -> float:
 
 def corrected_p(score: Score, tests: float) -> float:
     """p-value of a score for the best of ``tests`` independent ones."""
-    local = float(stats.chi2.sf(score.statistic, score.rank))
+    if score.inflation > 1.0 and score.freedom > 0:
+        # The noise was measured between few periods, and is itself uncertain.
+        local = float(stats.f.sf(score.statistic / score.rank, score.rank, score.freedom))
+    else:
+        local = float(stats.chi2.sf(score.statistic, score.rank))
     one_sided = score.rank == 1 and any(score.option.candidate.sign.values())
     local = local / 2 if one_sided and score.fall > 0 else local
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))

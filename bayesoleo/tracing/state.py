@@ -10,6 +10,7 @@ import numpy as np
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.errors_table import ErrorTable, error_table
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.floor import is_at_floor
 from bayesoleo.tracing.holdout import Prediction, predict_fitted, predict_held_out
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.score import Base, base_of
@@ -54,7 +55,18 @@ class State:
     def worst_ratio(self) -> float:
         """Largest pooled ratio to the noise over roles and outputs."""
         tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
-        return max(table.worst_ratio() for table in tables)
+        return float(np.max([table.worst_ratio() for table in tables]))
+
+    @property
+    def at_floor(self) -> bool:
+        """Whether fitted and held-out runs are all down to their noise."""
+        return all(is_at_floor(table) for table in (self.fit_errors, self.hold_errors))
+
+    @property
+    def unsolved(self) -> tuple[str, ...]:
+        """Runs whose prediction failed, with the reason."""
+        found = [*self.fitted, *self.held_out]
+        return tuple(f"{p.record.label}: {p.status.message}" for p in found if not p.status.ok)
 
     def base(self) -> Base:
         """What candidates are scored against."""

@@ -45,7 +45,7 @@ def test_wall_keeps_the_energy(scales):
     """tau = r C makes the wall's equation r times C dT/dt = Q - (T_w - T_0)/r."""
     extended = find_effect("wall_heat_capacity").extend(system("f16n2d2"), "heat_loss", scales)
     equation = extended.model.equations["wall_excess"]
-    resistance, capacity = symbol("wall_heat_capacity"), symbol("C")
+    resistance, capacity = symbol("wall_heat_capacity_resistance"), symbol("C")
     total = sp.Add(*equation.values()) / resistance
     total = total.subs(symbol("wall_heat_capacity_time_constant"), resistance * capacity)
     wall = symbol("wall_excess")

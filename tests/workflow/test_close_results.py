@@ -247,15 +247,6 @@ def test_bad_input_leaves_an_older_result_alone(verb, tmp_path):
     assert contents(out) == before
 
 
-def test_a_folder_that_cannot_be_written_is_found_out_first(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        workflow.check_writable(blocked / "out")
-    workflow.check_writable(tmp_path / "new" / "deeper")
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.fixture(scope="module")
 def by_displacement(tmp_path_factory):
     """The rig controls the displacement."""
