@@ -166,6 +166,11 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     # solving anything.
     predictor = Predictor(driven, reduced.records, steps=8, backend="numpy", jobs=1)
     predictor.layout.priors(driven)
+    if not predictor.layout.names:
+        raise ModelError(
+            f"model {model.name!r} has no parameter to estimate",
+            hint="give at least one a prior (sd=…, relative_sd=…, bounds=…) without fixed=True",
+        )
     _check_units(driven, reduced.campaign)
     return Task(reduced, roles, assembly, settings)
 
@@ -231,7 +236,10 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         "unknowns": list(predictor.layout.names),
         "possible_drives": list(possible_drives(model)),
         "steps": settings.steps or first_steps(driven, task.roles.fitted),
-        "effects": len(catalogue() if settings.effects is None else settings.effects),
+        "effects": sum(
+            bool(effect.places(driven if effect.family == "sensor" else model))
+            for effect in (catalogue() if settings.effects is None else settings.effects)
+        ),
     }
 
 
@@ -366,9 +374,10 @@ def _sample(task: Task, fit: Fit, out: Path | None, say: Say, progress: bool) ->
     fit.problem.freeze(fit.point.theta)
     density = LogDensity(fit.problem, settings.jobs)
     start = laplace_mixture(density, np.stack([fit.point.theta]))
-    fingerprint = hashlib.sha256(
-        json.dumps([task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]).encode()
-    ).hexdigest()
+    # Another seed or quality is another run, with a folder of its own.
+    parts = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
+    parts += [settings.seed, settings.quick]
+    fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     return draw_samples(
         density,
         start,
@@ -385,7 +394,9 @@ def _result(
     task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | None, say: Say
 ) -> xr.DataTree:
     seed, fit = task.settings.seed, loop.final.fit
-    files = {} if out is None else {name: str(out / name) for name in (RESULTS, REPORT, SUMMARY)}
+    # Bare names: they stay true when the folder moves.
+    names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
+    files = {} if out is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
     groups = {schema.POINT: point_group(fit), **loop_groups(loop, samples, seed)}
     if samples is not None:

@@ -146,6 +146,8 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
     for k, score in enumerate(scores):
         same = _same(scores, k, groups[k], refits)
         fitted = refits.get(id(score))
+        if fitted is not None and not np.isfinite(fitted.share):
+            fitted = None  # an estimate that failed says no more than the score
         # The excess is known up to noise: what explains all of it must not seem to explain more.
         gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
         ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
@@ -167,7 +169,9 @@ def _same(
         else:
             alike = j in group
         if alike:
-            found.append(other.option.candidate.effect)
+            effect, target = other.option.key
+            same_id = effect == scores[k].option.candidate.effect
+            found.append(f"{effect} @ {target}" if same_id else effect)
     return tuple(dict.fromkeys(found))
 
 

@@ -71,7 +71,8 @@ def _candidate(ranked: Ranked) -> dict[str, Any]:
         "gain": ranked.gain,
         "p_value": ranked.p_value,
         "expected": expected | {name: float(value) for name, value in score.shapes.items()},
-        "indistinguishable_from": [name for name in ranked.same if name != candidate.effect],
+        "estimated": ranked.refitted,
+        "indistinguishable_from": list(ranked.same),
     }
 
 
