@@ -1,4 +1,4 @@
-"""``MODEL`` on the command line: the name of a built-in system, or ``file.py:object``."""
+"""Objects in a user's file, named on the command line as ``file.py:object``: models, effects."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
+from bayesoleo.effects import Effect, catalogue
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model
 from bayesoleo.systems import system
 
-DEFAULT_OBJECT = "model"
+DEFAULT_OBJECT, DEFAULT_EFFECTS = "model", "effects"
 _HINT = "write file.py:object"
 
 
@@ -57,6 +58,48 @@ def load_model(text: str) -> Model:
         problem = f"{name} is not a Model but {type(model).__name__}"
         raise ModelError(problem, file=path, hint=_models_in(found, path))
     return model
+
+
+def load_effects(text: str) -> tuple[Effect, ...]:
+    """The catalogue, and after it the effects that a text names.
+
+    Parameters
+    ----------
+    text : str
+        ``file.py:object`` with an ``Effect`` or several in a list; ``object`` is ``effects`` where
+        it is left out. Effects of the catalogue may be among them.
+
+    Returns
+    -------
+    tuple of Effect
+
+    Raises
+    ------
+    ModelError
+        No such file or object; the object holds something else, or an id that is taken.
+    """
+    file, _, name = (text, "", "") if text.endswith(".py") else text.rpartition(":")
+    if not file.endswith(".py"):
+        raise ModelError("names no file of effects", value=text, hint=_HINT)
+    path, name = Path(file).expanduser(), name or DEFAULT_EFFECTS
+    found = vars(_run(path))
+    if name not in found:
+        names = [key for key, item in found.items() if isinstance(item, Effect)]
+        hint = f"write {' or '.join(f'{path}:{key}' for key in names)}" if names else None
+        raise ModelError("no such object", file=path, value=name, hint=hint)
+    given = found[name]
+    effects = list(catalogue())
+    for effect in given if isinstance(given, list | tuple) else [given]:
+        if not isinstance(effect, Effect):
+            problem = f"{name} holds {type(effect).__name__}, not an Effect"
+            raise ModelError(problem, file=path, hint="write an Effect or a list of them")
+        if any(effect is known for known in effects):
+            continue
+        if effect.id in {known.id for known in effects}:
+            hint = "choose another id"
+            raise ModelError("there is an effect of this id", file=path, value=effect.id, hint=hint)
+        effects.append(effect)
+    return tuple(effects)
 
 
 def _built_in(text: str) -> Model:
@@ -127,7 +170,7 @@ def _told(error: BaseException, path: Path) -> ModelError:
         return ModelError(where + problem, file=path, key=key, value=value, hint=hint)
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     problem = f"{where}{type(error).__name__}: {text}".rstrip(": ")
-    return ModelError(problem, file=path, hint="correct the model file")
+    return ModelError(problem, file=path, hint="correct the file")
 
 
 def _line(error: BaseException, path: Path) -> int | None:

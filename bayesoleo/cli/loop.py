@@ -107,6 +107,7 @@ def close(
     jobs: options.Jobs = None,
     effective_size: options.EffectiveSize = 1000,
     max_effects: options.MaxEffects = 4,
+    effects: options.Effects = None,
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
@@ -130,6 +131,7 @@ def close(
       bayesoleo close shaker --model f16n2d2
       bayesoleo close shaker --model model.py:model --out results --quick
       bayesoleo close shaker --model f16n2d1 --drive force --seed 7
+      bayesoleo close shaker --model f16n2d2 --effects mine.py:drag
     """
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
@@ -144,6 +146,7 @@ def close(
         steps=steps,
         max_effects=max_effects,
         drive=drive,
+        effects=effects,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)

@@ -125,6 +125,17 @@ MaxEffects = Annotated[
     ),
 ]
 
+Effects = Annotated[
+    str | None,
+    typer.Option(
+        "--effects",
+        metavar="FILE.py:OBJECT",
+        show_default=False,
+        rich_help_panel=RUNNING,
+        help="Effects of your own, one or a list, besides the built-in ones. A file is code.",
+    ),
+]
+
 
 def settings(
     *,
@@ -136,14 +147,16 @@ def settings(
     steps: int | None = None,
     max_effects: int = 4,
     drive: str | None = None,
+    effects: str | None = None,
 ) -> Settings:
     """Settings of the workflow from options.
 
     Raises
     ------
     InputError
-        If there is no such scheme.
+        If there is no such scheme, or the file of effects cannot be used.
     """
+    from bayesoleo.modelfile import load_effects
     from bayesoleo.workflow import Settings
 
     if scheme not in SCHEMES:
@@ -160,5 +173,6 @@ def settings(
         steps=steps,
         max_effects=max_effects,
         drive=drive,
+        effects=None if effects is None else load_effects(effects),
         command=shlex.join(["bayesoleo", *sys.argv[1:]]),
     )

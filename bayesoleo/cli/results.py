@@ -13,6 +13,7 @@ from bayesoleo.errors import InputError
 
 PANEL = "From results and models"
 RESULT_SUFFIXES = (".nc", ".zarr")
+PAGE, PAGE_SUFFIXES = "report.html", (".html", ".htm")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -24,7 +25,7 @@ def report(
     results: Annotated[
         Path,
         typer.Argument(
-            metavar="RESULTS.nc", show_default=False, help="The results.nc that close wrote."
+            metavar="RESULTS.nc", show_default=False, help="The results.nc that close or trace wrote."
         ),
     ],
     out: Annotated[
@@ -32,14 +33,14 @@ def report(
         typer.Option(
             "--out",
             "-o",
-            metavar="FILE.html",
+            metavar="FILE.html|DIR",
             show_default="report.html beside the result",
             rich_help_panel=options.OUTPUT,
-            help="Page to write; an older one is replaced as a whole.",
+            help="Page to write, or folder for report.html; an older page is replaced as a whole.",
         ),
     ] = None,
 ) -> None:
-    """Write the report of a result again: one self-contained page.
+    """Write the report of a result of close or trace again: one self-contained page.
 
     \b
     Examples:
@@ -49,12 +50,14 @@ def report(
     from bayesoleo.report import write_report
     from bayesoleo.storage import read_tree
 
-    page = results.parent / "report.html" if out is None else out
+    page = results.parent / PAGE if out is None else out.expanduser()
+    if page.suffix.lower() not in PAGE_SUFFIXES or page.is_dir():
+        page /= PAGE
     tree = read_tree(results)
     if page.is_dir():
-        hint = f"give a file: --out {page / 'report.html'}"
-        raise InputError("is a folder", file=page, hint=hint)
+        raise InputError("is a folder", file=page, hint="give another file or folder with --out")
     shell.check_writable(page.parent)
+    page.parent.mkdir(parents=True, exist_ok=True)
     write_report(tree, page)
     shell.console().print(f"report    {page}", markup=False, soft_wrap=True)
 

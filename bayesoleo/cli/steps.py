@@ -272,6 +272,7 @@ def trace(
     out: options.Out = None,
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
+    effects: options.Effects = None,
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
@@ -296,7 +297,9 @@ def trace(
 
     if out is not None:
         shell.check_writable(out)
-    chosen = options.settings(seed=seed, jobs=jobs, scheme=scheme, steps=steps, drive=drive)
+    chosen = options.settings(
+        seed=seed, jobs=jobs, scheme=scheme, steps=steps, drive=drive, effects=effects
+    )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -170,11 +171,34 @@ def choose(wrong: str, allowed: Sequence[str] | Mapping[str, Any]) -> str:
 
 def _load(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise CampaignError("no such file", file=path, hint=f"a campaign is a folder with a {FILE}")
+        raise _no_campaign(path)
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CampaignError(f"not valid TOML: {error}", file=path.name) from error
+        raise CampaignError(
+            f"not valid TOML: {error}", file=path.name, hint=_slip(path, str(error))
+        ) from error
+
+
+def _slip(path: Path, problem: str) -> str | None:
+    """What to write in a line that holds text without quotes."""
+    place = re.search(r"at line (\d+)", problem)
+    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    line = lines[int(place[1]) - 1] if place and int(place[1]) <= len(lines) else ""
+    key, _, value = (part.strip() for part in line.partition("="))
+    if re.match(r"[^\s\"'\[{#]*[A-Za-z]", value) and value not in ("true", "false"):
+        return f'text needs quotes: {key} = "{value}"'
+    return None
+
+
+def _no_campaign(path: Path) -> CampaignError:
+    """What is there instead of the file, or how far its path leads."""
+    hint, folder = f"a campaign is a folder with a {FILE}", path.parent
+    if folder.is_file():
+        return CampaignError("is a file; a folder is expected", file=folder, hint=hint)
+    if not folder.exists():
+        return CampaignError("no such folder", file=folder, hint=hint)
+    return CampaignError("no such file", file=path, hint=hint)
 
 
 def _get(

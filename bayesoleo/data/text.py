@@ -65,7 +65,7 @@ def read_text(
     )
     table = _read_cells(path, skip, separator, len(names))
     columns = {
-        name: _numbers(path, name, table[index])
+        name: _numbers(path, name, table[index], skip)
         for index, name in enumerate(names)
         if wanted is None or name in wanted or table[index].dtype.kind in "biuf"
     }
@@ -199,7 +199,7 @@ def _read_cells(path: Path, skip: int, separator: str, width: int) -> pd.DataFra
         ) from error
 
 
-def _numbers(path: Path, name: str, column: pd.Series) -> Array:
+def _numbers(path: Path, name: str, column: pd.Series, skip: int) -> Array:
     import pandas as pd
 
     if column.dtype.kind in "biuf":
@@ -212,13 +212,25 @@ def _numbers(path: Path, name: str, column: pd.Series) -> Array:
             "write decimal points" if _DECIMAL_COMMA.match(cell.strip()) else "write numbers only"
         )
         raise CampaignError(
-            f"not a number in row {wrong[0] + 1}",
+            f"not a number in {_place(path, skip, int(wrong[0]), cell)}",
             file=path.name,
             column=name,
             value=cell,
             hint=hint,
         )
     return numbers
+
+
+def _place(path: Path, skip: int, row: int, cell: str) -> str:
+    """Where an editor shows a row of values: blank lines and comments count there."""
+    with path.open(encoding="utf-8-sig") as stream:
+        filled = (
+            (number, line)
+            for number, line in enumerate(stream, 1)
+            if number > skip and line.split("#")[0].strip()
+        )
+        number, line = next(islice(filled, row, None), (0, ""))
+    return f"line {number}" if cell.strip() in line else f"row {row + 1}"
 
 
 def _check_filled(path: Path, columns: dict[str, Array], separator: str) -> None:

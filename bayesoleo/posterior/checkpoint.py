@@ -100,7 +100,7 @@ class FolderStore:
                 raise ResultsError(
                     "this folder holds draws of another problem, seed or setting",
                     file=self.folder,
-                    hint="give another folder, or remove this one to sample anew",
+                    hint=f"remove {self.folder} to draw anew, or write to another folder",
                 )
             self.segments.append(segment)
         for path in sorted(self.folder.glob("segment-*.npz")):

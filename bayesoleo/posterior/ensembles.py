@@ -164,6 +164,9 @@ class Ensembles:
         sampler = emcee.EnsembleSampler(
             self.chains, len(self.log_density.names), self._rows, moves=moves, vectorize=True
         )
+        # emcee wraps the function in one that prints the traceback and all rows of whatever passes
+        # through, an interrupt too.
+        sampler.log_prob_fn = self._rows
         before = _Tally.of(self.log_density)
         state = State(
             last.coords[-1],

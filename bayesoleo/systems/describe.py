@@ -16,7 +16,8 @@ from bayesoleo.model.text import as_text
 def as_latex(expression: sp.Expr, model: Model) -> str:
     """LaTeX of an expression, with the parameters' own symbols and dots for time derivatives."""
     names = {item: _latex_symbol(item, model) for item in expression.free_symbols}
-    return str(LatexPrinter({"symbol_names": names, "ln_notation": True}).doprint(expression))
+    settings = {"symbol_names": names, "ln_notation": True, "mul_symbol": r" \, "}
+    return str(LatexPrinter(settings).doprint(expression))
 
 
 def _latex_symbol(item: sp.Symbol, model: Model) -> str:

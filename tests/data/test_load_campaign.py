@@ -118,6 +118,7 @@ BAD_TOML = [
     ({"format = 1": "format = 2"}, r"key format: unknown .* format \(got 2\); write format = 1"),
     ({"format = 1": ""}, "key format: unknown campaign format .*write format = 1"),
     ({"format = 1": "format = ="}, "campaign.toml: not valid TOML"),
+    ({'"mm"': "mm"}, 'not valid TOML: .*; text needs quotes: unit = "mm"'),
     ({'name = "small"': ""}, "key name: missing"),
     ({'name = "small"': "name = 3"}, r"key name: wrong kind of value \(got 3\)"),
     (

@@ -57,7 +57,7 @@ def test_text_in_a_column_that_is_not_wanted_does_not_matter(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("t,a,note\n0,1,good\n1,2,bad\n")
     assert set(read_columns(path, wanted={"t", "a"})) == {"t", "a"}
-    with pytest.raises(CampaignError, match=r"column note: not a number in row 1 \(got 'good'\)"):
+    with pytest.raises(CampaignError, match=r"column note: not a number in line 2 \(got 'good'\)"):
         read_columns(path)
 
 
@@ -69,9 +69,13 @@ def test_text_in_a_column_that_is_not_wanted_does_not_matter(tmp_path):
         ("1,2\n3,4\n", "file has no header .*name the columns in line 1"),
         (
             "t;a\n0,1;2,5\n1,0;3,5\n",
-            r"column t: not a number in row 1 \(got '0,1'\); write decimal points",
+            r"column t: not a number in line 2 \(got '0,1'\); write decimal points",
         ),
         ("t,a,b\n0,1\n1,2\n", "key delimiter: header has 3 columns and the values 2"),
+        (
+            "# rig\nt,a\n\n0,1\n# pause\n1,2\n2,x\n",
+            r"column a: not a number in line 7 \(got 'x'\); write numbers only",
+        ),
         ("t,a,a\n0,1,1\n1,2,1\n", "column a: two columns have this name"),
         (
             "t,a,b\n0,1,\n1,2,\n2,3,\n",

@@ -60,7 +60,7 @@ def test_close_writes_result_report_and_summary(closed):
     assert summary["effects"] == ["coulomb_friction"]
     assert summary["verdict"] == schema.EFFECT_ADDED
     assert summary["seed"] == 5
-    assert all(Path(path).exists() for path in summary["files"].values())
+    assert all((out / name).exists() for name in summary["files"].values())
     report = (out / "report.html").read_text(encoding="utf-8")
     assert "coulomb_friction" in report or "Coulomb" in report
     assert "<script src=" not in report
