@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import xarray as xr
@@ -29,8 +31,8 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     Returns
     -------
     Figure
-        The accepted effect is blue, those the data cannot tell from it are pale blue. A letter
-        marks a class of effects that the data cannot tell apart from each other.
+        The accepted effect is blue, those the data cannot tell from it are pale blue and
+        marked ``≈``.
     """
     entry = reading.summary(tree)["rounds"][number]
     candidates = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
@@ -41,9 +43,9 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     box = (LEFT / style.WIDTH, BOTTOM / height, width / style.WIDTH, 1 - (TOP + BOTTOM) / height)
     axes = figure.add_axes(box)
     style.dress(axes, ticks=6)
-    letters = classes(candidates)
+    accepted, alike = chosen(entry), similar(entry)
     for row, candidate in enumerate(shown):
-        _bar(axes, row, candidate, entry["accepted"], letters.get(candidate["effect"], ""))
+        _bar(axes, row, candidate, candidate is accepted, any(candidate is c for c in alike))
     axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
     axes.set_yticks(range(len(shown)), [style.plain(name(c), 44) for c in shown])
     axes.spines["left"].set_visible(False)
@@ -63,17 +65,30 @@ def name(candidate: dict[str, Any]) -> str:
     return f"{candidate['effect']} @ {target}" if target else str(candidate["effect"])
 
 
-def classes(candidates: list[dict[str, Any]]) -> dict[str, str]:
-    """A letter for every effect that others cannot be told from, the same within a class."""
-    letters: dict[str, str] = {}
-    for candidate in candidates:
-        same = [candidate["effect"], *candidate["indistinguishable_from"]]
-        if len(set(same)) < 2:
-            continue
-        known = next((letters[effect] for effect in same if effect in letters), None)
-        letter = known or "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[len(set(letters.values())) % 26]
-        letters.update({effect: letters.get(effect, letter) for effect in same})
-    return letters
+def chosen(entry: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The accepted candidate of a round; of several with its id the one ranked first."""
+    if entry["accepted"] is None:
+        return None
+    own = (c for c in entry["candidates"] if c["effect"] == entry["accepted"])
+    return next(own, None)
+
+
+def similar(entry: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The candidates that are said not to be distinguishable from the accepted one."""
+    accepted = chosen(entry)
+    if accepted is None:
+        return []
+    listed = set(accepted["indistinguishable_from"])
+    ids = Counter(candidate["effect"] for candidate in entry["candidates"])
+    found = []
+    for candidate in entry["candidates"]:
+        effect = candidate["effect"]
+        # An id alone does not say which of several targets is meant; the other's own list does.
+        back = {accepted["effect"], name(accepted)} & set(candidate["indistinguishable_from"])
+        by_id = effect in listed and (ids[effect] == 1 or bool(back))
+        if candidate is not accepted and (name(candidate) in listed or by_id):
+            found.append(candidate)
+    return found
 
 
 def format_p(value: float | None) -> str:
@@ -85,18 +100,14 @@ def format_p(value: float | None) -> str:
     )
 
 
-def _bar(
-    axes: Axes, row: int, candidate: dict[str, Any], accepted: str | None, letter: str
-) -> None:
-    """One candidate: bar, share, p-value and class."""
-    first = candidate["effect"] == accepted
-    similar = accepted is not None and accepted in candidate["indistinguishable_from"]
-    colour = style.AFTER if first else style.SIMILAR if similar else style.NEUTRAL
+def _bar(axes: Axes, row: int, candidate: dict[str, Any], first: bool, alike: bool) -> None:
+    """One candidate: bar, share, p-value, and whether it is or is like the accepted one."""
+    colour = style.AFTER if first else style.SIMILAR if alike else style.NEUTRAL
     axes.barh(row, max(100 * candidate["gain"], 0.0), 0.68, color=colour)
     texts = (
         f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
         format_p(candidate["p_value"]),
-        letter,
+        "≈" if alike else "",
     )
     weight = "bold" if first else "normal"
     for inches, text, side in zip(
@@ -122,7 +133,7 @@ def _explain(figure: Figure, entry: dict[str, Any], hidden: int) -> None:
     if entry["accepted"]:
         handles = [
             Patch(facecolor=style.AFTER, label="accepted"),
-            Patch(facecolor=style.SIMILAR, label="not distinguishable from it"),
+            Patch(facecolor=style.SIMILAR, label="≈ not distinguishable from it"),
             *handles,
         ]
     remark = f"{hidden} more with less" if hidden > 0 else ""

@@ -93,6 +93,8 @@ def format_number(value: float | None, sd: float | None = None) -> str:
         return "–"
     if sd is None or not math.isfinite(sd) or sd <= 0.0:
         text = f"{value:#.4g}" if 1e-3 <= abs(value) < 1e4 else f"{value:.4g}"
+        if 9999.5 <= abs(value) < 1e5:
+            text = f"{float(text):.0f}"
         return text.rstrip(".").replace("-", "−")
     decimals = 1 - math.floor(math.log10(sd))
     rounded = round(value, decimals) + 0.0

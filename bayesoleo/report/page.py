@@ -69,11 +69,13 @@ def _content(tree: xr.DataTree) -> dict[str, Any]:
         "rounds": list(_rounds(tree, summary)),
         "parameters": tables.parameters(summary),
         "diagnostics": tables.diagnostics(tree),
+        "diagnostics_by_parameter": tables.diagnostics_by_parameter(tree),
         "point": tables.point_status(tree),
         "formulas": _formulas(tree),
         "equations": str(tree.attrs.get(schema.EQUATIONS, "")).strip(),
         "provenance": tables.provenance(tree),
         "figures": _figures(tree),
+        "residual_title": sections.residual_title(tree),
         "number": itertools.count(1),
     }
 
@@ -92,7 +94,7 @@ def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, An
     for number, entry in enumerate(summary["rounds"]):
         yield {
             "accepted": entry["accepted"],
-            "reason": entry["reason"],
+            "reason": sentences.reason(entry),
             "table": tables.candidates(entry) if entry["candidates"] else None,
             "figures": sections.ranking_figure(tree, number),
         }

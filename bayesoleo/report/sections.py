@@ -54,6 +54,14 @@ def residual_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn(list(_residuals(tree)))
 
 
+def residual_title(tree: xr.DataTree) -> str:
+    """Title of the section: what the residuals are shown against."""
+    if schema.RESIDUAL not in tree.children:
+        return "Residual"
+    *most, last = ["phase", *(against for against in LOOPS if against in tree[schema.RESIDUAL])]
+    return f"Residual against {', '.join(most)} and {last}" if most else f"Residual against {last}"
+
+
 def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
     loops = (
         "A cycle is a loop; where it closes to a line the residual is a function of the {}, and "
@@ -76,10 +84,11 @@ def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
     """The candidates of one round."""
     caption = (
         f"Candidates of round {number + 1}: the share of the excess over the noise that each would "
-        "explain, and the probability of such a share if it were not there. Effects with the same "
-        "letter cannot be told apart by these data."
+        "explain, and the probability of such a share if it were not there."
     )
     entry = reading.summary(tree)["rounds"][number]
+    if entry["accepted"]:
+        caption += " These data cannot tell the effects marked ≈ from the accepted one."
     return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
 
 

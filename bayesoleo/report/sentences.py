@@ -59,6 +59,17 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
     return shown
 
 
+def reason(entry: Mapping[str, Any]) -> str:
+    """Why a round ended as it did, as a sentence; an id at its start stays as it is written."""
+    text = entry["reason"].strip().rstrip(".")
+    if not text:
+        return ""
+    first = text.split()[0]
+    ids = {str(entry["accepted"])}
+    ids |= {str(c[key]) for c in entry["candidates"] for key in ("effect", "target")}
+    return f"{text if first in ids or '_' in first else text[0].upper() + text[1:]}."
+
+
 def remainder(summary: Mapping[str, Any]) -> list[str]:
     """What is still unexplained, sentence by sentence."""
     last = summary["rounds"][-1]

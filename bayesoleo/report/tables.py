@@ -12,7 +12,7 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.plots import reading
-from bayesoleo.plots.rankings import classes, format_p, name
+from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale, engineering, format_number, format_value
 
 KNOWN_CONSTANTS = (
@@ -28,17 +28,29 @@ DIAGNOSTICS = {
     "effective_sample_size": "effective sample size",
     "rhat_nested": "nested R̂ over ensembles",
     "evaluations": "evaluations of the posterior",
+    "reached": "effective size asked for reached",
 }
+BY_PARAMETER = {
+    "autocorrelation_time": ("autocorrelation time, draws", "{:.1f}"),
+    "effective_sample_size": ("effective sample size", "{:.0f}"),
+    "rhat_nested": ("nested R̂", "{:.3f}"),
+}
+LEADING_CANDIDATES = 10
+LEADING_PARAMETERS = 20
 
 
 @dataclass(frozen=True)
 class Table:
-    """Head and rows of text; ``words`` leading columns hold words, the others numbers."""
+    """Head and rows of text; ``words`` leading columns hold words, the others numbers.
+
+    Of many rows the first ``lead`` are shown, the rest when asked for; all of them if it is None.
+    """
 
     head: list[str]
     rows: list[list[str]]
     words: int = 1
     marked: frozenset[int] = frozenset()
+    lead: int | None = None
 
 
 def output_units(tree: xr.DataTree, summary: Mapping[str, Any]) -> dict[str, str]:
@@ -72,7 +84,9 @@ def format_short(value: float | None) -> str:
     """Three digits: an error is not known better."""
     if value is None or not np.isfinite(value):
         return "–"
-    if value == 0.0 or not 1e-3 <= abs(value) < 1e4:
+    if 999.5 <= abs(value) < 1e5:
+        return f"{float(f'{value:.3g}'):.0f}"
+    if value == 0.0 or not 1e-3 <= abs(value) < 1e5:
         return f"{value:.3g}"
     return f"{value:#.3g}".rstrip(".")
 
@@ -126,23 +140,39 @@ def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[s
 def candidates(entry: Mapping[str, Any]) -> Table:
     """All candidates of a round, the best first."""
     ranked = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
-    letters = classes(ranked)
     rows = [
         [
             name(candidate),
             candidate["family"],
             f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
             format_p(candidate["p_value"]).removeprefix("p ").removeprefix("= "),
-            ", ".join(f"{k} = {format_number(v)}" for k, v in candidate["expected"].items()),
-            letters.get(candidate["effect"], ""),
+            expected_text(candidate["expected"]),
             ", ".join(candidate["indistinguishable_from"]),
         ]
         for candidate in ranked
     ]
-    head = ["effect", "family", "share", "p", "expected (SI)", "class", "not distinguishable from"]
-    accepted = entry["accepted"]
-    marked = frozenset(i for i, c in enumerate(ranked) if c["effect"] == accepted)
-    return Table(head, rows, 2, marked)
+    head = ["effect", "family", "share", "p", "expected (SI)", "not distinguishable from"]
+    accepted = chosen(entry)
+    marked = frozenset(i for i, c in enumerate(ranked) if c is accepted)
+    return Table(head, rows, 2, marked, LEADING_CANDIDATES)
+
+
+def expected_text(expected: Mapping[str, float | None]) -> str:
+    """Expected values with their names; those of a parameter of every run as a range."""
+    runs: dict[str, list[float]] = {}
+    for label, value in expected.items():
+        values = runs.setdefault(label.split("[", 1)[0], [])
+        if value is not None:
+            values.append(value)
+    texts = []
+    for label, values in runs.items():
+        text = format_number(values[0] if values else None)
+        if len(values) > 1:
+            text = f"{format_number(min(values))} … {format_number(max(values))}"
+            text += f" ({len(values)} runs)"
+        # Name and value stay on one line.
+        texts.append(f"{label} = {text}".replace(" ", "\N{NO-BREAK SPACE}"))
+    return ", ".join(texts)
 
 
 def parameters(summary: Mapping[str, Any]) -> Table:
@@ -193,21 +223,48 @@ def diagnostics(tree: xr.DataTree) -> Table | None:
         sizes = posterior.sizes
         rows.append(["walkers × draws", f"{sizes[schema.CHAIN]} × {sizes[schema.DRAW]}"])
     for key, value in attributes.items():
-        if key != "failures":
-            rows.append([DIAGNOSTICS.get(str(key), str(key).replace("_", " ")), _plain(value)])
+        by_parameter = key in BY_PARAMETER and isinstance(_decoded(value), dict)
+        if key == "failures" or by_parameter:
+            continue
+        text = _yes_or_no(value) if key == "reached" else _plain(value)
+        rows.append([DIAGNOSTICS.get(str(key), str(key).replace("_", " ")), text])
     failures = _decoded(attributes.get("failures"))
     if failures is not None:
         counted = [f"{count} {reason}" for reason, count in failures.items() if count]
         rows.append(["failed evaluations", ", ".join(counted) or "none"])
-    return Table(["sampler", ""], rows)
+    return Table(["sampler", ""], [row for row in rows if row[1]])
+
+
+def diagnostics_by_parameter(tree: xr.DataTree) -> Table | None:
+    """How the sampler did in each parameter; None where that is not stored."""
+    if schema.SAMPLE_STATS not in tree.children:
+        return None
+    attributes = tree[schema.SAMPLE_STATS].attrs
+    stored = {key: _decoded(attributes.get(key)) for key in BY_PARAMETER}
+    columns = {key: values for key, values in stored.items() if isinstance(values, dict)}
+    names = list(dict.fromkeys(label for values in columns.values() for label in values))
+    if not names:
+        return None
+    rows = [
+        [
+            label,
+            *(_fixed(values.get(label), BY_PARAMETER[key][1]) for key, values in columns.items()),
+        ]
+        for label in names
+    ]
+    head = ["parameter", *(BY_PARAMETER[key][0] for key in columns)]
+    return Table(head, rows, lead=LEADING_PARAMETERS)
 
 
 def point_status(tree: xr.DataTree) -> Table | None:
     """How the estimate ended; None without one."""
     if schema.POINT not in tree.children or not tree[schema.POINT].attrs:
         return None
-    rows = [[str(k).replace("_", " "), _plain(v)] for k, v in tree[schema.POINT].attrs.items()]
-    return Table(["point estimate", ""], rows)
+    attributes = dict(tree[schema.POINT].attrs)
+    if attributes.get("status_message") == attributes.get("status"):
+        attributes.pop("status_message", None)
+    rows = [[str(key).replace("_", " "), _plain(value)] for key, value in attributes.items()]
+    return Table(["point estimate", ""], [row for row in rows if row[1]])
 
 
 def provenance(tree: xr.DataTree) -> Table:
@@ -263,13 +320,25 @@ def _scaled(value: float | None, scale: Scale, sd: float | None) -> str:
 
 
 def _plain(value: Any) -> str:
-    """An attribute as text; a JSON list without its brackets."""
+    """An attribute as text; a JSON list or object without its brackets."""
     decoded = _decoded(value)
+    if isinstance(decoded, dict):
+        return ", ".join(f"{key} {_plain(item)}" for key, item in decoded.items()) or "none"
     if isinstance(decoded, list):
         return ", ".join(map(str, decoded)) or "none"
     if isinstance(value, float | np.floating):
         return format_value(float(value))
     return str(value)
+
+
+def _fixed(value: Any, form: str) -> str:
+    """A number in a fixed form, a dash where there is none."""
+    known = isinstance(value, int | float) and np.isfinite(value)
+    return form.format(value) if known else "–"
+
+
+def _yes_or_no(value: Any) -> str:
+    return "yes" if value else "no"
 
 
 def _decoded(value: Any) -> Any:

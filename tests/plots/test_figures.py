@@ -13,7 +13,7 @@ from matplotlib.text import Text
 
 from bayesoleo import plots, schema
 from bayesoleo.plots import reading, style
-from bayesoleo.plots.rankings import classes
+from bayesoleo.plots.rankings import chosen, similar
 
 
 def texts(figure):
@@ -99,9 +99,32 @@ def test_error_without_any_noise_floor_is_the_rms(two_runs):
     assert "rms in µV" in texts(plots.error(tree))
 
 
-def test_effects_that_cannot_be_told_apart_share_a_letter(oleo):
-    first = json.loads(oleo.attrs["summary"])["rounds"][0]["candidates"]
-    assert classes(first) == {"Stribeck_friction": "A", "Dahl_friction": "A"}
+def candidate(effect, target, *same):
+    return {"effect": effect, "target": target, "indistinguishable_from": list(same)}
+
+
+def test_only_what_the_accepted_candidate_lists_is_marked(oleo):
+    first, last = json.loads(oleo.attrs["summary"])["rounds"]
+    assert [c["effect"] for c in similar(first)] == ["Dahl_friction"]
+    assert chosen(last) is None
+    assert similar(last) == []
+    assert texts(plots.ranking(oleo, 0)).count("≈") == 1
+
+
+def test_an_id_with_several_targets_marks_the_one_that_is_meant():
+    entry = {
+        "accepted": "lag",
+        "candidates": [
+            candidate("lag", "force", "lag @ stroke", "offset", "wall"),
+            candidate("lag", "stroke", "lag @ force"),
+            candidate("offset", "force", "lag"),
+            candidate("offset", "stroke", "wall"),
+            candidate("wall", None),
+            candidate("play", None, "wall", "lag"),
+        ],
+    }
+    found = [(c["effect"], c["target"]) for c in similar(entry)]
+    assert found == [("lag", "stroke"), ("offset", "force"), ("wall", None)]
 
 
 def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo):
