@@ -23,6 +23,22 @@ def within_error(samples, mean, sd):
     np.testing.assert_array_less(np.abs(flat.std(axis=0) / sd - 1), error)
 
 
+class Interrupted(Gaussian):
+    """A user's Ctrl-C while the ensembles move."""
+
+    def __call__(self, phi):
+        if self.evaluations > 500:
+            raise KeyboardInterrupt
+        return super().__call__(phi)
+
+
+def test_interrupt_passes_without_a_word(capfd):
+    mixture = Mixture(np.zeros((1, 2)), np.eye(2)[None], np.zeros(1))
+    with pytest.raises(KeyboardInterrupt):
+        sample(Interrupted(np.ones(2)), mixture, seed=1, progress=False)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("dimension", [1, 2, 9])
 def test_a_gaussian_from_a_start_that_is_off(dimension):
     sd = 10.0 ** np.linspace(-3, 3, dimension)
