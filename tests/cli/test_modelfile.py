@@ -7,8 +7,9 @@ import sys
 import pytest
 from conftest import MODEL
 
+from bayesoleo.effects import catalogue
 from bayesoleo.errors import ModelError
-from bayesoleo.modelfile import load_model
+from bayesoleo.modelfile import load_effects, load_model
 
 
 def test_built_in_and_file(model):
@@ -56,3 +57,37 @@ def test_folder_cannot_be_a_model(tmp_path):
     (tmp_path / "a.py").mkdir()
     with pytest.raises(ModelError, match=r"a.py: cannot be read: Is a directory"):
         load_model(str(tmp_path / "a.py"))
+
+
+EFFECTS = """
+from bayesoleo import catalogue, force_effect
+
+drag = force_effect("cubic_drag", "damping", "c3*velocity**3", {"c3": "force/(position/s)**3"})
+effects = [*catalogue(), drag]
+same = force_effect("viscous_damping", "damping", "c*velocity", {"c": "force/(position/s)"})
+"""
+
+
+def test_effects_of_a_file_come_after_the_catalogue(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(EFFECTS)
+    for text in (f"{path}", f"{path}:effects", f"{path}:drag"):
+        loaded = load_effects(text)
+        assert loaded[:-1] == catalogue()
+        assert loaded[-1].id == "cubic_drag"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("mine.py:drga", "mine.py: no such object .got 'drga'.; write .*mine.py:drag"),
+        ("mine.py:catalogue", "mine.py: catalogue holds .*, not an Effect; write"),
+        ("mine.py:same", "mine.py: there is an effect of this id .got 'viscous_damping'."),
+        ("none.py:drag", "none.py: there is no such file; write file.py:object"),
+        ("cubic_drag", "names no file of effects .got .*; write file.py:object"),
+    ],
+)
+def test_effects_that_cannot_be_used(tmp_path, name, message):
+    (tmp_path / "mine.py").write_text(EFFECTS)
+    with pytest.raises(ModelError, match=message):
+        load_effects(str(tmp_path / name))
