@@ -25,7 +25,7 @@ def report(
     results: Annotated[
         Path,
         typer.Argument(
-            metavar="RESULTS.nc", show_default=False, help="The results.nc that close or trace wrote."
+            metavar="RESULTS.nc", show_default=False, help="results.nc of close or trace."
         ),
     ],
     out: Annotated[

@@ -126,6 +126,8 @@ def test_report_from_a_result(run, made_up, tmp_path):
     assert str(page) in result.stdout
     assert "<html" in page.read_text(encoding="utf-8")
     assert run("report", path, "--out", tmp_path / "other.html").exit_code == 0
+    assert run("report", path, "--out", tmp_path / "pages" / "v1.2").exit_code == 0
+    assert (tmp_path / "pages" / "v1.2" / "report.html").is_file()
     assert (tmp_path / "other.html").exists()
 
 
