@@ -208,6 +208,11 @@ def test_two_runs_of_one_label(make_campaign):
 def test_no_campaign(tmp_path):
     with pytest.raises(CampaignError, match=r"campaign.toml: no such file; a campaign is a folder"):
         load_campaign(tmp_path)
+    with pytest.raises(CampaignError, match=r"nowhere: no such folder; a campaign is a folder"):
+        load_campaign(tmp_path / "nowhere")
+    (tmp_path / "rig.csv").write_text("t,a\n")
+    with pytest.raises(CampaignError, match=r"rig.csv: is a file; a folder is expected; a camp"):
+        load_campaign(tmp_path / "rig.csv")
 
 
 def test_unknown_run(make_campaign):
