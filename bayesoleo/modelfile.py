@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
+import inspect
+import re
 import sys
 import traceback
 from collections.abc import Iterator
@@ -10,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
+from bayesoleo import model as declarations
 from bayesoleo.effects import Effect, catalogue
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model
@@ -170,7 +174,18 @@ def _told(error: BaseException, path: Path) -> ModelError:
         return ModelError(where + problem, file=path, key=key, value=value, hint=hint)
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     problem = f"{where}{type(error).__name__}: {text}".rstrip(": ")
-    return ModelError(problem, file=path, hint="correct the file")
+    return ModelError(problem, file=path, hint=_keyword(text) or "correct the file")
+
+
+def _keyword(text: str) -> str | None:
+    """The closest keyword of a declaration, where an error says that it does not know one."""
+    found = re.match(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", text)
+    declaration = getattr(declarations, found[1], None) if found else None
+    if found is None or not isinstance(declaration, type):
+        return None
+    keywords = list(inspect.signature(declaration).parameters)
+    close = difflib.get_close_matches(found[2], keywords, 1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"one of: {', '.join(keywords)}"
 
 
 def _line(error: BaseException, path: Path) -> int | None:

@@ -59,7 +59,7 @@ def _top(
 
     FOLDER holds campaign.toml, which says what is in the files of the runs. Input that cannot be
     used gets one line that says where, what, and what to write instead; the exit status is then 2.
-    With BAYESOLEO_DEBUG=1 it is shown with its traceback.
+    With BAYESOLEO_DEBUG=1 the error is shown with its traceback instead.
     """
 
 

@@ -74,6 +74,10 @@ BAD_MODELS = {
         MODEL.replace("relative_sd=0.5", "bounds=(0.0, 10.0)"),
         "line 11: the bounds exclude the start (got 2000.0); choose a value between 0 and 10",
     ),
+    "unknown keyword": (
+        MODEL.replace("relative_sd=0.5", "rel_sd=0.5"),
+        "did you mean relative_sd?",
+    ),
     "error in the file": (MODEL + "\nx = 1 / 0\n", "line 19: ZeroDivisionError: division by zero"),
     "not Python": ("model = (\n", "line 1: SyntaxError: '(' was never closed"),
     "leaves": ("import sys\nsys.exit(0)\n", "line 2: SystemExit: 0"),
