@@ -47,7 +47,7 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     for row, candidate in enumerate(shown):
         _bar(axes, row, candidate, candidate is accepted, any(candidate is c for c in alike))
     axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
-    axes.set_yticks(range(len(shown)), [style.plain(name(c), 44) for c in shown])
+    axes.set_yticks(range(len(shown)), [style.plain(name(c), 42) for c in shown])
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
     largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)

@@ -62,7 +62,8 @@ def format_unit(unit: str) -> str:
     if unit.strip() in DIMENSIONLESS:
         return ""
     text = re.sub(r"(?:\*\*|\^)\s*(-?\d+)", lambda m: m[1].translate(SUPERSCRIPTS), unit.strip())
-    return re.sub(r"\s*\*\s*|(?<=\w)\s+(?=\w)", "·", text).replace(" / ", "/")
+    text = re.sub(r"\s*\*\s*|(?<=\w)\s+(?=\w)", "·", text).replace(" / ", "/")
+    return re.sub(r"^ln\(\((\w*)\)²\)$", r"ln \1²", text)
 
 
 def format_value(value: float | None, unit: str = "", sd: float | None = None) -> str:

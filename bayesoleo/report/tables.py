@@ -154,6 +154,8 @@ def candidates(entry: Mapping[str, Any]) -> Table:
     head = ["effect", "family", "share", "p", "expected (SI)", "not distinguishable from"]
     accepted = chosen(entry)
     marked = frozenset(i for i, c in enumerate(ranked) if c is accepted)
+    if not any(row[-1] for row in rows):
+        head, rows = head[:-1], [row[:-1] for row in rows]
     return Table(head, rows, 2, marked, LEADING_CANDIDATES)
 
 
@@ -170,9 +172,13 @@ def expected_text(expected: Mapping[str, float | None]) -> str:
         if len(values) > 1:
             text = f"{format_number(min(values))} … {format_number(max(values))}"
             text += f" ({len(values)} runs)"
-        # Name and value stay on one line.
-        texts.append(f"{label} = {text}".replace(" ", "\N{NO-BREAK SPACE}"))
+        texts.append(f"{_together(f'{label} =')} {_together(text)}")
     return ", ".join(texts)
+
+
+def _together(text: str) -> str:
+    """Text that stays on one line."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def parameters(summary: Mapping[str, Any]) -> Table:

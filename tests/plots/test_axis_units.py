@@ -52,6 +52,7 @@ def test_rounding_keeps_a_number_within_a_tenth_of_its_sd(value, sd):
 def test_unit_text():
     assert format_unit("N*s/m**2") == "N·s/m²"
     assert format_unit("kg m^-3") == "kg·m⁻³"
+    assert format_unit("ln((V)^2)") == "ln V²"
     assert format_unit("dimensionless") == ""
     assert engineering("V", 3e-5).label("voltage") == "voltage in µV"
     assert engineering("1", 0.5).label("phase") == "phase"

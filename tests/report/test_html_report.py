@@ -12,6 +12,13 @@ from bayesoleo import schema
 from bayesoleo.errors import ResultsError
 from bayesoleo.report import render_report, write_report
 from bayesoleo.report.images import encode_formula
+from bayesoleo.report.sentences import reason
+from bayesoleo.report.tables import (
+    diagnostics,
+    diagnostics_by_parameter,
+    expected_text,
+    format_short,
+)
 from bayesoleo.storage import read_tree, write_tree
 
 
@@ -113,6 +120,32 @@ def test_an_unexplained_remainder_is_said(two_runs, effects, text):
     summary.update(verdict=schema.UNEXPLAINED, effects=effects)
     tree.attrs["summary"] = json.dumps(summary)
     assert text in render_report(tree)
+
+
+def test_many_candidates_are_folded_and_a_range_stands_for_the_runs(page):
+    assert "<details><summary>" in page
+    text = expected_text({"gain": 1060.0, "offset[a]": 2.0, "offset[b]": -1.0})
+    assert (
+        text.replace("\N{NO-BREAK SPACE}", " ") == "gain = 1060, offset = −1.000 … 2.000 (2 runs)"
+    )
+    assert [format_short(value) for value in (1064.0, 41989.0, 999.7)] == ["1060", "42000", "1000"]
+
+
+def test_diagnostics_by_parameter_are_rounded_and_empty_rows_left_out(synthetic):
+    tree = synthetic.oleo_tree()
+    stats = tree[schema.SAMPLE_STATS]
+    stats.attrs["rhat_nested"] = '{"m": 1.0025610773362879}'
+    stats.attrs |= {"reached": 1, "warning": ""}
+    assert diagnostics_by_parameter(tree).rows == [["m", "1.003"]]
+    rows = dict(diagnostics(tree).rows)
+    assert "warning" not in rows
+    assert rows["effective size asked for reached"] == "yes"
+
+
+def test_an_id_at_the_start_of_a_sentence_stays_as_written():
+    entry = {"accepted": None, "candidates": [{"effect": "play", "target": None}]}
+    assert reason(entry | {"reason": "play explains 4 %"}) == "play explains 4 %."
+    assert reason(entry | {"reason": "no effect is significant"}) == "No effect is significant."
 
 
 def test_a_tree_without_summary():
