@@ -161,6 +161,22 @@ def test_an_effect_outside_the_catalogue_leaves_a_remainder(tmp_path):
             assert entry.accepted.gain < 0.5
 
 
+def test_what_the_hold_out_runs_contradict_is_not_added(tmp_path):
+    """Friction in the fitted runs; the others have the damping that a fit without it finds."""
+
+    def damped(x, v, t):
+        return spring_damper_force(x, v, t) + 100.0 * v
+
+    for name in ("rubbing", "damped"):
+        (tmp_path / name).mkdir()
+    rubbing = damper_campaign(tmp_path / "rubbing")
+    other = damper_campaign(tmp_path / "damped", damped)
+    records = [r if r.role == "fit" else other.record(r.label) for r in rubbing.records]
+    loop = close(replace(rubbing, records=tuple(records)), damper())
+    assert loop.effects == ()
+    assert "does not lower the error on hold-out" in loop.rounds[0].reason
+
+
 def test_no_effect_to_look_for_is_no_failure(tmp_path):
     loop = close(damper_campaign(tmp_path), damper(), effects=())
     assert loop.effects == ()
