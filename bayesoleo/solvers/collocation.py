@@ -1,10 +1,10 @@
-"""One-step collocation on an equidistant mesh, as linear maps between unknowns, stage values and
-samples.
+"""One-step collocation, as linear maps between unknowns, stage values and samples.
 
 The unknowns of a step are the state at its left node (value, and velocity of a second-order dof)
 and the highest derivative of each dof at each stage: ``x (L, n, w)`` with ``w = D + s d``.
 Everything else - stage values, samples between nodes, sensitivities - is linear in them, so the
-same maps serve solutions and their derivatives.
+same maps serve solutions and their derivatives. Steps are of one length unless a mesh says
+otherwise; ``step`` is the mean length throughout, period over number of steps.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.errors import InputError
+from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 from bayesoleo.solvers.tableau import Tableau
 
@@ -22,7 +24,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """Steps of the mesh, positions in them and interpolation weights, each (s, N), of N phases."""
+    """Steps of the mesh, positions in them and interpolation weights, each (s, N), of N phases.
+
+    Positions and weights contain the length of their step over the mean length.
+    """
 
     index: NDArray[np.int64]
     position: Array
@@ -41,10 +46,14 @@ class Collocation:
         Stages and weights.
     orders : tuple of int
         Order (1 or 2) of each dof.
+    mesh : Mesh, optional
+        Steps of different lengths; then the number of steps ``n`` is the mesh's. Otherwise any
+        number of equal steps.
     """
 
     method: Tableau
     orders: tuple[int, ...]
+    mesh: Mesh | None = None
 
     @property
     def state_size(self) -> int:
@@ -63,7 +72,25 @@ class Collocation:
 
     def phases(self, n: int) -> Array:
         """Phases in cycles of the ``N = n s`` points at which equations hold, shape (N,)."""
+        if self.mesh is not None:
+            return self._mesh_of(n).points(self.method.c)
         return ((np.arange(n)[:, None] + self.method.c) / n).ravel()
+
+    def nodes(self, n: int) -> Array:
+        """Phases in cycles at which the steps begin, shape (n,)."""
+        return np.arange(n) / n if self.mesh is None else self._mesh_of(n).edges[:-1]
+
+    def _mesh_of(self, n: int) -> Mesh:
+        assert self.mesh is not None
+        if self.mesh.steps != n:
+            raise InputError(
+                "wrong number of steps", value=n, hint=f"the mesh has {self.mesh.steps}"
+            )
+        return self.mesh
+
+    def _lengths(self, n: int, step: float) -> Array:
+        """Length of each step, s, shape (n,)."""
+        return np.full(n, step) if self.mesh is None else step * self._mesh_of(n).relative
 
     def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array:
         """Unknowns that represent a given motion.
@@ -91,14 +118,37 @@ class Collocation:
     def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
         method = self.method
-        _rows(x, lanes, step, method.a, method.a @ method.a, method.c, self._orders, z)
+        h = self._lengths(x.shape[1], step)
+        _rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
 
-    def plan(self, phase: Array, n: int) -> SamplePlan:
-        """Where in the mesh given phases (cycles) lie; worth keeping for fixed samples."""
-        scaled = (phase % 1.0) * n
-        index = np.minimum(scaled.astype(np.int64), n - 1)
-        position = scaled - index
+    def plan(self, phase: Array, n: int, *, initial: bool = False) -> SamplePlan:
+        """Where in the mesh given phases lie; worth keeping for fixed samples.
+
+        Parameters
+        ----------
+        phase : ndarray, shape (N,)
+            Cycles, of which only the fraction counts; of a transient (``initial``) parts of its
+            time, from 0 to 1.
+        n : int
+            Steps of the mesh.
+        initial : bool
+            Whether the phases are a transient's.
+
+        Returns
+        -------
+        SamplePlan
+        """
+        inside = phase if initial else phase % 1.0
+        if self.mesh is None:
+            scaled = inside * n
+            index = np.minimum(scaled.astype(np.int64), n - 1)
+            position = scaled - index
+        else:
+            index, position = self._mesh_of(n).locate(inside)
         w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
+        if self.mesh is not None:
+            relative = self.mesh.relative[index]
+            position, w1, w2 = relative * position, relative * w1, relative**2 * w2
         return SamplePlan(index, position, w0, w1, w2)
 
     def sample(self, x: Array, plan: SamplePlan, step: float) -> Array:
@@ -111,7 +161,7 @@ class Collocation:
         plan : SamplePlan
             Of N phases.
         step : float
-            Length of a step of the mesh, s.
+            Mean length of a step, s.
 
         Returns
         -------
@@ -148,7 +198,7 @@ class Collocation:
         lanes : ndarray of int
             Which of the L to solve.
         step : float
-            Length of a step, s.
+            Mean length of a step, s.
         initial : bool
             Hold the first state instead of closing the period.
 
@@ -164,8 +214,9 @@ class Collocation:
         ok = np.ones(count, dtype=np.bool_)
         present = np.zeros((1, 1, 1)) if x is None else x
         method = self.method
+        h = self._lengths(n, step)
         _linear(
-            gz, right, present, x is not None, lanes, step, method.a, method.a @ method.a, method.b,
+            gz, right, present, x is not None, lanes, h, method.a, method.a @ method.a, method.b,
             method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
         )  # fmt: skip
         return dx, monodromy, ok
@@ -215,7 +266,7 @@ def _sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
 
 @jit
 def _rows(x, lanes, h, a, aa, c, orders, z):
-    """``z (L, nz, n s)`` at the stages."""
+    """``z (L, nz, n s)`` at the stages, with steps of the lengths ``h (n,)``."""
     d, s, n = orders.size, c.size, x.shape[1]
     D = orders.sum()
     for lane in lanes:
@@ -230,12 +281,12 @@ def _rows(x, lanes, h, a, aa, c, orders, z):
                         twice += aa[i, stage] * value
                     low, point = x[lane, m, state], m * s + i
                     if orders[j] == 1:
-                        z[lane, row, point] = low + h * once
+                        z[lane, row, point] = low + h[m] * once
                         z[lane, row + 1, point] = x[lane, m, D + i * d + j]
                     else:
                         rate = x[lane, m, state + 1]
-                        z[lane, row, point] = low + h * (c[i] * rate + h * twice)
-                        z[lane, row + 1, point] = rate + h * once
+                        z[lane, row, point] = low + h[m] * (c[i] * rate + h[m] * twice)
+                        z[lane, row + 1, point] = rate + h[m] * once
                         z[lane, row + 2, point] = x[lane, m, D + i * d + j]
             row += orders[j] + 1
             state += orders[j]
@@ -270,7 +321,7 @@ def _linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx
         if good:
             _transfer(stages, h, b, ba, orders, transfer)
             if newton:
-                _add_jumps(x[lane], h, b, ba, orders, transfer)
+                _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:
@@ -290,22 +341,21 @@ def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
             row = state = 0
             for j in range(d):
                 for stage in range(s):
-                    once, twice, own = (
-                        h * a[i, stage],
-                        h * h * aa[i, stage],
-                        1.0 if stage == i else 0.0,
-                    )
+                    once, twice = a[i, stage], aa[i, stage]
+                    own = 1.0 if stage == i else 0.0
                     column = stage * d + j
                     if orders[j] == 1:
                         for t in range(count):
                             point = begin + t * s
                             work[line, column, t] = (
-                                once * gz[e, row, point] + own * gz[e, row + 1, point]
+                                h[first + t] * once * gz[e, row, point]
+                                + own * gz[e, row + 1, point]
                             )
                     else:
                         for t in range(count):
-                            point = begin + t * s
-                            total = twice * gz[e, row, point] + once * gz[e, row + 1, point]
+                            point, length = begin + t * s, h[first + t]
+                            total = length * length * twice * gz[e, row, point]
+                            total += length * once * gz[e, row + 1, point]
                             work[line, column, t] = total + own * gz[e, row + 2, point]
                 for t in range(count):
                     work[line, size + state, t] = -gz[e, row, begin + t * s]
@@ -313,7 +363,7 @@ def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
                     for t in range(count):
                         point = begin + t * s
                         work[line, size + state + 1, t] = -(
-                            h * c[i] * gz[e, row, point] + gz[e, row + 1, point]
+                            h[first + t] * c[i] * gz[e, row, point] + gz[e, row + 1, point]
                         )
                 row += orders[j] + 1
                 state += orders[j]
@@ -333,38 +383,42 @@ def _transfer(stages, h, b, ba, orders, transfer):
         transfer[last, last] = 1.0
         if orders[j] == 2:
             transfer[state, state] = 1.0
-            transfer[state, last] = h
+            for m in range(n):
+                transfer[state, last, m] = h[m]
         for stage in range(s):
             for column in range(transfer.shape[1]):
                 for m in range(n):
-                    transfer[last, column, m] += h * b[stage] * stages[stage * d + j, column, m]
+                    transfer[last, column, m] += h[m] * b[stage] * stages[stage * d + j, column, m]
                 if orders[j] == 2:
                     for m in range(n):
                         transfer[state, column, m] += (
-                            h * h * ba[stage] * stages[stage * d + j, column, m]
+                            h[m] * h[m] * ba[stage] * stages[stage * d + j, column, m]
                         )
         state += orders[j]
 
 
 @jit
-def _add_jumps(x, h, b, ba, orders, transfer):
-    """Add the jump from each step's end to the next node to the right-hand side (one column)."""
+def _add_jumps(x, h, b, ba, orders, initial, transfer):
+    """Add the jump from each step's end to the next node to the right-hand side (one column).
+
+    A transient's last step has no next node.
+    """
     d, s, n = orders.size, b.size, x.shape[0]
     D = orders.sum()
     state = 0
     for j in range(d):
         last = state + orders[j] - 1
-        for m in range(n):
+        for m in range(n - 1 if initial else n):
             following = m + 1 if m + 1 < n else 0
             once = twice = 0.0
             for stage in range(s):
                 value = x[m, D + stage * d + j]
                 once += b[stage] * value
                 twice += ba[stage] * value
-            transfer[last, D, m] += x[m, last] + h * once - x[following, last]
+            transfer[last, D, m] += x[m, last] + h[m] * once - x[following, last]
             if orders[j] == 2:
                 transfer[state, D, m] += (
-                    x[m, state] + h * (x[m, last] + h * twice) - x[following, state]
+                    x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
                 )
         state += orders[j]
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bayesoleo.errors import InputError
 from bayesoleo.solvers.backward import BackwardDifferences
 from bayesoleo.solvers.collocation import Collocation
+from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.periodic import Scheme
 from bayesoleo.solvers.tableau import tableau
 
@@ -12,7 +14,7 @@ from bayesoleo.solvers.tableau import tableau
 DEFAULT_SCHEME = "radau3"
 
 
-def scheme(name: str, orders: tuple[int, ...]) -> Scheme:
+def scheme(name: str, orders: tuple[int, ...], mesh: Mesh | None = None) -> Scheme:
     """A scheme for dofs of the given orders.
 
     Parameters
@@ -23,10 +25,16 @@ def scheme(name: str, orders: tuple[int, ...]) -> Scheme:
         algebraic equation (a drive through a compliance of zero).
     orders : tuple of int
         Order of each dof.
+    mesh : Mesh, optional
+        Steps of different lengths, for collocation only.
 
     Raises
     ------
     InputError
-        If there is no such scheme.
+        If there is no such scheme, or if it cannot have steps of different lengths.
     """
-    return BackwardDifferences(orders) if name == "thesis" else Collocation(tableau(name), orders)
+    if name != "thesis":
+        return Collocation(tableau(name), orders, mesh)
+    if mesh is not None:
+        raise InputError("differences need equal steps", value=name, hint="use radau3 or gauss3")
+    return BackwardDifferences(orders)

@@ -7,6 +7,7 @@ import numpy as np
 from bayesoleo.model import Condition, Model, Parameter
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.records import Harmonics
+from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.periodic import Boundary
 from bayesoleo.solvers.schemes import scheme
 
@@ -105,11 +106,12 @@ def problem(
     name: str = "radau3",
     n: int = 64,
     backend: str = "numpy",
+    mesh: Mesh | None = None,
 ) -> tuple[Boundary, np.ndarray]:
     """The discretised problem and its constants at their nominal values, shape (1, np)."""
     equations = kernels(model, backend=backend)
     derived = equations.derived
-    method = scheme(name, derived.orders)
+    method = scheme(name, derived.orders, mesh)
     rows = [force.evaluate(method.phases(n), frequency, order) for _, order in derived.inputs]
     nominal = {str(item): value for item, value in model.nominal().items()}
     p = np.array([[nominal[c] for c in derived.constants]])

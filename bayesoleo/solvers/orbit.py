@@ -1,0 +1,61 @@
+"""A periodic solution as every solver returns it, however it was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit:
+    """A closed motion of one parameter vector.
+
+    Parameters
+    ----------
+    phases : ndarray, shape (n,)
+        Where the states are, in cycles from 0 to below 1; the first is 0.
+    states : ndarray, shape (n, D)
+        Value, and velocity of a second-order dof, of each dof in turn; SI.
+    period : float
+        Seconds.
+    multipliers : ndarray of complex, shape (D,)
+        Floquet multipliers, largest first; NaN where they are not known.
+    status : Status
+        How the solver ended; unless it is ``CONVERGED`` the states are only where it stopped.
+    error : float
+        Estimated largest error of a state over that state's largest size; NaN where the solver
+        makes no estimate.
+    evaluations : int
+        How often the equations were evaluated, counted by points in time.
+    """
+
+    phases: Array
+    states: Array
+    period: float
+    multipliers: NDArray[np.complex128]
+    status: Status
+    error: float
+    evaluations: int
+
+    @property
+    def stable(self) -> bool:
+        """Whether every disturbance dies out: all multipliers inside the unit circle.
+
+        False where they are not known. An autonomous system's own multiplier of one makes it False:
+        compare the others.
+        """
+        return bool(np.all(np.abs(self.multipliers) < 1.0))
+
+
+def floquet_multipliers(monodromy: Array) -> NDArray[np.complex128]:
+    """Eigenvalues of a monodromy matrix ``(D, D)``, largest first; NaN if it is not finite."""
+    if not np.isfinite(monodromy).all():
+        return np.full(monodromy.shape[0], complex(np.nan))
+    values = np.linalg.eigvals(monodromy).astype(np.complex128)
+    return values[np.argsort(-np.abs(values), kind="stable")]
