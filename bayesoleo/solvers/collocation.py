@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
+from bayesoleo.solvers import collocation_kernels as kernels
 from bayesoleo.solvers.mesh import Mesh
-from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 from bayesoleo.solvers.tableau import Tableau
 
 Array = NDArray[np.float64]
@@ -119,7 +119,7 @@ class Collocation:
         """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
         method = self.method
         h = self._lengths(x.shape[1], step)
-        _rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
+        kernels.rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
 
     def plan(self, phase: Array, n: int, *, initial: bool = False) -> SamplePlan:
         """Where in the mesh given phases lie; worth keeping for fixed samples.
@@ -170,7 +170,7 @@ class Collocation:
         nz = self.state_size + len(self.orders)
         z = np.empty((x.shape[0], nz, x.shape[3], plan.index.size))
         everyone = np.arange(x.shape[0])
-        _sample(
+        kernels.sample(
             x, everyone, plan.index, plan.position, plan.w0, plan.w1, plan.w2, step, self._orders, z
         )
         return z
@@ -215,7 +215,7 @@ class Collocation:
         present = np.zeros((1, 1, 1)) if x is None else x
         method = self.method
         h = self._lengths(n, step)
-        _linear(
+        kernels.linear(
             gz, right, present, x is not None, lanes, h, method.a, method.a @ method.a, method.b,
             method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
         )  # fmt: skip
@@ -224,219 +224,3 @@ class Collocation:
     @property
     def _orders(self) -> NDArray[np.int64]:
         return np.array(self.orders, dtype=np.int64)
-
-
-@jit
-def _sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
-    """``z (L, nz, C, N)`` at positions inside steps from the unknowns ``x (L, n, w, C)``."""
-    d, s = orders.size, w0.shape[0]
-    D = orders.sum()
-    for lane in lanes:
-        for column in range(x.shape[3]):
-            now = x[lane, :, :, column]
-            row = state = 0
-            for j in range(d):
-                value, rate = z[lane, row, column], z[lane, row + 1, column]
-                last = state + orders[j] - 1
-                for i in range(index.size):
-                    value[i] = now[index[i], state]
-                    rate[i] = 0.0
-                if orders[j] == 2:
-                    top = z[lane, row + 2, column]
-                    for i in range(index.size):
-                        value[i] += h * position[i] * now[index[i], last]
-                        rate[i] = now[index[i], last]
-                        top[i] = 0.0
-                for stage in range(s):
-                    own = D + stage * d + j
-                    if orders[j] == 1:
-                        for i in range(index.size):
-                            highest = now[index[i], own]
-                            value[i] += h * w1[stage, i] * highest
-                            rate[i] += w0[stage, i] * highest
-                    else:
-                        for i in range(index.size):
-                            highest = now[index[i], own]
-                            value[i] += h * h * w2[stage, i] * highest
-                            rate[i] += h * w1[stage, i] * highest
-                            z[lane, row + 2, column, i] += w0[stage, i] * highest
-                row += orders[j] + 1
-                state += orders[j]
-
-
-@jit
-def _rows(x, lanes, h, a, aa, c, orders, z):
-    """``z (L, nz, n s)`` at the stages, with steps of the lengths ``h (n,)``."""
-    d, s, n = orders.size, c.size, x.shape[1]
-    D = orders.sum()
-    for lane in lanes:
-        row = state = 0
-        for j in range(d):
-            for i in range(s):
-                for m in range(n):
-                    once = twice = 0.0
-                    for stage in range(s):
-                        value = x[lane, m, D + stage * d + j]
-                        once += a[i, stage] * value
-                        twice += aa[i, stage] * value
-                    low, point = x[lane, m, state], m * s + i
-                    if orders[j] == 1:
-                        z[lane, row, point] = low + h[m] * once
-                        z[lane, row + 1, point] = x[lane, m, D + i * d + j]
-                    else:
-                        rate = x[lane, m, state + 1]
-                        z[lane, row, point] = low + h[m] * (c[i] * rate + h[m] * twice)
-                        z[lane, row + 1, point] = rate + h[m] * once
-                        z[lane, row + 2, point] = x[lane, m, D + i * d + j]
-            row += orders[j] + 1
-            state += orders[j]
-
-
-#: Steps of the mesh whose stages are eliminated together, innermost in memory.
-BLOCK = 32
-
-
-@jit
-def _linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok):
-    """Eliminate every step's stages, close the period, and recover the stages."""
-    d, s = orders.size, b.size
-    D, n, k = orders.sum(), dx.shape[1], right.shape[2]
-    size = s * d
-    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((size, BLOCK))
-    stages = np.empty((size, D + k, n))
-    transfer = np.empty((D, D + k, n))
-    states = np.empty((D, k, n))
-    for lane in lanes:
-        good = True
-        for first in range(0, n, BLOCK):
-            count = min(BLOCK, n - first)
-            _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
-            if not eliminate_together(work, scale, count, size):
-                _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
-                good = good and eliminate_each(work, count, size)
-            for line in range(size):
-                for column in range(D + k):
-                    for t in range(count):
-                        stages[line, column, first + t] = work[line, size + column, t]
-        if good:
-            _transfer(stages, h, b, ba, orders, transfer)
-            if newton:
-                _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
-            good = close_and_sweep(transfer, monodromy[lane], states, initial)
-        ok[lane] = good
-        if good:
-            _recover(stages, states, dx[lane])
-
-
-@jit
-def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
-    """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
-    d, s = orders.size, c.size
-    D, k = orders.sum(), right.shape[1]
-    size = s * d
-    for i in range(s):
-        begin = first * s + i
-        for e in range(d):
-            line = i * d + e
-            row = state = 0
-            for j in range(d):
-                for stage in range(s):
-                    once, twice = a[i, stage], aa[i, stage]
-                    own = 1.0 if stage == i else 0.0
-                    column = stage * d + j
-                    if orders[j] == 1:
-                        for t in range(count):
-                            point = begin + t * s
-                            work[line, column, t] = (
-                                h[first + t] * once * gz[e, row, point]
-                                + own * gz[e, row + 1, point]
-                            )
-                    else:
-                        for t in range(count):
-                            point, length = begin + t * s, h[first + t]
-                            total = length * length * twice * gz[e, row, point]
-                            total += length * once * gz[e, row + 1, point]
-                            work[line, column, t] = total + own * gz[e, row + 2, point]
-                for t in range(count):
-                    work[line, size + state, t] = -gz[e, row, begin + t * s]
-                if orders[j] == 2:
-                    for t in range(count):
-                        point = begin + t * s
-                        work[line, size + state + 1, t] = -(
-                            h[first + t] * c[i] * gz[e, row, point] + gz[e, row + 1, point]
-                        )
-                row += orders[j] + 1
-                state += orders[j]
-            for column in range(k):
-                for t in range(count):
-                    work[line, size + D + column, t] = -right[e, column, begin + t * s]
-
-
-@jit
-def _transfer(stages, h, b, ba, orders, transfer):
-    """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
-    d, s, n = orders.size, b.size, transfer.shape[2]
-    transfer[:] = 0.0
-    state = 0
-    for j in range(d):
-        last = state + orders[j] - 1
-        transfer[last, last] = 1.0
-        if orders[j] == 2:
-            transfer[state, state] = 1.0
-            for m in range(n):
-                transfer[state, last, m] = h[m]
-        for stage in range(s):
-            for column in range(transfer.shape[1]):
-                for m in range(n):
-                    transfer[last, column, m] += h[m] * b[stage] * stages[stage * d + j, column, m]
-                if orders[j] == 2:
-                    for m in range(n):
-                        transfer[state, column, m] += (
-                            h[m] * h[m] * ba[stage] * stages[stage * d + j, column, m]
-                        )
-        state += orders[j]
-
-
-@jit
-def _add_jumps(x, h, b, ba, orders, initial, transfer):
-    """Add the jump from each step's end to the next node to the right-hand side (one column).
-
-    A transient's last step has no next node.
-    """
-    d, s, n = orders.size, b.size, x.shape[0]
-    D = orders.sum()
-    state = 0
-    for j in range(d):
-        last = state + orders[j] - 1
-        for m in range(n - 1 if initial else n):
-            following = m + 1 if m + 1 < n else 0
-            once = twice = 0.0
-            for stage in range(s):
-                value = x[m, D + stage * d + j]
-                once += b[stage] * value
-                twice += ba[stage] * value
-            transfer[last, D, m] += x[m, last] + h[m] * once - x[following, last]
-            if orders[j] == 2:
-                transfer[state, D, m] += (
-                    x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
-                )
-        state += orders[j]
-
-
-@jit
-def _recover(stages, states, dx):
-    """Stage unknowns from the node states: ``dx (n, w, k)``."""
-    D, k, n = states.shape
-    total = np.empty(n)
-    for column in range(k):
-        for i in range(D):
-            for m in range(n):
-                dx[m, i, column] = states[i, column, m]
-        for line in range(stages.shape[0]):
-            for m in range(n):
-                total[m] = stages[line, D + column, m]
-            for i in range(D):
-                for m in range(n):
-                    total[m] += stages[line, i, m] * states[i, column, m]
-            for m in range(n):
-                dx[m, D + line, column] = total[m]
