@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from bayesoleo.data import Campaign, ReducedCampaign, load_campaign, reduce_camp
 from bayesoleo.data.units import parse_unit
 from bayesoleo.effects import Effect
 from bayesoleo.errors import CampaignError, ModelError
+from bayesoleo.estimation.nuisance import declared_nuisance, uncertain_conditions
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, laplace_mixture
@@ -69,6 +70,9 @@ class Settings:
         Instead of the catalogue.
     command : str
         Kept in the result.
+    nuisance : tuple of {"conditions", "offset", "gain"}
+        What is estimated within its declared tolerance: conditions by run (``sd``), offset and gain
+        of sensors (``accuracy``).
     """
 
     seed: int = 0
@@ -81,6 +85,7 @@ class Settings:
     drive: str | None = None
     effects: tuple[Effect, ...] | None = None
     command: str = ""
+    nuisance: tuple[str, ...] = ()
 
     @property
     def numerics(self) -> Numerics:
@@ -159,8 +164,8 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     """
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
+    assembly, reduced = _with_nuisance(Assembly(model, drive), reduced, settings.nuisance)
     roles = assign(reduced.records)
-    assembly = Assembly(model, drive)
     driven = assembly.model()
     # Building a predictor of one step checks channels, conditions and priors of every run without
     # solving anything.
@@ -173,6 +178,18 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
         )
     _check_units(driven, reduced.campaign)
     return Task(reduced, roles, assembly, settings)
+
+
+def _with_nuisance(
+    assembly: Assembly, reduced: ReducedCampaign, kinds: tuple[str, ...]
+) -> tuple[Assembly, ReducedCampaign]:
+    """Let what is known to a tolerance only be estimated within it."""
+    if not kinds:
+        return assembly, reduced
+    accuracy = {name: item.accuracy for name, item in reduced.campaign.channels.items()}
+    found = declared_nuisance(kinds, assembly.model(), reduced.records, accuracy)
+    records = found.complete(reduced.records)
+    return replace(assembly, nuisance=found), ReducedCampaign(reduced.campaign, records)
 
 
 def _check_units(model: Model, campaign: Campaign) -> None:
@@ -497,7 +514,7 @@ def simulate(
     return simulate_like(
         model,
         reduced.campaign,
-        reduced.records,
+        uncertain_conditions(model).complete(reduced.records),
         merged(sets, values, model),
         out=out,
         noise=noise,

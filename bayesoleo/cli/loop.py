@@ -112,6 +112,7 @@ def close(
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
 ) -> None:
     """Close the loop: estimate, find what is missing, add it, compare before and after.
 
@@ -147,6 +148,7 @@ def close(
         max_effects=max_effects,
         drive=drive,
         effects=effects,
+        nuisance=nuisance,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
@@ -161,6 +163,7 @@ def check(
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
     as_json: options.Json = False,
 ) -> None:
     """Read a campaign and a model, say what would be done, and touch nothing.
@@ -175,7 +178,7 @@ def check(
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
 
-    chosen = options.settings(scheme=scheme, steps=steps, drive=drive)
+    chosen = options.settings(scheme=scheme, steps=steps, drive=drive, nuisance=nuisance)
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:
         shell.print_json(tables.plain(plan))

@@ -115,6 +115,16 @@ Steps = Annotated[
         help="Steps a period.",
     ),
 ]
+Nuisance = Annotated[
+    str,
+    typer.Option(
+        metavar="conditions,offset,gain",
+        show_default=False,
+        rich_help_panel=SOLVING,
+        help="Estimate within declared tolerances: conditions (sd), sensors' offset and gain "
+        "(accuracy).",
+    ),
+]
 MaxEffects = Annotated[
     int,
     typer.Option(
@@ -148,6 +158,7 @@ def settings(
     max_effects: int = 4,
     drive: str | None = None,
     effects: str | None = None,
+    nuisance: str = "",
 ) -> Settings:
     """Settings of the workflow from options.
 
@@ -174,5 +185,6 @@ def settings(
         max_effects=max_effects,
         drive=drive,
         effects=None if effects is None else load_effects(effects),
+        nuisance=tuple(word.strip() for word in nuisance.split(",") if word.strip()),
         command=shlex.join(["bayesoleo", *sys.argv[1:]]),
     )

@@ -153,6 +153,7 @@ def estimate(
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
     as_json: options.Json = False,
 ) -> None:
     """Estimate the parameters from the runs with role fit: MBE, then the mode of the posterior.
@@ -170,7 +171,7 @@ def estimate(
 
     if out is not None:
         shell.check_writable(out)
-    chosen = options.settings(jobs=jobs, scheme=scheme, steps=steps, drive=drive)
+    chosen = options.settings(jobs=jobs, scheme=scheme, steps=steps, drive=drive, nuisance=nuisance)
     declared = load_model(model)
     with shell.stoppable(out):
         tree = workflow.estimate(campaign, declared, chosen, out=out, say=shell.teller(quiet))
@@ -211,6 +212,7 @@ def sample(
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
 ) -> None:
     """Sample the posterior from the estimate until the effective size asked for is reached.
 
@@ -238,6 +240,7 @@ def sample(
         scheme=scheme,
         steps=steps,
         drive=drive,
+        nuisance=nuisance,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
@@ -277,6 +280,7 @@ def trace(
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
 ) -> None:
     """Hold the residual against its noise and rank what may be missing; add nothing.
 
@@ -298,7 +302,13 @@ def trace(
     if out is not None:
         shell.check_writable(out)
     chosen = options.settings(
-        seed=seed, jobs=jobs, scheme=scheme, steps=steps, drive=drive, effects=effects
+        seed=seed,
+        jobs=jobs,
+        scheme=scheme,
+        steps=steps,
+        drive=drive,
+        effects=effects,
+        nuisance=nuisance,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)

@@ -5,6 +5,7 @@ from bayesoleo.estimation.function_problem import FunctionProblem
 from bayesoleo.estimation.iterate import Iteration
 from bayesoleo.estimation.laplace import mode_covariance
 from bayesoleo.estimation.multistart import Modes, multistart
+from bayesoleo.estimation.nuisance import Nuisance, declared_nuisance
 from bayesoleo.estimation.objectives import (
     log_likelihood,
     log_posterior,
@@ -15,6 +16,7 @@ from bayesoleo.estimation.objectives import (
 )
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Evaluation, Misfit, Problem
+from bayesoleo.estimation.replicate import Replications, estimate_many
 from bayesoleo.estimation.steps import METHODS, Step
 from bayesoleo.estimation.table import as_text, to_dataset
 
@@ -25,11 +27,15 @@ __all__ = [
     "Iteration",
     "Misfit",
     "Modes",
+    "Nuisance",
     "PointEstimate",
     "Problem",
+    "Replications",
     "Step",
     "as_text",
+    "declared_nuisance",
     "estimate",
+    "estimate_many",
     "log_likelihood",
     "log_posterior",
     "log_prior",

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.problem import Evaluation, Misfit
 from bayesoleo.model import Prior
+from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
+
+# Vectors that one batch of sensitivities is computed for: what they take is the raw samples of a
+# run times the unknowns.
+_LANES = 16
 
 
 class CampaignProblem:
@@ -51,6 +59,13 @@ class CampaignProblem:
                 full[names.index(name)] = value
         free = np.array([k for k, name in enumerate(names) if name not in values], dtype=np.int64)
         return CampaignProblem(self.predictor, free, full)
+
+    @property
+    def nuisances(self) -> frozenset[str]:
+        """Unknowns whose prior is a measurement, and counts in every estimator."""
+        layout, parameters = self.predictor.layout, self.predictor.model.parameters
+        owners = zip(layout.names, layout.parameters, strict=True)
+        return frozenset(name for name, owner in owners if parameters[owner].nuisance)
 
     @property
     def start(self) -> Array:
@@ -92,3 +107,74 @@ class CampaignProblem:
     def freeze(self, theta: Array) -> Status:
         """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""
         return max(self.predictor.set_anchor(self.full(theta[None])[0]), default=Status.CONVERGED)
+
+    @property
+    def lanes(self) -> int:
+        """Vectors whose sensitivities are computed together."""
+        return _LANES
+
+    @property
+    def data(self) -> tuple[Array, ...]:
+        """Measured samples of each output, runs one after the other, SI."""
+        columns = zip(*(run.measured for run in self.predictor.runs), strict=True)
+        return tuple(np.concatenate(column) for column in columns)
+
+    def with_data(self, data: Sequence[Array]) -> CampaignProblem:
+        """The same problem with other measured samples, shape (n_b,) for each output.
+
+        Raises
+        ------
+        InputError
+            If their number is another, or they are not finite.
+        """
+        wanted = [column.shape for column in self.data]
+        given = [np.shape(column) for column in data]
+        if given != wanted or not all(np.isfinite(column).all() for column in data):
+            raise InputError(
+                "data must be finite and as many as the problem's",
+                key="data",
+                value=given,
+                hint=f"give arrays of shapes {wanted}",
+            )
+        predictor, first = copy(self.predictor), 0
+        predictor.runs = []
+        for run in self.predictor.runs:
+            last = first + run.measured.shape[1]
+            other = copy(run)
+            other.measured = np.stack([np.asarray(column[first:last]) for column in data])
+            predictor.runs.append(other)
+            first = last
+        return CampaignProblem(predictor, self._free, self._full)
+
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> NormalEquations:
+        """Equations at vectors (L, l), each compared with its own row of data (L, n_b).
+
+        Solves start from the anchor; :meth:`freeze` it near the vectors.
+        """
+        if self.predictor.model.dofs and any(run.anchor is None for run in self.predictor.runs):
+            self.freeze(self.start)
+        full = self.full(theta)
+        ends = np.cumsum([run.measured.shape[1] for run in self.predictor.runs])
+        shape = (len(theta), len(self.outputs), full.shape[1])
+
+        def of_run(r: int) -> NormalEquations:
+            samples = self.predictor.runs[r].predict(
+                self.predictor.constants(full, r), derivatives=True
+            )
+            assert samples.y_p is not None
+            columns = self.predictor.layout.columns[r]
+            gram, slope = np.zeros((*shape, full.shape[1])), np.zeros(shape)
+            sums = np.empty(shape[:2])
+            cut = slice(ends[r] - samples.y.shape[2], ends[r])
+            for b, column in enumerate(data):
+                rows = reduce_rows(column[:, cut] - samples.y[:, b], samples.y_p[:, b].mT)
+                gram[:, b, columns[:, None], columns], slope[:, b, columns], sums[:, b] = rows
+            return NormalEquations(gram, slope, sums, samples.status)
+
+        parts = thread_map(of_run, range(len(self.predictor.runs)), self.predictor.jobs)
+        return NormalEquations(
+            np.sum([part.gram for part in parts], axis=0)[:, :, self._free[:, None], self._free],
+            np.sum([part.slope for part in parts], axis=0)[:, :, self._free],
+            np.sum([part.sums for part in parts], axis=0),
+            np.stack([part.status for part in parts]).max(axis=0),
+        )

@@ -28,7 +28,13 @@ def to_document(model: Model) -> dict[str, Any]:
         "inputs": dict(model.inputs),
         "conditions": {name: asdict(item) for name, item in model.conditions.items()},
         "dofs": {
-            name: {"unit": d.unit, "guess": _text(d.guess), "description": d.description}
+            name: {
+                "unit": d.unit,
+                "guess": _text(d.guess),
+                "description": d.description,
+                "initial": _text(d.initial),
+                "initial_rate": _text(d.initial_rate),
+            }
             for name, d in model.dofs.items()
         },
         "parameters": {name: _parameter(item) for name, item in model.parameters.items()},
@@ -75,7 +81,7 @@ def from_document(document: dict[str, Any]) -> Model:
 
 
 def _text(body: Any) -> Any:
-    return body if isinstance(body, str | int | float) else as_text(body)
+    return body if body is None or isinstance(body, str | int | float) else as_text(body)
 
 
 def _parameter(item: Parameter) -> dict[str, Any]:
@@ -93,6 +99,7 @@ def _parameter(item: Parameter) -> dict[str, Any]:
         "by_run": item.by_run,
         "description": item.description,
         "latex": item.latex,
+        "nuisance": item.nuisance,
     }
 
 

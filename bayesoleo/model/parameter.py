@@ -36,6 +36,9 @@ class Parameter:
         explain.
     by_run : bool
         One independent value for every run.
+    nuisance : bool
+        Its prior is a measurement and counts in every estimator: a sensor's offset within its
+        accuracy, the error of a condition.
     description : str
         What it is, for reports.
     latex : str, optional
@@ -57,6 +60,7 @@ class Parameter:
     by_run: bool = False
     description: str = ""
     latex: str | None = None
+    nuisance: bool = False
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.value):
@@ -107,11 +111,20 @@ class Dof:
         Static value from which a first solution starts; may use parameters and conditions.
     description : str
         What it is.
+    initial : str, float or sympy.Expr, optional
+        Value with which a transient run starts, over parameters, conditions, channels - as measured
+        at the run's first sample, smoothed - and the word ``equilibrium``: the value at rest under
+        the first sample's inputs. Periodic runs have no start. By default it is estimated for each
+        transient run; see :mod:`bayesoleo.model.initial`.
+    initial_rate : str, float or sympy.Expr, optional
+        The velocity at the start, of a dof of second order; zero where only ``initial`` is given.
     """
 
     unit: str = ""
     guess: str | float | sp.Expr = 0.0
     description: str = ""
+    initial: str | float | sp.Expr | None = None
+    initial_rate: str | float | sp.Expr | None = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from bayesoleo.effects import Candidate, Effect, Scales, candidates, catalogue
 from bayesoleo.errors import ModelError
+from bayesoleo.estimation.nuisance import Nuisance
 from bayesoleo.model import Model, Parameter, driven_by
 
 #: Added effects by name: (effect, target).
@@ -81,6 +82,8 @@ class Assembly:
         How it was assembled, in order.
     declared : Model or None
         The model before any effect; ``None`` stands for ``native``.
+    nuisance : Nuisance
+        Conditions and channels that are known to a tolerance only.
     """
 
     native: Model
@@ -89,6 +92,7 @@ class Assembly:
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     steps: tuple[Step, ...] = ()
     declared: Model | None = None
+    nuisance: Nuisance = field(default_factory=Nuisance)
 
     @property
     def added(self) -> tuple[Added, ...]:
@@ -100,6 +104,7 @@ class Assembly:
         model = self.native if self.drive is None else driven_by(self.native, self.drive)
         for effect, target, scales in self.sensors:
             model = effect.extend(model, target, scales).model
+        model = self.nuisance.extend(model)
         return model.with_parameters(**self.parameters)
 
     def with_parameters(self, changed: Mapping[str, Parameter]) -> Assembly:
@@ -121,7 +126,7 @@ class Assembly:
 
     def without(self, step: Step) -> Assembly:
         """The same assembly with one effect left out."""
-        base = Assembly(self.declared or self.native, self.drive)
+        base = Assembly(self.declared or self.native, self.drive, nuisance=self.nuisance)
         for other in self.steps:
             if other is not step:
                 base = base._with_step(other.effect, other.target, other.scales)[1]

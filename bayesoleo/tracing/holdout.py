@@ -89,7 +89,9 @@ def _held_out(fit: Fit, record: Record) -> Prediction:
     predictor = _single(fit, record)
     problem = CampaignProblem(predictor).holding(fit.shared)
     own = len(problem.names)
-    theta = estimate(problem, "mbe").theta if own else np.empty(0)
+    # What is known of a nuisance parameter counts; of any other, only what the run says.
+    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
+    theta = estimate(problem, method).theta if own else np.empty(0)
     full = problem.full(theta[None])[0]
     status = predictor.set_anchor(full)[0]
     samples = predictor.simulate(full[None], 0)

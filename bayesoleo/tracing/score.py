@@ -161,6 +161,10 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
     # A constant known to a tolerance is no free parameter: its prior's precision, one in this unit,
     # stays with it.
     gram[known:, known:] += np.eye(size - known)
+    for k, name in enumerate(fit.problem.names):
+        if name in fit.problem.nuisances:
+            gram[k, k] += 1.0
+            gradient[k] -= (fit.point.theta[k] - fit.problem.priors[k].mean) / unit[k]
     noise = excess = 0.0
     for r, record in enumerate(fit.records):
         run = fit.predictor.runs[r]
