@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from bayesoleo.estimation.bounded import bounded_step
 from bayesoleo.estimation.linearise import inverse_gram
@@ -27,12 +28,15 @@ class Equations:
         Derivative of the log prior where the prior is fixed at its centre, zero otherwise.
     room : tuple of ndarray, each shape (l,)
         Distances to the limits of the support, or to how far a logarithm may go in one step.
+    root : ndarray, shape (l, l)
+        Rows ``P`` with ``P'P`` the prior's precision; upper triangular.
     """
 
     jacobian: Array
     residual: Array
     slope: Array
     room: tuple[Array, Array]
+    root: Array
 
     @property
     def gradient(self) -> Array:
@@ -41,8 +45,9 @@ class Equations:
 
     def solve(self, rows: Array) -> Array:
         """Step, shape (l,), with the weight ``rows' rows`` added to ``A``."""
-        # only the fixed prior pulls, and its rows are the identity
-        pull = self.slope if len(rows) == len(self.slope) else np.zeros(len(rows))
+        # only the fixed prior pulls, and it does so along its own rows: P'r is its slope
+        pulls = len(rows) == len(self.slope) and self.slope.any()
+        pull = solve_triangular(rows, self.slope, trans="T") if pulls else np.zeros(len(rows))
         target = np.concatenate((self.residual, pull))
         return bounded_step(np.vstack((self.jacobian, rows)), target, self.room)
 
@@ -53,10 +58,10 @@ class Equations:
 
     def distance(self) -> float:
         """Newton decrement: the way to the fixed point in linearised standard deviations."""
-        step = self.solve(np.eye(len(self.slope)))
+        step = self.solve(self.root)
         return float(np.sqrt(max(0.0, float(step @ self.gradient))))
 
     def sd(self) -> Array:
-        """Linearised standard deviations ``[A + 1]^-1/2``, shape (l,)."""
-        weighted = np.vstack((self.jacobian, np.eye(len(self.slope))))
+        """Linearised standard deviations ``[A + P'P]^-1/2``, shape (l,)."""
+        weighted = np.vstack((self.jacobian, self.root))
         return np.sqrt(np.diag(inverse_gram(weighted)))

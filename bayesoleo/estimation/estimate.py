@@ -70,7 +70,7 @@ def estimate(
     """
     step = find_method(method)
     scale = PriorScale.of(problem.priors, problem.names)
-    begin = _checked_start(problem, scale, problem.start if start is None else start)
+    begin = checked_start(problem, scale, problem.start if start is None else start)
     outcome = iterate(
         problem,
         step,
@@ -118,7 +118,8 @@ def polish(
     )
 
 
-def _checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Array:
+def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Array:
+    """The start as an array, or an :class:`InputError` that names what does not fit."""
     theta = np.array(start, dtype=float)
     if theta.shape != scale.mean.shape or not np.isfinite(theta).all():
         raise InputError(
@@ -158,7 +159,7 @@ def _summarise(
         unit = scale.unit(outcome.theta)
         rows = Linearised.of(outcome.evaluation, unit).whitened(variance)[0]
         units = np.outer(unit, unit)
-        covariance = units * inverse_gram(np.vstack((rows, np.eye(unknowns))))
+        covariance = units * inverse_gram(np.vstack((rows, scale.root)))
         likelihood = units * inverse_gram(rows)
     held = on_limit(scale.room(outcome.theta))
     return PointEstimate(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesoleo.errors import InputError
+from bayesoleo.estimation.batch import NormalEquations, reduce_rows
+from bayesoleo.estimation.broadcast import Broadcast
 from bayesoleo.estimation.problem import Array, Evaluation, Misfit
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
@@ -16,9 +19,11 @@ from bayesoleo.solvers.status import Status
 # Sixth-order central difference. At a relative step of 1e-3 rounding costs about 1e-13 of a
 # derivative, and truncation stays below 1e-8 even where the function changes e-fold within 1 % of
 # a parameter.
-_OFFSETS = (1, 2, 3)
-_WEIGHTS = (45 / 60, -9 / 60, 1 / 60)
+_OFFSETS = np.array([1.0, 2.0, 3.0])
+_WEIGHTS = np.array([45.0, -9.0, 1.0]) / 60
 _RELATIVE_STEP = 1e-3
+# Numbers of one batch of predictions: about what stays in a core's cache.
+_BATCH = 2**17
 
 
 class FunctionProblem:
@@ -61,10 +66,14 @@ class FunctionProblem:
         jacobian: Callable[[Any, Array], ArrayLike] | None = None,
         output: str = "y",
     ) -> None:
-        self._function, self._x, self._jacobian = function, x, jacobian
-        self._y = np.array(y, dtype=float)
+        # Data of extended precision keep it until the residual is formed: where a model fits to the
+        # last digits, the residual would else be the rounding of the two numbers it comes from.
+        measured = np.array(y)
+        self._y = measured if measured.dtype == np.longdouble else measured.astype(float)
         if self._y.ndim != 1 or not np.isfinite(self._y).all():
             raise InputError("measured output must be one column of finite numbers", key="y")
+        self._x, self._jacobian = x, jacobian
+        self._prediction = Broadcast(function, x, self._y.size)
         self._priors = tuple(priors)
         length = len(self._priors)
         self._names = tuple(names or (f"theta{i}" for i in range(1, length + 1)))
@@ -109,30 +118,69 @@ class FunctionProblem:
         """Number of samples, shape (1, 1)."""
         return np.array([[self._y.size]], dtype=np.int64)
 
+    @property
+    def data(self) -> tuple[Array, ...]:
+        """Measured samples, one array of shape (n,)."""
+        return (self._y,)
+
+    @property
+    def lanes(self) -> int:
+        """Vectors whose predictions with their differences fit the cache."""
+        stencil = 1 + (2 * _OFFSETS.size * len(self._names) if self._jacobian is None else 0)
+        return max(1, _BATCH // (self._y.size * stencil))
+
+    def with_data(self, data: Sequence[Array]) -> FunctionProblem:
+        """The same problem with other measured samples, shape (n,).
+
+        Raises
+        ------
+        InputError
+            If their number is another, or they are not finite.
+        """
+        (y,) = data
+        if np.shape(y) != self._y.shape or not np.isfinite(y).all():
+            raise InputError(
+                "data must be finite and as many as the problem's",
+                key="data",
+                value=np.shape(y),
+                hint=f"give {self._y.size} samples",
+            )
+        other = copy(self)
+        other._y = np.array(y)
+        return other
+
     def predict(self, theta: ArrayLike) -> Array:
         """Prediction at one vector, shape (n,); NaN or infinite where the function fails."""
-        with np.errstate(all="ignore"):
-            prediction = np.asarray(self._function(self._x, np.array(theta, dtype=float)))
-        return np.broadcast_to(prediction.astype(float, copy=False), self._y.shape)
+        return self._prediction.one(np.array(theta, dtype=float))
 
     def evaluate(self, theta: Array) -> Evaluation:
         """Residual and sensitivity at one vector, shape (l,)."""
         theta = np.array(theta, dtype=float)
-        residual = self._y - self.predict(theta)
+        residual = self._residual(theta)
         sensitivity = np.full((self._y.size, theta.size), np.nan)
         if np.isfinite(residual).all():
-            sensitivity = self._sensitivity(theta)
+            sensitivity = self._sensitivity(theta[None])[0]
         if np.isfinite(sensitivity).all():
             return Evaluation((residual,), (sensitivity,), Status.CONVERGED)
         failed = (np.full_like(residual, np.nan),), (np.full_like(sensitivity, np.nan),)
         return Evaluation(*failed, Status.NOT_FINITE)
+
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> NormalEquations:
+        """Equations at vectors (L, l), each compared with its own row of data (L, n)."""
+        with np.errstate(all="ignore"):
+            residual = np.asarray(data[0] - self._prediction.many(theta), dtype=float)
+            sensitivity = self._sensitivity(theta)
+            gram, slope, sums = reduce_rows(residual, sensitivity)
+            finite = np.isfinite(sums) & np.isfinite(gram).all(axis=(1, 2))
+        status = np.where(finite, Status.CONVERGED, Status.NOT_FINITE).astype(np.int64)
+        return NormalEquations(gram[:, None], slope[:, None], sums[:, None], status)
 
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors, shape (L, l)."""
         vectors = np.atleast_2d(np.asarray(theta, dtype=float))
         sums = np.empty((len(vectors), 1, 1))
         for row, vector in enumerate(vectors):
-            residual = self._y - self.predict(vector)
+            residual = self._residual(vector)
             # a residual that overflows when squared is as unusable as one that is not finite
             with np.errstate(over="ignore", invalid="ignore"):
                 sums[row] = np.sum(residual * residual)
@@ -140,25 +188,30 @@ class FunctionProblem:
         sums[failed] = np.nan
         return Misfit(sums, np.where(failed, Status.NOT_FINITE, Status.CONVERGED).astype(np.int64))
 
+    def _residual(self, theta: Array) -> Array:
+        with np.errstate(invalid="ignore", over="ignore"):
+            return np.asarray(self._y - self.predict(theta), dtype=float)
+
     def _sensitivity(self, theta: Array) -> Array:
+        """Derivatives of the prediction at vectors (L, l), shape (L, n, l)."""
         if self._jacobian is not None:
             with np.errstate(all="ignore"):
-                return np.array(self._jacobian(self._x, theta), dtype=float)
-        columns = [self._difference(theta, index) for index in range(theta.size)]
-        return np.column_stack(columns)
+                rows = [np.array(self._jacobian(self._x, row), dtype=float) for row in theta]
+            return np.stack(rows)
+        step = self._steps(theta)
+        # vectors (offset, L, unknown, l): each moves one unknown by a multiple of its step
+        moved = _OFFSETS[:, None, None, None] * (step[:, :, None] * np.eye(theta.shape[1]))
+        ahead, behind = theta[:, None] + moved, theta[:, None] - moved
+        # the steps that floating point really took, not the ones that were asked for
+        taken = np.einsum("olkk->olk", ahead - behind) / (2 * _OFFSETS[:, None, None])
+        both = np.concatenate((ahead, behind)).reshape(-1, theta.shape[1])
+        ends = self._prediction.many(both).reshape(2, *moved.shape[:3], -1)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            slopes = (ends[0] - ends[1]) / taken[..., None]
+            return np.einsum("o,olkn->lnk", _WEIGHTS, np.asarray(slopes, dtype=float))
 
-    def _difference(self, theta: Array, index: int) -> Array:
-        step = _RELATIVE_STEP * max(abs(theta[index]), _RELATIVE_STEP * self._sd[index])
-        room = np.abs(self._support[index] - theta[index]).min()
-        if room > 0:  # keep the stencil inside the support, where the function is defined
-            step = min(step, room / (_OFFSETS[-1] + 1))
-        total = np.zeros(self._y.size)
-        for offset, weight in zip(_OFFSETS, _WEIGHTS, strict=True):
-            ahead, behind = theta.copy(), theta.copy()
-            ahead[index] += offset * step
-            behind[index] -= offset * step
-            # the step that floating point really took, not the one that was asked for
-            taken = (ahead[index] - behind[index]) / (2 * offset)
-            with np.errstate(invalid="ignore", over="ignore"):
-                total += weight * (self.predict(ahead) - self.predict(behind)) / taken
-        return total
+    def _steps(self, theta: Array) -> Array:
+        """Steps of the differences, shape (L, l): the stencil stays inside the support."""
+        step = _RELATIVE_STEP * np.maximum(np.abs(theta), _RELATIVE_STEP * self._sd)
+        room = np.abs(self._support - theta[..., None]).min(axis=-1)
+        return np.where(room > 0, np.minimum(step, room / (_OFFSETS[-1] + 1)), step)

@@ -243,7 +243,7 @@ class _Loop:
         self.bias_corrected, self.progress = bias_corrected, progress
         self.counts: NDArray[np.int64] = output_counts(problem.counts)
         self.scale = PriorScale.of(problem.priors, problem.names)
-        self.state = step.begin(len(self.scale.sd))
+        self.state = step.begin(self.scale.root)
         self.history: list[Iteration] = []
         self.evaluations, self.distance = 0, np.nan
         self.point: _Point
@@ -349,7 +349,7 @@ class _Loop:
         rows = Linearised.of(self.point.evaluation, self.scale.unit(theta)).whitened(variance)
         fixed = self.step.fixed_prior
         slope = self.scale.slope(theta) if fixed else np.zeros(theta.size)
-        return Equations(*rows, slope, self.scale.room(theta))
+        return Equations(*rows, slope, self.scale.room(theta), self.scale.root)
 
     def is_small(self, proposal: Array, equations: Equations, tolerance: float) -> bool:
         if is_cut(proposal, equations.room):

@@ -44,7 +44,7 @@ def mode_covariance(problem: Problem, theta: Array) -> Array:
     variance = staged_variance(sums_of_squares(evaluation), counts)
     chain = scale.unit(theta)
     rows = Linearised.of(evaluation, chain).whitened(variance)[0]
-    covariance = inverse_gram(np.vstack((rows, np.eye(unknowns))))
+    covariance = inverse_gram(np.vstack((rows, scale.root)))
     cross = np.column_stack(
         [
             chain * (sensitivity.T @ residual) / v

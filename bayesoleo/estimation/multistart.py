@@ -13,6 +13,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimate import estimate, polish
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array, Problem
+from bayesoleo.model.correlated import sample_of
 from bayesoleo.parallel import thread_map
 from bayesoleo.solvers.status import count
 
@@ -119,8 +120,9 @@ def _starts(
         raise InputError(
             "drawing starts needs a generator", key="rng", hint="pass numpy.random.default_rng(1)"
         )
-    draws = [prior.sample(rng, starts) for prior in problem.priors] if rng is not None else []
-    return [own, *np.column_stack(draws)] if starts else [own]
+    if not starts or rng is None:
+        return [own]
+    return [own, *sample_of(problem.priors, rng, starts)]
 
 
 def _merge(

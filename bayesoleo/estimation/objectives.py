@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Array, Evaluation
+from bayesoleo.model.correlated import log_density_of
 from bayesoleo.model.priors import Prior
 
 # A model that reproduces its data exactly has no residual variance; its logarithm must stay finite.
@@ -92,9 +93,8 @@ def log_likelihood(sums: Array, variance: Array, counts: NDArray[np.int64]) -> f
 
 
 def log_prior(priors: Sequence[Prior], theta: Array) -> float:
-    """Sum of the priors' log densities; minus infinity outside their support."""
-    densities = (prior.log_density(value) for prior, value in zip(priors, theta, strict=True))
-    return float(sum(float(density) for density in densities))
+    """Log density of the priors together; minus infinity outside their support."""
+    return float(log_density_of(priors, np.asarray(theta, dtype=float)[None])[0])
 
 
 def log_posterior(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Array
+from bayesoleo.model.correlated import Correlated, log_density_of, scaled_root
 from bayesoleo.model.priors import LogNormal, Normal, Prior
 
 # A centred difference over this fraction of the prior's sd is exact for a quadratic log density and
@@ -49,6 +50,9 @@ class PriorScale:
         Which unknowns are stepped in their logarithm.
     spread : ndarray, shape (l,)
         Standard deviation of what is stepped: of the unknown or of its logarithm.
+    root : ndarray, shape (l, l)
+        Rows ``P`` with ``P'P`` the prior's precision in scaled unknowns: the identity, but for
+        unknowns with a joint prior.
     """
 
     priors: tuple[Prior, ...]
@@ -58,6 +62,7 @@ class PriorScale:
     high: Array
     logarithmic: NDArray[np.bool_]
     spread: Array
+    root: Array
 
     @classmethod
     def of(cls, priors: Sequence[Prior], names: Sequence[str]) -> PriorScale:
@@ -84,24 +89,25 @@ class PriorScale:
         for index, prior in enumerate(priors):
             if isinstance(prior, LogNormal):
                 spread[index] = prior.log_spread
-        return cls(tuple(priors), mean, sd, low, high, logarithmic, spread)
+        root = scaled_root(priors, sd)
+        return cls(tuple(priors), mean, sd, low, high, logarithmic, spread, root)
 
     def inside(self, theta: Array) -> NDArray[np.bool_]:
-        """Which unknowns lie in their prior's support; zero has no logarithm. Shape (l,)."""
+        """Which unknowns lie in their prior's support; zero has no logarithm. Shape (..., l)."""
         return (theta >= self.low) & (theta <= self.high) & ~(self.logarithmic & (theta <= 0))
 
     def unit(self, theta: Array) -> Array:
-        """Derivative of each unknown with respect to its scaled one, shape (l,)."""
+        """Derivative of each unknown with respect to its scaled one, shape (..., l)."""
         return np.where(self.logarithmic, theta * self.spread, self.spread)
 
     def moved(self, theta: Array, step: Array) -> Array:
-        """Unknowns, shape (l,), after a step of the scaled ones, shape (l,)."""
+        """Unknowns, shape (..., l), after a step of the scaled ones, shape (..., l)."""
         with np.errstate(over="ignore"):  # the loop refuses what is not finite
             factor = np.exp(np.where(self.logarithmic, self.spread * step, 0.0))
         return np.where(self.logarithmic, theta * factor, theta + self.spread * step)
 
     def room(self, theta: Array) -> tuple[Array, Array]:
-        """Scaled distances down and up to how far one step may go, each shape (l,).
+        """Scaled distances down and up to how far one step may go, each shape (..., l).
 
         To the limits of the support; for a logarithm as far as linear equations are worth anything.
         """
@@ -109,20 +115,27 @@ class PriorScale:
         down, up = (theta - self.low) / self.sd, (self.high - theta) / self.sd
         return np.where(self.logarithmic, farthest, down), np.where(self.logarithmic, farthest, up)
 
-    def slope(self, theta: Array) -> Array:
-        """Derivative of the log prior with respect to the scaled unknowns, shape (l,)."""
-        return np.array([self._slope(i, float(value)) for i, value in enumerate(theta)])
+    def log_density(self, theta: Array) -> Array:
+        """Log prior of vectors, shape (L, l), per unit of the unknowns, shape (L,)."""
+        return log_density_of(self.priors, theta)
 
-    def _slope(self, index: int, value: float) -> float:
+    def slope(self, theta: Array) -> Array:
+        """Derivative of the log prior with respect to the scaled unknowns, shape (..., l)."""
+        away = (theta - self.mean) / self.sd
+        slope = -away @ (self.root.T @ self.root)
+        for index, prior in enumerate(self.priors):
+            if not isinstance(prior, Normal | Correlated):
+                slope[..., index] = self._slope(index, theta[..., index])
+        return slope
+
+    def _slope(self, index: int, value: Array) -> Array:
         prior, sd = self.priors[index], self.sd[index]
-        if isinstance(prior, Normal):
-            return float(-(value - self.mean[index]) / sd)
         if isinstance(prior, LogNormal):  # the density is per unit of the value, hence the second
             spread = prior.log_spread
-            return float(-np.log(value / prior.median) / spread - spread)
-        room = min(value - self.low[index], self.high[index] - value)
-        step = min(_SLOPE_STEP * sd, room / 2)
-        if step <= 0:  # on the limit itself a one-sided look is all there is, and it is not needed
-            return 0.0
-        behind, ahead = prior.log_density(np.array([value - step, value + step]))
-        return float((ahead - behind) * sd / (2 * step))
+            return -np.log(value / prior.median) / spread - spread
+        room = np.minimum(value - self.low[index], self.high[index] - value)
+        step = np.minimum(_SLOPE_STEP * sd, room / 2)
+        # on the limit itself a one-sided look is all there is, and it is not needed
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rise = prior.log_density(value + step) - prior.log_density(value - step)
+            return np.where(step > 0, rise * sd / (2 * step), 0.0)

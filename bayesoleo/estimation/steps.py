@@ -36,9 +36,15 @@ class Step:
     #: whether steps may shrink before the optimum is reached
     locks: ClassVar[bool] = False
 
-    def begin(self, unknowns: int) -> Array:
-        """State before the first iteration."""
-        return np.eye(unknowns)
+    #: whether the prior's weight is the same in every iteration, so that many data sets can be
+    #: fitted together
+    steady: ClassVar[bool] = False
+    #: whether the prior enters at all
+    weighted: ClassVar[bool] = True
+
+    def begin(self, root: Array) -> Array:
+        """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
+        return root
 
     def rows(self, state: Array, jacobian: Array) -> Array:
         """Rows ``P``, shape (l, l), for whitened sensitivities of shape (k, l)."""
@@ -58,6 +64,7 @@ class BayesianStep(Step):
     """Bayesian estimator, BE: the prior stays at its centre (Verbeek 1993, eq. 3.19)."""
 
     name: ClassVar[str] = "be"
+    steady: ClassVar[bool] = True
     fixed_prior: ClassVar[bool] = True
 
 
@@ -70,6 +77,7 @@ class ModifiedBayesianStep(Step):
     """
 
     name: ClassVar[str] = "mbe"
+    steady: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -91,24 +99,25 @@ class MinimumVarianceStep(Step):
 class ModifiedMinimumVarianceStep(Step):
     """Modified MVE: the prior variance is added again in every iteration, so nothing locks up.
 
-    The state is ``V``, zero at the start; the weight is ``(V + diag(w))^-1`` (Verbeek 1993,
-    eq. 3.22, after Hendriks).
+    The state is ``V``, zero at the start, above ``diag(w)``; the weight is ``(V + diag(w))^-1``
+    (Verbeek 1993, eq. 3.22, after Hendriks).
     """
 
     name: ClassVar[str] = "mmve"
 
-    def begin(self, unknowns: int) -> Array:
-        return np.zeros((unknowns, unknowns))
+    def begin(self, root: Array) -> Array:
+        inverse = solve_triangular(root, np.eye(len(root)))
+        return np.stack((np.zeros_like(root), inverse @ inverse.T))
 
     def rows(self, state: Array, jacobian: Array) -> Array:
         # S = L L' gives S^-1 = P'P with P = L^-1
-        identity = np.eye(len(state))
-        return solve_triangular(cholesky(state + identity, lower=True), identity, lower=True)
+        identity = np.eye(state.shape[1])
+        return solve_triangular(cholesky(state[0] + state[1], lower=True), identity, lower=True)
 
     def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
         triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")
-        root = solve_triangular(triangle, np.eye(len(state)))
-        return root @ root.T
+        root = solve_triangular(triangle, np.eye(state.shape[1]))
+        return np.stack((root @ root.T, state[1]))
 
 
 @dataclass(frozen=True)
@@ -116,6 +125,8 @@ class GaussNewtonStep(Step):
     """Gauss-Newton with a pseudo-inverse: the prior does not enter at all."""
 
     name: ClassVar[str] = "gauss-newton"
+    steady: ClassVar[bool] = True
+    weighted: ClassVar[bool] = False
 
     def rows(self, state: Array, jacobian: Array) -> Array:
         return np.zeros((0, jacobian.shape[1]))
@@ -132,8 +143,8 @@ class LevenbergMarquardtStep(Step):
     name: ClassVar[str] = "levenberg-marquardt"
     smallest: ClassVar[float] = 1e-14
 
-    def begin(self, unknowns: int) -> Array:
-        return np.concatenate(([1e-3, 2.0], np.zeros(unknowns)))
+    def begin(self, root: Array) -> Array:
+        return np.concatenate(([1e-3, 2.0], np.zeros(len(root))))
 
     def rows(self, state: Array, jacobian: Array) -> Array:
         return np.sqrt(state[0]) * np.diag(self._length(state, jacobian))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.problem import Misfit, Problem
+from bayesoleo.model.correlated import log_density_of
 from bayesoleo.parallel import thread_map
 from bayesoleo.posterior.likelihood import log_likelihood_by_run
 from bayesoleo.posterior.transforms import Transforms
@@ -146,11 +147,8 @@ class LogDensity:
         return self._mark_failures(total, by_run, status)
 
     def _log_prior(self, u: Array, theta: Array) -> Array:
-        total = self.transforms.log_jacobian(u)
         with np.errstate(invalid="ignore"):
-            for column, prior in zip(theta.T, self.problem.priors, strict=True):
-                total += prior.log_density(np.ascontiguousarray(column))
-        return total
+            return self.transforms.log_jacobian(u) + log_density_of(self.problem.priors, theta)
 
     def _misfit(self, theta: Array) -> Misfit:
         if self.jobs is None or self.jobs <= 1 or len(theta) < 2:

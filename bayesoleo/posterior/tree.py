@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from bayesoleo.model.correlated import sample_of
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.density import LOG_VARIANCE
 from bayesoleo.posterior.samples import Samples
@@ -92,10 +93,10 @@ def _prior(
     long_names: Mapping[str, str],
     seed: int,
 ) -> xr.Dataset:
-    rng = np.random.default_rng(seed)
+    all_draws = sample_of(priors, np.random.default_rng(seed), PRIOR_CHAINS * PRIOR_DRAWS)
     variables = {}
-    for name, prior in zip(names, priors, strict=True):
-        draws = prior.sample(rng, PRIOR_CHAINS * PRIOR_DRAWS).reshape(PRIOR_CHAINS, PRIOR_DRAWS)
+    for name, column in zip(names, all_draws.T, strict=True):
+        draws = column.reshape(PRIOR_CHAINS, PRIOR_DRAWS)
         variables[name] = (("chain", "draw"), draws, _attributes(name, units, long_names))
     coords = {"chain": np.arange(PRIOR_CHAINS), "draw": np.arange(PRIOR_DRAWS)}
     return xr.Dataset(variables, coords=coords)
