@@ -9,27 +9,18 @@ source's hash).
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import os
-import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import platformdirs
 import sympy as sp
 
+from bayesoleo.compiled import BLOCK, ArrayKernel, BlockKernel, Kernel, load
 from bayesoleo.model.derive import Derived, derive
 from bayesoleo.model.expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model.model import Model
 from bayesoleo.model.printing import code
-
-Kernel = Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -76,9 +67,22 @@ class Kernels:
 @lru_cache(maxsize=128)
 def _cached(digest: str, active: tuple[str, ...], backend: str, model: _Hashed) -> Kernels:
     derived = derive(model.model, active)
+    results = _results(derived)
     source = generate(derived, backend)
-    module = _load(source, backend)
-    functions = {name: getattr(module, name) for name in KERNELS}
+    functions: dict[str, Kernel] = {}
+    if backend == "numba":
+        module = load(source)
+        functions = {
+            name: BlockKernel(getattr(module, name), len(items)) for name, items in results.items()
+        }
+    else:
+        sizes = (len(derived.states), len(derived.inputs), len(derived.constants))
+        module = ModuleType("kernels")
+        exec(compile(source, "<kernels>", "exec"), module.__dict__)
+        functions = {
+            name: ArrayKernel(getattr(module, name), len(items), sizes)
+            for name, items in results.items()
+        }
     return Kernels(derived=derived, source=source, **functions)
 
 
@@ -117,49 +121,31 @@ def kernels(model: Model, active: Sequence[str] | None = None, backend: str = "n
     return _cached(digest, chosen, backend, _Hashed(model, digest))
 
 
-KERNELS = (
-    "residual",
-    "jacobian",
-    "parameters",
-    "output",
-    "output_jacobian",
-    "admissible",
-    "inputs",
-    "output_inputs",
-)
+def _results(derived: Derived) -> dict[str, list[sp.Expr]]:
+    """What each kernel computes, row by row."""
+    active, states = derived.active_symbols, derived.states
+    g, y = derived.residual, derived.output
+    rows = [
+        TIME if name == "time" else derivative_symbol(name, order) for name, order in derived.inputs
+    ]
+    return {
+        "residual": list(g),
+        "jacobian": [*g, *derived.gradient(g, states)],
+        "parameters": derived.gradient(g, active),
+        "output": list(y),
+        "output_jacobian": [*derived.gradient(y, states), *derived.gradient(y, active)],
+        "admissible": list(derived.admissible),
+        "inputs": derived.gradient(g, rows),
+        "output_inputs": derived.gradient(y, rows),
+    }
 
 
 def generate(derived: Derived, backend: str) -> str:
     """Source of a module with all kernels of a model."""
-    active, states = derived.active_symbols, derived.states
-    g, y = derived.residual, derived.output
-    gz, gp = derived.gradient(g, states), derived.gradient(g, active)
-    yz, yp = derived.gradient(y, states), derived.gradient(y, active)
-    rows = [
-        TIME if name == "time" else derivative_symbol(name, order) for name, order in derived.inputs
-    ]
-    gu, yu = derived.gradient(g, rows), derived.gradient(y, rows)
-    nz, na, nu = len(states), len(active), len(rows)
-    targets = {
-        "residual": (("g",), [*_vector("g", g)]),
-        "jacobian": (("g", "gz"), [*_vector("g", g), *_matrix("gz", gz, nz)]),
-        "parameters": (("gp",), [*_matrix("gp", gp, na)]),
-        "output": (("y",), [*_vector("y", y)]),
-        "output_jacobian": (("yz", "yp"), [*_matrix("yz", yz, nz), *_matrix("yp", yp, na)]),
-        "admissible": (("a",), [*_vector("a", derived.admissible)]),
-        "inputs": (("gu",), [*_matrix("gu", gu, nu)]),
-        "output_inputs": (("yu",), [*_matrix("yu", yu, nu)]),
-    }
     head = ["import numpy as np"]
     if backend == "numba":
-        head += [
-            "import numba",
-            "jit = numba.njit(nogil=True, cache=True, error_model='numpy')",
-            ARCTAN,
-        ]
-    parts = [
-        _function(name, outs, items, derived, backend) for name, (outs, items) in targets.items()
-    ]
+        head += ["import numba", ARCTAN]
+    parts = [_function(name, items, derived, backend) for name, items in _results(derived).items()]
     return "\n".join(head) + "\n\n\n" + "\n\n\n".join(parts) + "\n"
 
 
@@ -168,7 +154,7 @@ def generate(derived: Derived, backend: str) -> str:
 #: kernel's source, so that the hash it is cached under covers it.
 ARCTAN = """
 
-@jit
+@numba.njit(error_model="numpy")
 def arctan(x):
     size = abs(x)
     far = size > 2.414213562373095
@@ -187,122 +173,51 @@ def arctan(x):
     return -value if x < 0.0 else value"""
 
 
-Item = tuple[str, sp.Expr]
-
-
-def _vector(name: str, expressions: Sequence[sp.Expr]) -> list[Item]:
-    return [(f"{name}[l, {j}, {{i}}]", e) for j, e in enumerate(expressions)]
-
-
-def _matrix(name: str, expressions: Sequence[sp.Expr], columns: int) -> list[Item]:
-    return [
-        (f"{name}[l, {k // columns}, {k % columns}, {{i}}]", e) for k, e in enumerate(expressions)
-    ]
-
-
-#: Results that one compiled loop stores: with more of them the compiler gives up on proving that
-#: they do not overlap, and with it on vector instructions; computing a shared arctangent twice
-#: costs less.
-STORES = 6
-
-
-def _function(
-    name: str, outs: Sequence[str], items: Sequence[Item], derived: Derived, backend: str
-) -> str:
-    """One kernel: lanes outside, points inside: loops of a few results (Numba) or rows (NumPy)."""
-    lines = ["@jit"] if backend == "numba" else []
-    lines += [f"def {name}(z, u, p, lanes, {', '.join(outs)}):", "    for l in lanes:"]
-    if not items:
-        return "\n".join([*lines, "        pass"])
-    whole = backend == "numpy" or _calls_library([e for _, e in items])
-    size = len(items) if whole else -(-len(items) // -(-len(items) // STORES))
-    for first in range(0, len(items), size):
-        part = items[first : first + size]
-        names, loads_constant, loads_point = _names(derived, [e for _, e in part])
-        constants = {symbol(c) for c in derived.constants if symbol(c) in names}
-        outside, inside, results = code([e for _, e in part], names, constants)
-        body = (
-            loads_point
-            + inside
-            + [f"{target} = {result}" for (target, _), result in zip(part, results, strict=True)]
-        )
-        lines += ["        " + line for line in loads_constant + outside]
-        if backend == "numpy":
-            lines += ["        " + line.format(i=":") for line in body]
-        else:
-            lines.append(f"        for i in range({outs[0]}.shape[-1]):")
-            lines += [
-                "            " + line.format(i="i").replace("np.arctan(", "arctan(")
-                for line in body
-            ]
-    return "\n".join(lines)
-
-
-def _calls_library(expressions: Sequence[sp.Expr]) -> bool:
-    """Whether calls occur that no vector instruction replaces; once is then better than split."""
-    functions = (sp.exp, sp.log, sp.sin, sp.cos, sp.tan, sp.tanh)
-    return any(
-        e.has(*functions) or any(not power.exp.is_Rational for power in e.atoms(sp.Pow))
-        for e in expressions
-    )
+def _function(name: str, items: Sequence[sp.Expr], derived: Derived, backend: str) -> str:
+    """One kernel: a loop over the points of a block (Numba) or operations on rows (NumPy)."""
+    block = backend == "numba"
+    names, loads_constant, loads_point = _names(derived, items, block)
+    constants = {symbol(c) for c in derived.constants if symbol(c) in names}
+    outside, inside, results = code(items, names, constants)
+    if not block:
+        lines = [f"out[{k}][...] = {result}" for k, result in enumerate(results)]
+        body = [*loads_constant, *outside, *loads_point, *inside, *lines] or ["pass"]
+        return "\n".join([f"def {name}(z, u, p, out):", *(f"    {line}" for line in body)])
+    sizes = {
+        "z": len(derived.states) * BLOCK,
+        "u": len(derived.inputs) * BLOCK,
+        "p": len(derived.constants),
+        "out": len(items) * BLOCK,
+    }
+    lines = [f"{key} = numba.carray({key}, ({size},))" for key, size in sizes.items() if size]
+    lines += [*loads_constant, *outside, "for i in range(count):"]
+    stores = [f"out[{k * BLOCK} + i] = {result}" for k, result in enumerate(results)] or ["pass"]
+    lines += [f"    {line}" for line in [*loads_point, *inside, *stores]]
+    body = [line.replace("np.arctan(", "arctan(") for line in lines]
+    return "\n".join([f"def {name}(z, u, p, out, count):", *(f"    {line}" for line in body)])
 
 
 def _names(
-    derived: Derived, expressions: Sequence[sp.Expr]
+    derived: Derived, expressions: Sequence[sp.Expr], block: bool
 ) -> tuple[dict[sp.Symbol, str], list[str], list[str]]:
     """Code names of the symbols that occur, with the lines that load them."""
     used = set().union(*(e.free_symbols for e in expressions)) if expressions else set()
     names: dict[sp.Symbol, str] = {}
     constant, point = [], []
+
+    def row(array: str, k: int) -> str:
+        return f"{array}{k} = {array}[{k * BLOCK} + i]" if block else f"{array}{k} = {array}[{k}]"
+
     for k, item in enumerate(derived.constants):
         if symbol(item) in used:
             names[symbol(item)] = f"p{k}"
-            constant.append(f"p{k} = p[l, {k}]")
-    for k, item in enumerate(derived.states):
-        if item in used:
-            names[item] = f"z{k}"
-            point.append(f"z{k} = z[l, {k}, {{i}}]")
+            constant.append(f"p{k} = p[{k}]")
+    for k, state in enumerate(derived.states):
+        if state in used:
+            names[state] = f"z{k}"
+            point.append(row("z", k))
     for k, (channel, order) in enumerate(derived.inputs):
         if derivative_symbol(channel, order) in used:
             names[derivative_symbol(channel, order)] = f"u{k}"
-            point.append(f"u{k} = u[{k}, {{i}}]")
+            point.append(row("u", k))
     return names, constant, point
-
-
-def _load(source: str, backend: str) -> ModuleType:
-    """Import generated source; Numba needs it as a file, beside which it keeps compiled code."""
-    name = "bayesoleo_kernels_" + hashlib.sha256(source.encode()).hexdigest()[:24]
-    if backend == "numpy":
-        module = ModuleType(name)
-        exec(compile(source, f"<{name}>", "exec"), module.__dict__)
-        return module
-    path = cache_folder() / f"{name}.py"
-    if not path.is_file():
-        _write_atomically(path, source)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # Numba finds a cached function's globals by its module's name
-    spec.loader.exec_module(module)
-    return module
-
-
-def cache_folder() -> Path:
-    """Where generated kernels are kept: ``BAYESOLEO_CACHE`` or the user's cache folder."""
-    chosen = os.environ.get("BAYESOLEO_CACHE")
-    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
-    folder = folder / "kernels"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a read-only home must not stop a computation; only the cache is lost
-        folder = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-"))
-    return folder
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """Two processes may generate the same kernel at once; neither may read half a file."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
-        stream.write(text)
-    os.replace(temporary, path)

@@ -6,9 +6,10 @@ import sympy as sp
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from bayesoleo.compiled import cache_folder
 from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model.expressions import FUNCTIONS, symbol
-from bayesoleo.model.kernels import cache_folder, kernels
+from bayesoleo.model.kernels import kernels
 from bayesoleo.systems.oleo import thermomechanical_oleo
 
 NAMES = ("x", "w", "a", "b")

@@ -1,0 +1,210 @@
+"""Generated source: where it is kept, and the one way in which compiled kernels are called.
+
+A kernel evaluates a block of points that lie next to each other in memory: ``kernel(z, u, p, out,
+count)`` with pointers to rows of :data:`BLOCK` numbers. All kernels share this signature, so what
+calls them - a Newton iteration, an integrator - is compiled once, not once for every model, and a
+call costs nanoseconds. Rows at distances that the compiler knows can be proven not to overlap: that
+is what turns the loop over points into vector instructions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib.util
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+import platformdirs
+from numba import types
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Points in a block, and the distance between rows.
+BLOCK = 64
+
+_POINTER = types.CPointer(types.float64)
+#: ``kernel(z (nz, BLOCK), u (nu, BLOCK), p (np,), out (rows, BLOCK), count)``.
+SIGNATURE = types.void(_POINTER, _POINTER, _POINTER, _POINTER, types.intp)
+
+_COMPILING = threading.Lock()
+
+
+class BlockKernel:
+    """A generated kernel, compiled when it is first needed.
+
+    Parameters
+    ----------
+    function : callable
+        Python source of the kernel, in a module that stands on disk.
+    rows : int
+        Rows that it fills.
+    """
+
+    def __init__(self, function: Callable[..., None], rows: int):
+        self.function, self.rows = function, rows
+
+    @cached_property
+    def pointer(self) -> Any:
+        """The compiled function, to be passed to compiled code."""
+        with _COMPILING:
+            return numba.cfunc(SIGNATURE, cache=True, error_model="numpy")(self.function)
+
+    def __call__(
+        self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *results: Array
+    ) -> None:
+        """Evaluate lanes of ``z (L, nz, N)``, ``u (nu, N)``, ``p (L, np)`` into one or two arrays
+        of shape (L, …, N)."""
+        if self.rows:
+            first, second = (*results, results[0][:, :0])[:2]
+            _fill(self.pointer, z, u, p, lanes, _flat(first), _flat(second))
+
+
+class ArrayKernel:
+    """A generated kernel of whole-array operations: slower, but ready at once.
+
+    Parameters
+    ----------
+    function : callable
+        ``(z, u, p, out)`` with ``out`` a list of rows.
+    rows : int
+        Rows that it fills.
+    sizes : tuple of int
+        Numbers of rows of ``z`` and ``u`` and of constants.
+    """
+
+    def __init__(self, function: Callable[..., None], rows: int, sizes: tuple[int, int, int]):
+        self.function, self.rows, self.sizes = function, rows, sizes
+
+    def __call__(
+        self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *results: Array
+    ) -> None:
+        """As :meth:`BlockKernel.__call__`."""
+        flat = [_flat(result) for result in results]
+        for lane in lanes:
+            self.function(z[lane], u, p[lane], [row for result in flat for row in result[lane]])
+
+    @cached_property
+    def pointer(self) -> Any:
+        """A callback into Python that compiled code takes for a compiled kernel."""
+        return _Callback(self._block)
+
+    def _block(self, z: int, u: int, p: int, out: int, count: int) -> None:
+        nz, nu, constants = self.sizes
+        with np.errstate(all="ignore"):
+            self.function(
+                _numbers_at(z, nz * BLOCK).reshape(nz, BLOCK)[:, :count],
+                _numbers_at(u, nu * BLOCK).reshape(nu, BLOCK)[:, :count],
+                _numbers_at(p, constants),
+                list(_numbers_at(out, self.rows * BLOCK).reshape(-1, BLOCK)[:, :count]),
+            )
+
+
+Kernel = BlockKernel | ArrayKernel
+
+
+class _Callback(types.WrapperAddressProtocol):
+    """A Python function of the kernels' signature at an address; it takes the interpreter lock."""
+
+    _TYPE = ctypes.CFUNCTYPE(None, *[ctypes.c_size_t] * 4, ctypes.c_ssize_t)
+
+    def __init__(self, function: Callable[[int, int, int, int, int], None]):
+        self._alive = self._TYPE(function)
+
+    def __wrapper_address__(self) -> int:
+        return ctypes.cast(self._alive, ctypes.c_void_p).value or 0
+
+    def signature(self) -> Any:
+        return SIGNATURE
+
+
+def _numbers_at(address: int, count: int) -> Array:
+    if count == 0:
+        return np.empty(0)
+    return np.frombuffer((ctypes.c_double * count).from_address(address))
+
+
+def _flat(result: Array) -> Array:
+    """All rows of a result in one dimension, as a view."""
+    rows = int(np.prod(result.shape[1:-1]))
+    flat = result.reshape(result.shape[0], rows, result.shape[-1])
+    if not np.shares_memory(flat, result) and flat.size:
+        raise ValueError("results must be contiguous")
+    return flat
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _fill(kernel, z, u, p, lanes, first, second):
+    nz, nu, points = z.shape[1], u.shape[0], first.shape[2]
+    rows, more = first.shape[1], second.shape[1]
+    # At least one row: a pointer must point to something.
+    z_block, u_block = np.zeros((max(nz, 1), BLOCK)), np.zeros((max(nu, 1), BLOCK))
+    p_lane, out = np.zeros(max(p.shape[1], 1)), np.empty((rows + more, BLOCK))
+    for begin in range(0, points, BLOCK):
+        count = min(BLOCK, points - begin)
+        for k in range(nu):
+            for i in range(count):
+                u_block[k, i] = u[k, begin + i]
+        for lane in lanes:
+            for k in range(p.shape[1]):
+                p_lane[k] = p[lane, k]
+            for k in range(nz):
+                for i in range(count):
+                    z_block[k, i] = z[lane, k, begin + i]
+            kernel(z_block.ctypes, u_block.ctypes, p_lane.ctypes, out.ctypes, count)
+            for k in range(rows):
+                for i in range(count):
+                    first[lane, k, begin + i] = out[k, i]
+            for k in range(more):
+                for i in range(count):
+                    second[lane, k, begin + i] = out[rows + k, i]
+
+
+def load(source: str) -> ModuleType:
+    """Import generated source from a file, beside which Numba keeps what it compiled of it.
+
+    The file is named by the source's hash: other source never meets another's compiled code.
+    """
+    name = "bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24]
+    if name in sys.modules:
+        return sys.modules[name]
+    path = cache_folder() / f"{name}.py"
+    if not path.is_file():
+        _write_atomically(path, source)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # Numba finds a cached function's globals by its module's name
+    spec.loader.exec_module(module)
+    return module
+
+
+def cache_folder() -> Path:
+    """Where generated kernels are kept: ``BAYESOLEO_CACHE`` or the user's cache folder."""
+    chosen = os.environ.get("BAYESOLEO_CACHE")
+    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
+    folder = folder / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a read-only home must not stop a computation; only the cache is lost
+        folder = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-"))
+    return folder
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    """Two processes may generate the same kernel at once; neither may read half a file."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    with os.fdopen(handle, "w", encoding="utf-8") as stream:
+        stream.write(text)
+    os.replace(temporary, path)
