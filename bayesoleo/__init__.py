@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from bayesoleo.workflow import check as check
     from bayesoleo.workflow import close as close
     from bayesoleo.workflow import estimate as estimate
+    from bayesoleo.workflow import estimate_each as estimate_each
     from bayesoleo.workflow import reduce as reduce
     from bayesoleo.workflow import sample as sample
     from bayesoleo.workflow import simulate as simulate
@@ -78,6 +79,7 @@ _HOMES = {
         "check",
         "close",
         "estimate",
+        "estimate_each",
         "reduce",
         "sample",
         "simulate",

@@ -20,6 +20,7 @@ from bayesoleo.data.units import parse_unit
 from bayesoleo.effects import Effect
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.estimation.nuisance import declared_nuisance, uncertain_conditions
+from bayesoleo.estimation.per_run import by_run_dataset
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, laplace_mixture
@@ -287,6 +288,50 @@ def estimate(
     task = prepare(campaign, model, settings)
     fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
     return _finish(task, {schema.POINT: point_group(fit)}, fit, out)
+
+
+def estimate_each(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    say: Say = _silent,
+) -> xr.Dataset:
+    """Estimate a model's parameters from each run by itself, fitted and held-out runs alike.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.Dataset
+        MBE's estimates by run, see :func:`bayesoleo.estimation.per_run.by_run_dataset`, with the
+        coordinates ``group`` and ``role`` (run). A parameter that varies by run has one value a run
+        like any other. :func:`bayesoleo.estimation.between_runs` says how much the runs differ.
+    """
+    task = prepare(campaign, model, settings)
+    driven = task.assembly.model()
+    # Alone, every parameter is one of the run's own.
+    shared = {name: replace(item, by_run=False) for name, item in driven.parameters.items()}
+    driven = driven.with_parameters(**shared)
+    points, residuals = {}, {}
+    for record in task.reduced.records:
+        say(f"run {record.label}")
+        fit = fit_model(driven, [record], settings.numerics)
+        points[record.label] = fit.mbe
+        residuals[record.label] = fit.problem.evaluate(fit.mbe.theta).residual
+    units = [driven.parameters[name].unit for name in fit.problem.names]
+    records = task.reduced.records
+    return by_run_dataset(points, residuals, units).assign_coords(
+        {
+            schema.RUN_GROUP: (schema.RUN, [record.group for record in records]),
+            schema.ROLE: (schema.RUN, [record.role for record in records]),
+        }
+    )
 
 
 def sample(

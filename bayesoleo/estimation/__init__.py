@@ -2,6 +2,7 @@
 
 from bayesoleo.estimation.estimate import estimate, polish
 from bayesoleo.estimation.function_problem import FunctionProblem
+from bayesoleo.estimation.hierarchy import Hierarchy, between_runs
 from bayesoleo.estimation.iterate import Iteration
 from bayesoleo.estimation.laplace import mode_covariance
 from bayesoleo.estimation.multistart import Modes, multistart
@@ -14,6 +15,7 @@ from bayesoleo.estimation.objectives import (
     staged_variance,
     sums_of_squares,
 )
+from bayesoleo.estimation.per_run import estimate_each
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Evaluation, Misfit, Problem
 from bayesoleo.estimation.replicate import Replications, estimate_many
@@ -24,6 +26,7 @@ __all__ = [
     "METHODS",
     "Evaluation",
     "FunctionProblem",
+    "Hierarchy",
     "Iteration",
     "Misfit",
     "Modes",
@@ -33,8 +36,10 @@ __all__ = [
     "Replications",
     "Step",
     "as_text",
+    "between_runs",
     "declared_nuisance",
     "estimate",
+    "estimate_each",
     "estimate_many",
     "log_likelihood",
     "log_posterior",
