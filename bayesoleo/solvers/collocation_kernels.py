@@ -1,9 +1,9 @@
 """Compiled loops of one-step collocation: rows at stages, samples between nodes, elimination of a
 step's stages.
 
-Unknowns are ``x (L, n, w)``, highest derivatives at the stages behind the state of each step; steps
-have the lengths ``h (n,)``; ``a``, ``b``, ``c`` are the method's weights, ``aa`` and ``ba`` those of
-the second integral.
+Unknowns are ``x (L, n, w)``, with the highest derivatives at the stages behind the state of each
+step; steps have the lengths ``h (n,)``; ``a``, ``b`` and ``c`` are the method's weights, ``aa`` and
+``ba`` those of the second integral.
 """
 
 from __future__ import annotations
