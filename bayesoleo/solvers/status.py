@@ -18,6 +18,7 @@ class Status(IntEnum):
     SINGULAR = 3
     NOT_FINITE = 4
     OUT_OF_BOUNDS = 5
+    TOLERANCE_NOT_MET = 6
 
     @property
     def message(self) -> str:
@@ -37,6 +38,7 @@ _MESSAGES = {
     Status.SINGULAR: "the linearised equations are singular",
     Status.NOT_FINITE: "a residual or a derivative is not finite",
     Status.OUT_OF_BOUNDS: "a parameter lies outside its prior's support",
+    Status.TOLERANCE_NOT_MET: "the error stays above the tolerance on the finest mesh allowed",
 }
 
 
