@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
-from bayesoleo.prediction.records import Harmonics, Record
+from bayesoleo.prediction.records import Harmonics, Record, Signal
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,23 @@ def harmonics_of(record: Record, channel: str) -> Harmonics:
     return record.harmonics[channel]
 
 
+def signal_of(record: Record, channel: str) -> Signal:
+    """What a channel is as an input, periodic or not.
+
+    Raises
+    ------
+    CampaignError
+        If the record lacks the channel.
+    """
+    if channel not in record.signals:
+        raise CampaignError(
+            f"the model needs channel {channel!r}",
+            run=record.label,
+            hint=f"channels there are: {', '.join(record.signals) or 'none'}",
+        )
+    return record.signals[channel]
+
+
 #: Rows computed before, by grid, channel and derivative; models of the same run share them.
 RowCache = dict[tuple[str, str, int], Array]
 
@@ -44,12 +61,12 @@ def input_rows(
     Parameters
     ----------
     record : Record
-        A periodic run.
+        A run.
     rows : tuple of (str, int)
         As in :class:`~bayesoleo.model.derive.Derived`; the channel ``time`` gives seconds since the
         first sample.
     phase : ndarray, shape (N,)
-        Cycles since the first sample.
+        Cycles since the first sample; of a transient, parts of its length.
     grid : str
         Names ``phase`` in the cache.
     cache : dict, optional
@@ -59,11 +76,11 @@ def input_rows(
     table = np.empty((len(rows), phase.size))
     for k, (channel, derivative) in enumerate(rows):
         if channel == "time":
-            table[k] = phase / record.frequency
+            table[k] = phase / record.rate
         else:
             key = (grid, channel, derivative)
             if key not in known:
-                item = harmonics_of(record, channel)
-                known[key] = item.evaluate(phase, record.frequency, derivative)
+                item = signal_of(record, channel)
+                known[key] = item.evaluate(phase, record.rate, derivative)
             table[k] = known[key]
     return table

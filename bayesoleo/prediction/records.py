@@ -1,19 +1,31 @@
 """Reduced records: what a campaign's run becomes before a model sees it.
 
-A periodic channel is two things at once: its raw samples, which a likelihood compares with a
-prediction, and its significant harmonics, which a model takes as an input together with exact time
-derivatives.
+A channel is two things at once: its raw samples, which a likelihood compares with a prediction, and
+a signal, which a model takes as an input together with its time derivatives: the significant
+harmonics of a periodic channel, the smooth curve behind one of a transient.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.prediction.smoothing import Smoothed
+
 Array = NDArray[np.float64]
+
+PERIODIC, TRANSIENT = "periodic", "transient"
+
+
+class Signal(Protocol):
+    """What an input is to a model: values and derivatives at any phase of a run."""
+
+    def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
+        """Value or time derivative at phases, shape (N,); see :class:`Harmonics`."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +97,14 @@ class Record:
     harmonics : mapping of str to Harmonics
         Significant harmonics of each channel (periodic runs).
     signal_noise : mapping of str to float
-        Standard deviation of a single sample about the periodic mean, SI.
+        Standard deviation of a single sample about the periodic mean, of a transient about the
+        smooth curve behind it, SI.
     conditions, condition_sd : mapping of str to float
         Known constants of the run, SI; standard deviation where declared.
     dropped_periods : int
         Leading periods left out because they had not settled.
+    smoothed : mapping of str to Smoothed
+        The smooth curve behind each channel (transient runs).
     """
 
     label: str
@@ -106,8 +121,36 @@ class Record:
     conditions: Mapping[str, float] = field(default_factory=dict)
     condition_sd: Mapping[str, float] = field(default_factory=dict)
     dropped_periods: int = 0
+    smoothed: Mapping[str, Smoothed] = field(default_factory=dict)
 
     @property
     def phase(self) -> Array:
         """Phase of every sample in cycles since the first one, shape (N,)."""
         return self.frequency * (self.time - self.time[0])
+
+    @property
+    def periodic(self) -> bool:
+        """Whether the run repeats itself."""
+        return self.kind == PERIODIC
+
+    @property
+    def signals(self) -> Mapping[str, Signal]:
+        """Each channel as an input: by its harmonics, or by its smooth curve."""
+        return self.harmonics if self.periodic else self.smoothed
+
+    @property
+    def span(self) -> float:
+        """What is solved for at once, s: a period, or the length of a transient."""
+        return 1.0 / self.rate
+
+    @property
+    def rate(self) -> float:
+        """Reciprocal of the span, Hz."""
+        if self.periodic:
+            return self.frequency
+        return 1.0 / float(self.time[-1] - self.time[0])
+
+    @property
+    def position(self) -> Array:
+        """Every sample's place in spans since the first one, shape (N,): the phase, if periodic."""
+        return self.rate * (self.time - self.time[0])
