@@ -8,8 +8,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from functools import cache
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 
 def available_cores() -> int:
@@ -18,6 +20,23 @@ def available_cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # macOS and Windows have no affinity call
         return os.cpu_count() or 1
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Linear algebra libraries of this process; to look for them takes milliseconds."""
+    import scipy.linalg  # noqa: F401  what is not loaded yet would not be found
+
+    return ThreadpoolController()
+
+
+def single_blas_thread() -> AbstractContextManager[object]:
+    """Keep linear algebra to the calling thread.
+
+    Small problems gain nothing from more, and on a busy machine wait for them.
+    """
+    limit: AbstractContextManager[object] = _libraries().limit(limits=1, user_api="blas")
+    return limit
 
 
 def thread_map[T, R](
@@ -46,7 +65,7 @@ def thread_map[T, R](
     # Threads of ours that each call a linear algebra library with threads of its own would crowd
     # each other out.
     with (
-        threadpool_limits(limits=1, user_api="blas"),
+        single_blas_thread(),
         ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool,
     ):
         return list(pool.map(function, work))

@@ -38,6 +38,7 @@ class CampaignProblem:
         self, predictor: Predictor, free: NDArray[np.int64] | None = None, full: Array | None = None
     ):
         self.predictor = predictor
+        self._last: tuple[Array, Evaluation] | None = None
         layout = predictor.layout
         self._all_priors = layout.priors(predictor.model)
         self._free = np.arange(len(layout.names)) if free is None else free
@@ -82,11 +83,15 @@ class CampaignProblem:
         """Residuals and sensitivities at one vector, shape (l,).
 
         Every evaluation re-anchors the solver at ``theta``: an estimate walks, and starts each
-        solve where it stands.
+        solve where it stands. Asked again for the last vector, it answers from memory.
         """
+        if self._last is None or not np.array_equal(self._last[0], theta):
+            self._last = (np.array(theta), self._evaluate(theta))
+        return self._last[1]
+
+    def _evaluate(self, theta: Array) -> Evaluation:
         full = self.full(theta[None])[0]
-        self.predictor.set_anchor(full)
-        runs = self.predictor.predict(full)
+        runs = self.predictor.evaluate(full)
         residual: Sequence[Sequence[Array]] = [
             list(record.measured - run.y)
             for record, run in zip(self.predictor.runs, runs, strict=True)

@@ -28,6 +28,7 @@ def estimate(
     start: ArrayLike | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 50,
+    resolution: float = 0.0,
     bias_corrected: bool = False,
     progress: Progress | None = None,
 ) -> PointEstimate:
@@ -49,6 +50,9 @@ def estimate(
         Relative step: converged when every step is below this part of the unknown, or of its
         linearised standard deviation where that is larger.
     max_iterations : int, optional
+    resolution : float, optional
+        Converged also where the optimum is nearer than this many standard deviations: what is
+        below, the data cannot tell. Zero asks for digits alone.
     bias_corrected : bool, optional
         Divide the sums of squares by ``n - l/s`` instead of ``n``.
     progress : callable, optional
@@ -77,6 +81,7 @@ def estimate(
         begin,
         tolerance=tolerance,
         max_iterations=max_iterations,
+        resolution=resolution,
         bias_corrected=bias_corrected,
         progress=progress,
     )
@@ -89,6 +94,7 @@ def polish(
     *,
     tolerance: float = 1e-6,
     max_iterations: int = 50,
+    resolution: float = 0.0,
     progress: Progress | None = None,
 ) -> PointEstimate:
     """Move from an estimate, usually MBE's, to the posterior's mode by the Bayesian estimator.
@@ -101,7 +107,7 @@ def polish(
     problem : Problem
     point : PointEstimate
         Where to begin.
-    tolerance, max_iterations, progress
+    tolerance, max_iterations, resolution, progress
         As in :func:`estimate`.
 
     Returns
@@ -114,6 +120,7 @@ def polish(
         start=point.theta,
         tolerance=tolerance,
         max_iterations=max_iterations,
+        resolution=resolution,
         progress=progress,
     )
 

@@ -26,6 +26,7 @@ from bayesoleo.estimation.objectives import (
 from bayesoleo.estimation.problem import Array, Evaluation, Problem
 from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.steps import Step
+from bayesoleo.parallel import single_blas_thread
 from bayesoleo.solvers.status import Status
 
 # 2**-30 of a step moves nothing that another thirty iterations could use.
@@ -114,6 +115,7 @@ def iterate(
     *,
     tolerance: float,
     max_iterations: int,
+    resolution: float = 0.0,
     bias_corrected: bool = False,
     progress: Callable[[Iteration], None] | None = None,
 ) -> Outcome:
@@ -130,6 +132,9 @@ def iterate(
         Converged when every unknown's step is below this part of its value, or of its linearised
         standard deviation where that is larger.
     max_iterations : int
+    resolution : float, optional
+        Converged also where a step is shorter than this many standard deviations, all unknowns
+        together.
     bias_corrected : bool, optional
         Stage the variances with eq. 3.18 instead of 3.17.
     progress : callable, optional
@@ -141,13 +146,14 @@ def iterate(
         Ends on the last point that improved, so never on a worse one than the start.
     """
     loop = _Loop(problem, step, bias_corrected, progress)
-    loop.move(loop.look(np.array(start, dtype=float)), 0)
-    status = loop.point.status
-    if status.ok:
-        try:
-            status = loop.run(tolerance, max_iterations)
-        except np.linalg.LinAlgError:
-            status = Status.SINGULAR
+    with single_blas_thread():
+        loop.move(loop.look(np.array(start, dtype=float)), 0)
+        status = loop.point.status
+        if status.ok:
+            try:
+                status = loop.run(tolerance, max_iterations, resolution)
+            except np.linalg.LinAlgError:
+                status = Status.SINGULAR
     return Outcome(
         theta=loop.point.theta,
         evaluation=loop.point.evaluation,
@@ -266,7 +272,7 @@ class _Loop:
         if self.progress is not None:
             self.progress(iteration)
 
-    def run(self, tolerance: float, max_iterations: int) -> Status:
+    def run(self, tolerance: float, max_iterations: int, resolution: float) -> Status:
         """Iterate until a step is small and the fixed point near, or nothing helps."""
         pace = _Pace()
         for _ in range(max_iterations):
@@ -278,7 +284,7 @@ class _Loop:
             proposal = equations.solve(weight)
             pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
             part = self.part_of(proposal, pace, equations)
-            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance)
+            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance, resolution)
             before = self.point
             trial, halvings, taken = self.shorten(part * proposal, equations, variance)
             if halvings >= _MANY_HALVINGS:
@@ -351,9 +357,13 @@ class _Loop:
         slope = self.scale.slope(theta) if fixed else np.zeros(theta.size)
         return Equations(*rows, slope, self.scale.room(theta), self.scale.root)
 
-    def is_small(self, proposal: Array, equations: Equations, tolerance: float) -> bool:
+    def is_small(
+        self, proposal: Array, equations: Equations, tolerance: float, resolution: float
+    ) -> bool:
         if is_cut(proposal, equations.room):
             return False
+        if not self.step.locks and equations.distance() <= resolution:
+            return True
         unit = self.scale.unit(self.point.theta)
         least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
         return bool(np.all(np.abs(unit * proposal) <= tolerance * least))

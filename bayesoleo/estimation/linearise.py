@@ -13,6 +13,9 @@ from scipy.linalg import solve_triangular
 
 from bayesoleo.estimation.problem import Array, Evaluation
 
+# Rows of one block of a tall matrix.
+_BLOCK = 1024
+
 
 @dataclass(frozen=True)
 class Linearised:
@@ -46,8 +49,18 @@ class Linearised:
 
 
 def _triangle(matrix: Array) -> Array:
-    if matrix.shape[0] <= matrix.shape[1]:
+    """Triangular factor of a tall matrix: blocks that stay in the cache first, then their factors.
+
+    Orthogonal whatever the cut, and small enough for a linear algebra library to start no threads.
+    """
+    height, width = matrix.shape
+    if height <= width:
         return matrix
+    blocks = height // _BLOCK
+    if blocks > 1 and 4 * width <= _BLOCK:
+        cut = blocks * _BLOCK
+        heads = np.linalg.qr(matrix[:cut].reshape(blocks, _BLOCK, width), mode="r")
+        return _triangle(np.vstack((heads.reshape(-1, width), matrix[cut:])))
     return np.linalg.qr(matrix, mode="r")
 
 

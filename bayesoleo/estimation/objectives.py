@@ -27,7 +27,7 @@ _SMALLEST_VARIANCE = 1e-150
 def sums_of_squares(evaluation: Evaluation) -> Array:
     """Diagonal ``M_bb`` of the moment matrix, shape (s,), in squared units of the outputs."""
     with np.errstate(over="ignore"):  # a trial step far out; the loop refuses what is not finite
-        return np.array([float(residual @ residual) for residual in evaluation.residual])
+        return np.array([float(np.sum(residual * residual)) for residual in evaluation.residual])
 
 
 def output_counts(counts: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -27,7 +27,7 @@ from bayesoleo.estimation.problem import Array
 from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.steps import Step
 from bayesoleo.estimation.steps import method as find_method
-from bayesoleo.parallel import thread_map
+from bayesoleo.parallel import single_blas_thread, thread_map
 from bayesoleo.solvers.status import Status
 
 # Largest condition number of scaled normal equations that are solved as such; the rest goes to the
@@ -146,7 +146,8 @@ def estimate_many(
             progress(len(lanes.theta))
         return lanes
 
-    parts = thread_map(work, cuts, jobs)
+    with single_blas_thread():
+        parts = thread_map(work, cuts, jobs)
     return Replications(
         names=tuple(problem.names),
         outputs=tuple(problem.outputs),

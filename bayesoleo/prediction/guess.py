@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 
 import numpy as np
 import sympy as sp
@@ -68,15 +69,21 @@ def _declared(model: Model, dof: str) -> sp.Expr:
 def _evaluate(
     expression: sp.Expr, record: Record, constants: Mapping[str, float], phase: Array
 ) -> Array:
-    values = {symbol(name): value for name, value in constants.items()}
-    total = np.zeros(phase.size)
-    moving = [
-        item for item in expression.free_symbols if split_derivative(item)[0] in record.harmonics
-    ]
+    function, items = _compiled(expression)
     columns = []
-    for item in moving:
+    for item in items:
         channel, order = split_derivative(item)
-        assert item == derivative_symbol(channel, order)
-        columns.append(harmonics_of(record, channel).evaluate(phase, record.frequency, order))
-    function = sp.lambdify(moving, expression.subs(values), "numpy")
-    return total + np.asarray(function(*columns), dtype=float)
+        if channel in record.harmonics:
+            assert item == derivative_symbol(channel, order)
+            motion = harmonics_of(record, channel).evaluate(phase, record.frequency, order)
+            columns.append(motion)
+        else:
+            columns.append(np.asarray(constants[channel]))
+    return np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)
+
+
+@lru_cache(maxsize=256)
+def _compiled(expression: sp.Expr) -> tuple[Callable[..., Array], tuple[sp.Symbol, ...]]:
+    """A guess as a function of its symbols: the same for every run, and slow to make."""
+    items = tuple(sorted(expression.free_symbols, key=str))
+    return sp.lambdify(items, expression, "numpy"), items

@@ -14,6 +14,7 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor, Samples
+from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.schemes import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
@@ -51,7 +52,7 @@ class Predictor:
     records : sequence of Record
         The runs.
     steps : int
-        Steps of the mesh in a period.
+        Steps of the mesh in a period; how finely the steps of transients are cut.
     scheme : str
         Discretisation, see :func:`bayesoleo.solvers.schemes.scheme`.
     backend : {"numba", "numpy"}
@@ -84,11 +85,15 @@ class Predictor:
         self.layout = Layout.of(model, [record.label for record in records])
         compiled = kernels(model, self.layout.active, backend)
         self.outputs = compiled.derived.outputs
-        known = {} if share is None else {id(run.record): run.known_rows for run in share.runs}
+        shared = {} if share is None else {id(run.record): run for run in share.runs}
 
         def build(record: Record) -> RunPredictor:
-            rows = known.get(id(record))
-            return RunPredictor(model, compiled, record, steps, scheme, rows)
+            like = shared.get(id(record))
+            if record.periodic:
+                rows = None if like is None else like.known_rows
+                return RunPredictor(model, compiled, record, steps, scheme, rows)
+            same = like if isinstance(like, TransientRun) else None
+            return TransientRun(model, compiled, record, steps, scheme, same)
 
         self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
         self._base = np.stack([run.base_constants() for run in self.runs])
@@ -110,11 +115,24 @@ class Predictor:
         """Outputs and sensitivities of every run at ``theta (l,)``."""
         return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)
 
+    def evaluate(self, theta: Array) -> list[RunPrediction]:
+        """Anchor every run at ``theta (l,)`` and predict it there, by one solve."""
+        work = range(len(self.runs))
+        return thread_map(
+            lambda r: self._by_unknown(r, self.runs[r].evaluate(self.constants(theta[None], r)[0])),
+            work,
+            self.jobs,
+        )
+
     def _predict_run(self, theta: Array, r: int) -> RunPrediction:
-        samples = self.runs[r].predict(self.constants(theta[None], r), derivatives=True)
+        constants = self.constants(theta[None], r)
+        return self._by_unknown(r, self.runs[r].predict(constants, derivatives=True))
+
+    def _by_unknown(self, r: int, samples: Samples) -> RunPrediction:
+        """Derivatives of one run's samples with respect to all unknowns."""
         assert samples.y_p is not None
         _, ny, _, count = samples.y_p.shape
-        sensitivity = np.zeros((ny, theta.size, count))
+        sensitivity = np.zeros((ny, len(self.layout.names), count))
         sensitivity[:, self.layout.columns[r]] = samples.y_p[0]
         return RunPrediction(samples.y[0], sensitivity, Status(int(samples.status[0])))
 

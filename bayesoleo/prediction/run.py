@@ -266,18 +266,41 @@ class RunPredictor:
 
     def predict(self, p: Array, *, derivatives: bool = False) -> Samples:
         """Outputs at the raw samples for constants ``p (L, np)``."""
+        if not self.kernels.derived.dofs:
+            status = np.zeros(p.shape[0], dtype=np.int64)
+            return self._at_samples(p, None, None, status, derivatives)
+        solution = self.solve(p)
+        x_p: Array | None = None
+        if derivatives:
+            solution, x_p, _ = sensitivities(self.boundary, p, solution)
+        return self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+
+    def evaluate(self, p: Array) -> Samples:
+        """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it.
+
+        One solve does for both, where :meth:`predict` would repeat it.
+        """
+        status = np.array([self.set_anchor(p)], dtype=np.int64)
+        if not self.kernels.derived.dofs:
+            return self._at_samples(p[None], None, None, status, derivatives=True)
+        if self.anchor is None or status[0] != Status.CONVERGED.value:
+            shape = (1, len(self.kernels.derived.outputs), len(self.active), self.record.time.size)
+            return Samples(np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan), status)
+        x_p = np.moveaxis(self.anchor.x_p, 0, 2)[None]
+        return self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
+
+    def _at_samples(
+        self,
+        p: Array,
+        x: Array | None,
+        x_p: Array | None,
+        status: NDArray[np.int64],
+        derivatives: bool,
+    ) -> Samples:
+        """Outputs of solutions ``x (L, n, w)`` with their derivatives ``x_p (L, n, w, na)``."""
         derived, count = self.kernels.derived, p.shape[0]
         samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
-        x_p: Array | None = None
-        if derived.dofs:
-            solution = self.solve(p)
-            if derivatives:
-                solution, x_p, _ = sensitivities(self.boundary, p, solution)
-            status = solution.status
-            z = self._rows_at_samples(solution.x[..., None], p)[:, :, 0]
-        else:
-            status = np.zeros(count, dtype=np.int64)
-            z = self._rows_at_samples(None, p)[:, :, 0]
+        z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
         lanes = np.flatnonzero(status == Status.CONVERGED.value)
         y = np.full((count, ny, samples), np.nan)
         with np.errstate(all="ignore"):

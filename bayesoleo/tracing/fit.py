@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 #: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior
 #: standard deviations.
 LARGEST_SHIFT = 0.1
+#: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
+#: iterations gain a digit each, and what is below no figure shows.
+RESOLUTION = 1e-3
 #: Steps for each harmonic of the inputs, and limits.
 STEPS_PER_HARMONIC = 4
 FEWEST_STEPS, MOST_STEPS = 128, 8192
@@ -166,7 +169,13 @@ def fit_model(
         say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
         mbe = _robust_estimate(problem, start, tolerance, max_iterations)
         say("posterior mode")
-        point = polish(problem, mbe, tolerance=tolerance, max_iterations=max_iterations)
+        point = polish(
+            problem,
+            mbe,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            resolution=RESOLUTION,
+        )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         shift = _mesh_shift(problem, point, predictions, numerics) if model.dofs else 0.0
@@ -191,6 +200,7 @@ def _robust_estimate(
         start=begin[free],
         tolerance=tolerance,
         max_iterations=max_iterations,
+        resolution=RESOLUTION,
     )
     if not held:
         return point
