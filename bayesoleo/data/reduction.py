@@ -20,6 +20,7 @@ from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.errors import CampaignError
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.smoothing import smooth_signal
 
 Array = NDArray[np.float64]
 
@@ -187,6 +188,7 @@ def _record(run: Run, time: Array, samples: Mapping[str, Array], **reduced: Any)
 
 
 def _transient(run: Run) -> Record:
+    step = run.time_step
     return _record(
         run,
         run.time,
@@ -196,4 +198,5 @@ def _transient(run: Run) -> Record:
         periods=0,
         harmonics={},
         signal_noise={name: innovation_noise(values) for name, values in run.samples.items()},
+        smoothed={name: smooth_signal(np.array(x), step) for name, x in run.samples.items()},
     )

@@ -1,0 +1,219 @@
+"""Predict one transient run: a start, a mesh chosen once, solutions on it, outputs at samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.model import Model
+from bayesoleo.model.kernels import Kernels
+from bayesoleo.prediction.guess import Motion
+from bayesoleo.prediction.inputs import RowCache, input_rows
+from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.run import Anchor, RunPredictor, Samples
+from bayesoleo.prediction.start import InitialState
+from bayesoleo.solvers.collocation import Collocation
+from bayesoleo.solvers.integrate import halved, integrate, resolving
+from bayesoleo.solvers.mesh import Mesh, equidistant
+from bayesoleo.solvers.periodic import Boundary, Solution
+from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.tableau import tableau
+from bayesoleo.solvers.transient import solve_transient, transient_sensitivities
+
+Array = NDArray[np.float64]
+
+#: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
+WHOLE = 128
+#: Samples of an input that a step spans at least: nothing faster is known of it.
+SAMPLES_A_STEP = 4
+#: Steps of equal length where equations have no explicit form for an integrator to choose by.
+FALLBACK = 512
+
+
+class TransientRun(RunPredictor):
+    """One transient run of one model.
+
+    The mesh is chosen where the run is first anchored and kept from then on, so that all later
+    solutions are functions of their own parameters alone.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    kernels : Kernels
+        Of that model.
+    record : Record
+        A transient run.
+    steps : int
+        Fineness: :data:`WHOLE` is the integrator's own mesh; twice as much halves its steps.
+    scheme_name : str
+        Discretisation by collocation; the thesis's differences have no counterpart here, and the
+        default stands in for them.
+    like : TransientRun, optional
+        The same run under another model, whose mesh and input rows are taken over.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        kernels: Kernels,
+        record: Record,
+        steps: int,
+        scheme_name: str,
+        like: TransientRun | None = None,
+    ):
+        self.model, self.kernels, self.record = model, kernels, record
+        derived = kernels.derived
+        self._check(record)
+        self.method = tableau(DEFAULT_SCHEME if scheme_name == "thesis" else scheme_name)
+        self.period, self.fineness = record.span, steps
+        self.known_rows: RowCache = {} if like is None else like.known_rows
+        self.position = record.position
+        self.sample_inputs = input_rows(
+            record, derived.inputs, self.position, "samples", self.known_rows
+        )
+        self.measured = np.stack([record.samples[name] for name in derived.outputs])
+        self.anchor: Anchor | None = None
+        self.active = np.array(
+            [derived.constants.index(name) for name in derived.active], dtype=np.int64
+        )
+        self.initial = InitialState(model, kernels, record)
+        self.space = StateSpace(
+            kernels, derived.orders, self._inputs, len(derived.active), len(derived.admissible)
+        )
+        #: The mesh as chosen, before it is cut finer; none yet where nobody chose one.
+        self.chosen: Mesh | None = None if like is None else like.chosen
+        self.motions: dict[str, Motion] = {} if like is None else like.known_motions()
+        self._adopt(self.chosen or equidistant(1))
+
+    def _inputs(self, time: Array) -> Array:
+        return input_rows(self.record, self.kernels.derived.inputs, time / self.period)
+
+    def _adopt(self, mesh: Mesh) -> None:
+        """Work on a mesh, cut as fine as asked for."""
+        fine = halved(mesh, max(round(np.log2(self.fineness / WHOLE)), 0))
+        derived = self.kernels.derived
+        self.collocation = Collocation(self.method, derived.orders, fine)
+        self.steps, self.scheme = fine.steps, self.collocation
+        self.points = self.scheme.phases(fine.steps)
+        grid = f"{self.method.name} {hash(fine.edges.tobytes())}"
+        self.boundary = Boundary(
+            equations=self.kernels,
+            scheme=self.scheme,
+            period=self.period,
+            inputs=input_rows(self.record, derived.inputs, self.points, grid, self.known_rows),
+            conditions=len(derived.admissible),
+            active=len(derived.active),
+        )
+        self.plan = (
+            self.collocation.plan(self.position, fine.steps, initial=True) if derived.dofs else None
+        )
+
+    def _choose(self, mesh: Mesh) -> None:
+        """Keep a mesh for good, cut where the inputs change faster than its steps can follow."""
+        shortest = SAMPLES_A_STEP / (self.record.time.size - 1)
+        self.chosen = resolving(
+            mesh, lambda position: self._inputs(position * self.period), self.method, shortest
+        )
+        self._adopt(self.chosen)
+
+    # -- solving ---------------------------------------------------------------------------
+
+    def set_anchor(self, p: Array) -> Status:
+        """Solve at constants ``p (np,)`` and keep the solution as the start of later ones.
+
+        The first call chooses the mesh.
+        """
+        if not self.kernels.derived.dofs:
+            return Status.CONVERGED
+        start = self.initial(p[None])
+        if start.status[0] != Status.CONVERGED.value:
+            return Status(int(start.status[0]))
+        solution = self._first(p, start.state[0]) if self.anchor is None else self.solve(p[None])
+        if isinstance(solution, Status):
+            return solution
+        if solution.status[0] == Status.CONVERGED.value:
+            solution, x_p, _ = transient_sensitivities(
+                self.boundary, p[None], solution, start.by_parameter
+            )
+            if solution.status[0] == Status.CONVERGED.value:
+                moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+                self.anchor = Anchor(p.copy(), solution.x[0], moved)
+        return Status(int(solution.status[0]))
+
+    def _first(self, p: Array, state: Array) -> Solution | Status:
+        """The first solution, on a mesh of its own unless one was taken over."""
+        rows: Motion = lambda position: self._known(position, state)  # noqa: E731
+        if self.chosen is None or not self.motions:
+            found = integrate(self.space, p, state, self.period)
+            if not found.status.ok and found.status is not Status.SINGULAR:
+                return found.status
+            if self.chosen is None:
+                self._choose(found.mesh or equidistant(FALLBACK))
+            if found.states is not None:
+                rows = self._integrated(found.states, p)
+        start = self._unknowns(rows)
+        start[:, 0, : self.scheme.state_size] = state
+        return solve_transient(self.boundary, p[None], start)
+
+    def _unknowns(self, rows: Motion) -> Array:
+        """The scheme's unknowns ``(1, n, w)`` of a motion."""
+        nodes = self.collocation.nodes(self.steps)
+        return self.scheme.from_motion(rows(nodes)[None], rows(self.points)[None])
+
+    def _integrated(self, states: Motion, p: Array) -> Motion:
+        def rows(position: Array) -> Array:
+            time = position * self.period
+            return self.space.complete(time, states(time)[None], p[None])[0][0]
+
+        return rows
+
+    def _known(self, position: Array, state: Array) -> Array:
+        """Rows ``(nz, N)`` of the known motions; what is not known stays as it starts."""
+        derived, first, value = self.kernels.derived, 0, 0
+        rows = np.zeros((len(derived.states), position.size))
+        for dof, order in zip(derived.dofs, derived.orders, strict=True):
+            motion = self.motions[dof](position) if dof in self.motions else None
+            if motion is not None and motion.shape[0] == order + 1:
+                rows[first : first + order + 1] = motion
+            else:
+                rows[first] = state[value]
+            first, value = first + order + 1, value + order
+        return rows
+
+    def solve(self, p: Array) -> Solution:
+        """Solutions for constants ``p (L, np)``, each started from the anchor alone."""
+        if self.anchor is None:
+            shape = (p.shape[0], self.steps, self.scheme.width)
+            failed = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
+            return Solution(np.full(shape, np.nan), failed, np.zeros(p.shape[0], dtype=np.int64))
+        start = self.initial(p)
+        x = self.anchor.predict(p[:, self.active] - self.anchor.p[self.active])
+        x[:, 0, : self.scheme.state_size] = start.state
+        solution = solve_transient(self.boundary, p, x)
+        bad = start.status != Status.CONVERGED.value
+        return Solution(
+            solution.x, np.where(bad, start.status, solution.status), solution.iterations
+        )
+
+    def predict(self, p: Array, *, derivatives: bool = False) -> Samples:
+        """Outputs at the raw samples for constants ``p (L, np)``."""
+        if not self.kernels.derived.dofs:
+            status = np.zeros(p.shape[0], dtype=np.int64)
+            return self._at_samples(p, None, None, status, derivatives)
+        solution = self.solve(p)
+        x_p: Array | None = None
+        if derivatives:
+            start = self.initial(p).by_parameter
+            solution, x_p, _ = transient_sensitivities(self.boundary, p, solution, start)
+        return self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+
+    def _rows_of(self, first: int, last: int, phase: Array) -> Array:
+        assert self.anchor is not None
+        plan = self.collocation.plan(phase, self.steps, initial=True)
+        rows = self.scheme.sample(
+            self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps)
+        )
+        return rows[0, first:last, 0]
