@@ -93,6 +93,8 @@ def _radau_nodes(stages: int) -> Array:
 def tableau(name: str) -> Tableau:
     """A collocation method by name: ``radau2``, ``radau3``, ``gauss2`` or ``gauss3``.
 
+    ``radau5`` is for integration, whose steps can be long.
+
     Raises
     ------
     InputError
@@ -104,7 +106,7 @@ def tableau(name: str) -> Tableau:
     IV.5.
     """
     family, stages = name[:-1], name[-1:]
-    if stages not in ("2", "3") or family not in ("radau", "gauss"):
+    if name != "radau5" and (stages not in ("2", "3") or family not in ("radau", "gauss")):
         raise InputError(
             "unknown scheme", value=name, hint="use radau2, radau3, gauss2, gauss3 or thesis"
         )
