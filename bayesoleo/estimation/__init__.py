@@ -1,8 +1,15 @@
 """Which parameter values fit, and how sure is that, at a point."""
 
+from bayesoleo.estimation.axes import principal_axes
 from bayesoleo.estimation.estimate import estimate, polish
 from bayesoleo.estimation.function_problem import FunctionProblem
 from bayesoleo.estimation.hierarchy import Hierarchy, between_runs
+from bayesoleo.estimation.indifference import indifference
+from bayesoleo.estimation.intervals import (
+    linearised_covariance,
+    linearised_intervals,
+    over_experiments,
+)
 from bayesoleo.estimation.iterate import Iteration
 from bayesoleo.estimation.laplace import mode_covariance
 from bayesoleo.estimation.multistart import Modes, multistart
@@ -18,7 +25,11 @@ from bayesoleo.estimation.objectives import (
 from bayesoleo.estimation.per_run import estimate_each
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Evaluation, Misfit, Problem
+from bayesoleo.estimation.profile import profile
 from bayesoleo.estimation.replicate import Replications, estimate_many
+from bayesoleo.estimation.sampling_distribution import sampling_distribution
+from bayesoleo.estimation.sensitivity import global_sensitivity, local_sensitivity, sobol
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.estimation.steps import METHODS, Step
 from bayesoleo.estimation.table import as_text, to_dataset
 
@@ -34,6 +45,7 @@ __all__ = [
     "PointEstimate",
     "Problem",
     "Replications",
+    "Shown",
     "Step",
     "as_text",
     "between_runs",
@@ -41,13 +53,23 @@ __all__ = [
     "estimate",
     "estimate_each",
     "estimate_many",
+    "global_sensitivity",
+    "indifference",
+    "linearised_covariance",
+    "linearised_intervals",
+    "local_sensitivity",
     "log_likelihood",
     "log_posterior",
     "log_prior",
     "mode_covariance",
     "multistart",
     "output_counts",
+    "over_experiments",
     "polish",
+    "principal_axes",
+    "profile",
+    "sampling_distribution",
+    "sobol",
     "staged_variance",
     "sums_of_squares",
     "to_dataset",

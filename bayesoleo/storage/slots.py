@@ -1,0 +1,88 @@
+"""Numbered pieces of a long calculation on disk: each whole or absent, only missing ones redone.
+
+A piece depends on its own number alone, never on which pieces were made before it, so a calculation
+that was stopped goes on to the same result in any order and with any number of workers.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import ResultsError
+from bayesoleo.storage.atomic import replacing
+
+Arrays = dict[str, NDArray]
+_FINGERPRINT = "fingerprint"
+
+
+class Slots:
+    """A folder with one file a piece.
+
+    Parameters
+    ----------
+    folder : path-like or None
+        Made with the first piece; with None pieces are kept in memory.
+    fingerprint : str
+        Says what the pieces belong to; pieces of something else are refused.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str] | None, fingerprint: str) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.fingerprint = fingerprint
+        self._memory: dict[int, Arrays] = {}
+
+    def path(self, number: int) -> Path | None:
+        """File of a piece; None where pieces are kept in memory."""
+        return None if self.folder is None else self.folder / f"slot-{number:06d}.npz"
+
+    def read(self, number: int) -> Arrays | None:
+        """Arrays of a piece, or None if it has not been made.
+
+        Raises
+        ------
+        ResultsError
+            If the file is damaged or belongs to another calculation.
+        """
+        path = self.path(number)
+        if path is None:
+            return self._memory.get(number)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            found = str(arrays.pop(_FINGERPRINT))
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise ResultsError(
+                "is damaged", file=path, hint="remove it; only this piece is then made again"
+            ) from error
+        if found != self.fingerprint:
+            raise ResultsError(
+                "belongs to another calculation",
+                file=path,
+                hint="choose another folder, or remove this one",
+            )
+        return arrays
+
+    def write(self, number: int, arrays: Mapping[str, NDArray]) -> None:
+        """Keep a piece, as a whole or not at all.
+
+        Raises
+        ------
+        ResultsError
+            If the folder cannot be written to.
+        """
+        path = self.path(number)
+        if path is None:
+            self._memory[number] = dict(arrays)
+            return
+        named: Arrays = {**arrays, _FINGERPRINT: np.array(self.fingerprint)}
+        with replacing(path) as draft:
+            np.savez(draft, **named)  # type: ignore[arg-type]
