@@ -1,0 +1,195 @@
+"""Intervals where the answer is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayesoleo.errors import InputError
+from bayesoleo.estimation import FunctionProblem, estimate, log_posterior, output_counts
+from bayesoleo.estimation.curvature import curvature, prior_precision
+from bayesoleo.estimation.held import Held
+from bayesoleo.estimation.intervals import (
+    linearised_covariance,
+    linearised_intervals,
+    over_experiments,
+)
+from bayesoleo.estimation.profile import profile
+from bayesoleo.model.correlated import JointNormal
+from bayesoleo.model.priors import LogNormal, Normal, Uniform
+
+SIZE = 40
+
+
+@pytest.fixture(scope="module")
+def line():
+    rng = np.random.default_rng(3)
+    design = rng.normal(size=(SIZE, 3)) * [1.0, 1e4, 1e-6]
+    y = design @ [1.0, -2e-4, 3e6] + rng.normal(size=SIZE)
+    priors = [Normal(0.0, 10.0), Normal(0.0, 1e-3), Normal(0.0, 1e7)]
+    problem = FunctionProblem(lambda x, t: x @ t, design, y, priors, ["a", "b", "c"])
+    return problem, design, estimate(problem, tolerance=1e-10)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A decay: nonlinear in its rate, with a residual large enough to count."""
+    rng = np.random.default_rng(4)
+    x = np.linspace(0.0, 3.0, 25)
+    y = 2.0 * np.exp(-1.5 * x) + 0.1 * rng.normal(size=25)
+    priors = [Normal(2.0, 1.0), LogNormal(1.5, 0.5)]
+    problem = FunctionProblem(lambda x, t: t[0] * np.exp(-t[1] * x), x, y, priors, ["size", "rate"])
+    return problem, estimate(problem, tolerance=1e-10), estimate(problem, "be", tolerance=1e-10)
+
+
+def test_propagated_and_posterior_forms_of_a_linear_model(line):
+    problem, design, point = line
+    inverse = np.linalg.inv((design.T @ design) * np.outer(*[design.std(0) ** -1] * 2))
+    inverse *= np.outer(*[design.std(0) ** -1] * 2)
+    for form in ("propagated", "posterior"):
+        covariance = linearised_covariance(problem, point, form, prior=False)
+        np.testing.assert_allclose(covariance[:3, :3], point.variance[0] * inverse, rtol=1e-8)
+    v = point.variance[0]
+    # the variance's own: 2 v^2 / n by curvature; propagation linearises e^2 and so doubles it
+    posterior = linearised_covariance(problem, point, "posterior", prior=False)[3, 3]
+    propagated = linearised_covariance(problem, point, "propagated", prior=False)[3, 3]
+    assert posterior == pytest.approx(2 * v**2 / SIZE)
+    assert propagated == pytest.approx(4 * v**2 / SIZE)
+
+
+def test_curvature_is_the_hessian_of_the_objective(bent):
+    problem, _, mode = bent
+
+    def objective(phi):
+        e = problem.evaluate(phi[:2]).residual[0]
+        counts = output_counts(problem.counts)
+        return log_posterior(np.array([e @ e]), phi[2:], counts, problem.priors, phi[:2])
+
+    phi = np.concatenate((mode.theta, mode.variance))
+    steps = 1e-3 * phi
+    expected = np.empty((3, 3))
+    for i, j in np.ndindex(3, 3):
+        a, b = np.eye(3)[i] * steps, np.eye(3)[j] * steps
+        corners = [objective(phi + p * a + q * b) * p * q for p in (1, -1) for q in (1, -1)]
+        expected[i, j] = -sum(corners) / (4 * steps[i] * steps[j])
+    scale = np.sqrt(np.diag(expected))
+    found = curvature(problem, mode.theta, mode.variance, exact=True)
+    # second differences over a thousandth: 1e-6 of the fourth derivative, about 40 here
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-4
+    )
+    gauss_newton = curvature(problem, mode.theta, mode.variance)
+    assert abs(gauss_newton[1, 1] / expected[1, 1] - 1) > 1e-3  # the residual does count here
+
+
+def test_precision_of_a_joint_prior_is_its_inverse_covariance():
+    covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
+    joint = JointNormal.of(["a", "b"], [0.0, 0.0], covariance)
+    priors = [joint.prior("a"), Uniform(0.0, 1.0), joint.prior("b")]
+    found = prior_precision(priors, np.array([0.1, 0.5, 0.2]))
+    np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], np.linalg.inv(covariance))
+    np.testing.assert_array_equal(found[1], 0.0)
+
+
+def test_holding_part_of_a_joint_prior_leaves_the_conditional():
+    joint = JointNormal.of(["a", "b"], [1.0, 2.0], [[4.0, 1.0], [1.0, 2.0]])
+    priors = [joint.prior("a"), joint.prior("b")]
+    problem = FunctionProblem(lambda x, t: x * t[0] + t[1], np.ones(3), np.zeros(3), priors, "ab")
+    (prior,) = Held(problem, np.array([0.0, 4.0]), [1]).priors
+    assert prior.mean == pytest.approx(1.0 + 0.5 * (4.0 - 2.0))
+    assert prior.sd == pytest.approx(np.sqrt(4.0 - 0.5))
+
+
+def test_profile_of_a_linear_model_is_the_closed_form(line):
+    problem, design, point = line
+    found = profile(problem, point)
+    scale = design.std(0)
+    inverse = np.linalg.inv((design / scale).T @ (design / scale)) / np.outer(scale, scale)
+    # the fall is n/2 log(1 + d^2 / (n v c)), since the variance follows
+    reach = stats.chi2.isf(0.05, 1)
+    half = np.sqrt(SIZE * point.variance[0] * np.diag(inverse) * np.expm1(reach / SIZE))
+    np.testing.assert_allclose(found["low"], point.theta - half, rtol=1e-3)
+    np.testing.assert_allclose(found["high"], point.theta + half, rtol=1e-3)
+    one = found.data.isel(parameter=1)
+    away = one["value"].values - point.theta[1]
+    fall = 0.5 * SIZE * np.log1p(away**2 / (SIZE * point.variance[0] * inverse[1, 1]))
+    known = np.isfinite(away)
+    np.testing.assert_allclose(one["fall"].values[known], fall[known], atol=1e-6)
+    assert known.sum() >= 7
+
+
+def test_profile_tells_what_linearisation_does_not(bent):
+    problem, point, mode = bent
+    found = profile(problem, point, ["rate"])
+    low, high = float(found["low"][0]), float(found["high"][0])
+    rate = point["rate"]
+    assert high - rate > 1.02 * (rate - low)  # skewed upwards
+    # an independent answer: the least sum of squares over the other unknown is linear
+    x, y = problem._x, problem._y
+    for end in (low, high):
+        shape = np.exp(-end * x)
+        rest = y - shape * (shape @ y) / (shape @ shape)
+        fall = 0.5 * y.size * np.log(rest @ rest / (y.size * point.variance[0]))
+        assert 2 * fall == pytest.approx(stats.chi2.isf(0.05, 1), rel=5e-3)
+    tighter = profile(problem, mode, ["rate"])
+    assert tighter.data.attrs["kind"] == "posterior"
+    assert float(tighter["high"][0] - tighter["low"][0]) < high - low
+
+
+def test_side_without_limit_is_open():
+    """Beyond a slope of 50 all steps look alike at these samples."""
+    x = np.linspace(-1.0, 1.0, 20)
+    y = np.sign(x) + 0.05 * np.random.default_rng(0).normal(size=20)
+    problem = FunctionProblem(lambda x, t: np.tanh(t[0] * x), x, y, [Normal(30.0, 20.0)], ["slope"])
+    point = estimate(problem, "be")
+    found = profile(problem, point, kind="likelihood")
+    assert np.isfinite(found["low"][0])
+    assert np.isinf(found["high"][0])
+    assert "open" in str(found)
+
+
+def test_intervals_over_experiments_are_student_t():
+    rng = np.random.default_rng(9)
+    table = rng.normal([3.0, -1.0], [0.5, 2.0], size=(14, 2))
+    found = over_experiments(table, ["a", "b"])
+    for k in range(2):
+        expected = stats.ttest_1samp(table[:, k], 0.0).confidence_interval(0.95)
+        assert float(found["low"][k]) == pytest.approx(expected.low)
+        assert float(found["high"][k]) == pytest.approx(expected.high)
+    wide = over_experiments(table, of="experiment", distribution="normal")
+    half = stats.norm.isf(0.025) * table.std(axis=0, ddof=1) * np.sqrt(1 + 1 / 14)
+    np.testing.assert_allclose(wide["high"] - wide["estimate"], half)
+    np.testing.assert_allclose(wide["covariance"], np.cov(table.T))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(("of", "target"), [("mean", 0.0), ("experiment", None)])
+def test_student_intervals_cover_as_often_as_they_say(of, target):
+    rng = np.random.default_rng(11)
+    hits = 0
+    for _ in range(2000):
+        table = rng.normal(size=(6, 1))
+        found = over_experiments(table, of=of).data
+        value = rng.normal() if target is None else target
+        hits += float(found["low"][0]) <= value <= float(found["high"][0])
+    assert hits / 2000 == pytest.approx(0.95, abs=3.5 * np.sqrt(0.95 * 0.05 / 2000))
+
+
+def test_failed_estimates_are_left_out_and_counted(bent):
+    problem, point, _ = bent
+    lost = estimate(problem, max_iterations=1)
+    found = over_experiments([point, point, lost])
+    assert (found.data.attrs["experiments"], found.data.attrs["failed"]) == (2, 1)
+
+
+def test_bad_requests_are_named(bent):
+    problem, point, _ = bent
+    with pytest.raises(InputError, match="two experiments or more"):
+        over_experiments(np.ones((1, 2)))
+    with pytest.raises(InputError, match="level must lie between 0 and 1"):
+        linearised_intervals(problem, point, level=95)
+    with pytest.raises(InputError, match="use 'propagated' or 'posterior'"):
+        linearised_intervals(problem, point, "sandwich")
+    with pytest.raises(InputError, match="use size, rate"):
+        profile(problem, point, ["speed"])
