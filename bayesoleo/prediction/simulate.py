@@ -242,7 +242,7 @@ def _clean_samples(
     model: Model, plan: RunPlan, values: Mapping[str, float], steps: int, scheme: str, backend: str
 ) -> dict[str, Array]:
     """All channels without noise, inputs first."""
-    record = _record(model, plan)
+    record = record_of(model, plan)
     inputs = {name: record.samples[name] for name in model.inputs}
     run = RunPredictor(model, kernels(model, model.estimated(), backend), record, steps, scheme)
     p = run.base_constants()
@@ -261,7 +261,7 @@ def _clean_samples(
     return inputs | dict(zip(run.kernels.derived.outputs, answer.y[0], strict=True))
 
 
-def _record(model: Model, plan: RunPlan) -> Record:
+def record_of(model: Model, plan: RunPlan) -> Record:
     """A record of the inputs alone, as a predictor takes it; phase counts from its first sample."""
     time = plan.time
     turned = {name: _turned(plan.inputs[name], plan.phase) for name in model.inputs}

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 LOOSE = 1e-3
 #: A pass's tolerance over the residual of the one before: its noise must not hide progress.
 FOLLOW = 1e-2
+#: Residual that a pass's own error makes, over its tolerance: less need not fall.
+NOISE = 30.0
 #: A correction this small, over the sizes of the states, leaves its square.
 LAST_CORRECTION = 1e-7
 #: From a correction this small on steps are kept.
@@ -172,8 +174,9 @@ class _Shooter:
                 if shot is not None:
                     return shot
             residual = self.residual(path)
+            ceiling = max(residual, NOISE * tolerance)
             tolerance = max(self.tolerance, min(tolerance, FOLLOW * residual))
-            following = self.advance(path, step, residual, tolerance)
+            following = self.advance(path, step, ceiling, tolerance)
             if following is None:
                 return self.failed(path, Status.NO_CONVERGENCE)
             path = following
@@ -209,15 +212,13 @@ class _Shooter:
         return step * path.scale, float(np.max(np.abs(step)))
 
     def advance(
-        self, path: Trajectory, step: Array, residual: float, tolerance: float
+        self, path: Trajectory, step: Array, ceiling: float, tolerance: float
     ) -> Trajectory | None:
-        """Take a Newton step, halved until the motion exists and the residual falls."""
+        """Take a Newton step, halved until the motion exists and its residual is low enough."""
         self.iterations += 1
         for _ in range(MAXIMUM_HALVINGS):
             trial = self.adaptive(path.states[0] + step, tolerance)
-            if trial.status.ok and self.residual(trial) < residual:
-                return trial
-            if residual < 10 * self.tolerance and trial.status.ok:
+            if trial.status.ok and self.residual(trial) < ceiling:
                 return trial
             step = step / 2
             self.halvings += 1
