@@ -1,0 +1,34 @@
+"""How good an estimate is, by what it leaves and by what it foresees."""
+
+from bayesoleo.assessment.assess import assess, assessment_text
+from bayesoleo.assessment.residual_tests import (
+    autocorrelation,
+    dependence,
+    lack_of_fit,
+    memory,
+    normality,
+    outliers,
+    runs_of_signs,
+    same_phase,
+)
+from bayesoleo.assessment.scores import Score, score_draws, score_normal
+from bayesoleo.assessment.series import Series, series_of_problem, series_of_tree
+
+__all__ = [
+    "Score",
+    "Series",
+    "assess",
+    "assessment_text",
+    "autocorrelation",
+    "dependence",
+    "lack_of_fit",
+    "memory",
+    "normality",
+    "outliers",
+    "runs_of_signs",
+    "same_phase",
+    "score_draws",
+    "score_normal",
+    "series_of_problem",
+    "series_of_tree",
+]

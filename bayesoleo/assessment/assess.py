@@ -1,0 +1,351 @@
+"""Assess an estimate by what it leaves: every test of section 2.4, as numbers by output and run.
+
+References
+----------
+Verbeek (1993), section 2.4; Bard (1974), chapter 7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from bayesoleo import schema
+from bayesoleo.assessment import residual_tests as tests
+from bayesoleo.assessment.series import Array, Series, series_of_problem, series_of_tree
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.point import PointEstimate
+from bayesoleo.estimation.problem import Problem
+from bayesoleo.estimation.shown import Shown, columns
+
+#: Outliers listed of each series, the farthest.
+LISTED = 5
+#: Lags of a correlogram over one period, and periods that it spans.
+LAGS, CYCLES = 40, 2
+#: A test is marked where its probability, times the number of series, is below this.
+MARKED = 0.01
+_MOST_ROUNDS = 20
+
+_NUMBERS = {
+    "rms": "root mean square",
+    "mean": "mean",
+    "runs_z": "test on runs of signs",
+    "runs_p": "its probability",
+    "skewness": "skewness",
+    "kurtosis": "excess kurtosis",
+    "normality": "test of normality, chi-square with two degrees of freedom",
+    "normality_p": "its probability",
+    "memory": "samples that hold the information of one, of what does not repeat",
+    "same_phase": "correlation of the same phase in different periods",
+    "lack_of_fit": "mean square that repeats over that of its noise",
+    "lack_of_fit_p": "its probability",
+    "ratio_to_noise": "root of the lack of fit",
+    "outliers": "number of outliers",
+    "outlier_limit": "robust standard deviations beyond which a sample is one",
+}
+_IN_UNIT = ("rms", "mean")
+
+
+def assess(
+    subject: Problem | xr.DataTree,
+    point: PointEstimate | ArrayLike | None = None,
+    *,
+    stage: str | None = None,
+) -> Shown:
+    """Test the residuals of an estimate.
+
+    Parameters
+    ----------
+    subject : Problem or DataTree
+        What was fitted, or the result of ``close`` or ``trace``.
+    point : PointEstimate or array_like, shape (l,), optional
+        The estimate; not needed for a result.
+    stage : {"before", "after"}, optional
+        Of a result: the model as declared or as extended; by default the latter.
+
+    Returns
+    -------
+    Shown
+        The group ``assessment``. By ``(output, run)``: ``rms``, ``mean``; ``runs_z``, the test on
+        runs of signs; ``skewness``, ``kurtosis``, ``normality``; ``memory``, ``same_phase``;
+        ``lack_of_fit`` (pure error between periods), ``ratio_to_noise``; ``outliers``, each with
+        its probability ``_p`` where it has one. ``share`` and ``share_p`` ``(output, run,
+        variable)``: the part of the residual's variance that a variable explains.
+        ``outlier_time``, ``outlier_score`` ``(output, run, rank)``. ``correlogram`` and
+        ``noise_correlogram`` ``(output, run, lag)`` over two periods. ``share_of_runs``,
+        ``share_of_runs_p``, ``share_of_groups``, ``share_of_groups_p`` ``(output)``: do mean
+        residuals differ between runs and between groups.
+
+    Raises
+    ------
+    InputError
+        If the estimate is missing, or the problem cannot be evaluated there.
+    """
+    if isinstance(subject, xr.DataTree):
+        series = series_of_tree(subject, stage)
+    elif point is None:
+        raise InputError("the estimate is missing", key="point", hint="pass assess(problem, point)")
+    else:
+        series = series_of_problem(subject, point)
+    data = _dataset(series)
+    return Shown(data, assessment_text(data))
+
+
+def noise_of(series: Series) -> Array:
+    """What does not repeat of a residual: all of it where nothing can, shape (n,)."""
+    average = series.average()
+    if average is None:
+        return series.residual
+    # The average takes a share of the noise with it.
+    loss = 1 - average.number / average.samples
+    return (series.residual - average.values) / np.sqrt(loss)
+
+
+def _numbers(series: Series) -> dict[str, float]:
+    """All single numbers of one series."""
+    noise, average = noise_of(series), series.average()
+    signs = tests.runs_of_signs(series.residual)
+    skewness, kurtosis, normal = tests.normality(series.residual)
+    places, _, limit = outliers_of(series)
+    found = {
+        "rms": float(np.sqrt(np.mean(series.residual**2))),
+        "mean": float(series.residual.mean()),
+        "runs_z": signs.statistic,
+        "runs_p": signs.p_value,
+        "skewness": skewness,
+        "kurtosis": kurtosis,
+        "normality": normal.statistic,
+        "normality_p": normal.p_value,
+        "memory": tests.memory(noise),
+        "outliers": float(places.size),
+        "outlier_limit": limit,
+    }
+    missing = dict.fromkeys(
+        ("same_phase", "lack_of_fit", "lack_of_fit_p", "ratio_to_noise"), np.nan
+    )
+    if average is None:
+        return found | missing
+    size = average.repeating, average.sigma, average.samples, average.number
+    fit = tests.lack_of_fit(*size, series.input_noise)
+    return found | {
+        "same_phase": tests.same_phase(*size),
+        "lack_of_fit": fit.statistic,
+        "lack_of_fit_p": fit.p_value,
+        "ratio_to_noise": float(np.sqrt(fit.statistic)),
+    }
+
+
+def _dataset(series: Sequence[Series]) -> xr.Dataset:
+    outputs = list(dict.fromkeys(one.output for one in series))
+    runs = list(dict.fromkeys(one.run for one in series))
+    names = list(dict.fromkeys(name for one in series for name in one.variables))
+    units = {one.output: one.unit for one in series}
+    grid, shape = (schema.OUTPUT, schema.RUN), (len(outputs), len(runs))
+    tables = {key: np.full(shape, np.nan) for key in _NUMBERS}
+    share, share_p = np.full((2, *shape, len(names)), np.nan)
+    far_time, far_score = np.full((2, *shape, LISTED), np.nan)
+    lags = CYCLES * LAGS + 1
+    whole, noise = np.full((2, *shape, lags), np.nan)
+    for one in series:
+        at = outputs.index(one.output), runs.index(one.run)
+        for key, value in _numbers(one).items():
+            tables[key][at] = value
+        share[at], share_p[at] = _shares(one, names)
+        far_time[at], far_score[at] = _farthest(one)
+        whole[at], noise[at] = correlograms(one)
+    across = [_between(series, output) for output in outputs]
+    data = xr.Dataset(
+        {
+            **{
+                key: _variable(
+                    grid, table, _NUMBERS[key], "output's SI unit" if key in _IN_UNIT else "1"
+                )
+                for key, table in tables.items()
+            },
+            "share": _variable((*grid, "variable"), share, "part of the variance explained", "1"),
+            "share_p": _variable((*grid, "variable"), share_p, "its probability", "1"),
+            "outlier_time": _variable((*grid, "rank"), far_time, "time of the outlier", "s"),
+            "outlier_score": _variable(
+                (*grid, "rank"), far_score, "distance of the outlier in robust sd", "1"
+            ),
+            "correlogram": _variable((*grid, "lag"), whole, "autocorrelation of the residual", "1"),
+            "noise_correlogram": _variable(
+                (*grid, "lag"), noise, "autocorrelation of what does not repeat", "1"
+            ),
+            **{
+                key: _variable((schema.OUTPUT,), np.array([row[key] for row in across]), text, "1")
+                for key, text in _ACROSS.items()
+            },
+            schema.UNIT: ((schema.OUTPUT,), np.array([units[o] for o in outputs], dtype=object)),
+        },
+        coords={
+            schema.OUTPUT: outputs,
+            schema.RUN: runs,
+            "variable": names,
+            "lag": ("lag", np.arange(lags) / LAGS, {schema.UNITS: "cycle"}),
+        },
+    )
+    periodic = {one.run: one.periodic for one in series}
+    data.attrs = {"series": len(series), "periodic": int(all(periodic.values()))}
+    return data
+
+
+_ACROSS = {
+    "share_of_runs": "part of the variance that differs from run to run",
+    "share_of_runs_p": "its probability",
+    "share_of_groups": "part of the variance of run means that differs from group to group",
+    "share_of_groups_p": "its probability",
+}
+
+
+def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+
+
+def _shares(series: Series, names: Sequence[str]) -> tuple[Array, Array]:
+    """How much each variable explains, and its probability."""
+    # Where nothing repeats, noise and the model's error cannot be told apart: noise is then taken
+    # as white.
+    effective = tests.memory(noise_of(series)) if series.periodic else 1.0
+    share, p_value = np.full((2, len(names)), np.nan)
+    for k, name in enumerate(names):
+        if name in series.variables:
+            # Bins of time shorter than a period would show the dependence on phase.
+            whole = name == schema.TIME and series.periodic
+            bins = max(2, series.residual.size // series.period) if whole else tests.BINS
+            found = tests.dependence(series.residual, series.variables[name], effective, bins)
+            share[k], p_value[k] = found.share, found.outcome.p_value
+    return share, p_value
+
+
+def outliers_of(series: Series) -> tuple[NDArray[np.int64], Array, float]:
+    """Places and scores of outliers, the farthest first, and the score from which one counts.
+
+    An outlier pulls on the average over periods, and so on all samples of its phase; the farthest
+    are taken out before the others are looked at.
+    """
+    found: dict[int, float] = {}
+    cleaned, limit = series, np.nan
+    for _ in range(_MOST_ROUNDS):
+        noise, average = noise_of(cleaned), cleaned.average()
+        scores, places, limit = tests.outliers(noise)
+        if places.size == 0:
+            break
+        near = np.abs(scores[places]) >= 0.5 * abs(scores[places[0]])
+        first = places if average is None else places[near]
+        found |= {int(k): float(scores[k]) for k in first if int(k) not in found}
+        if average is None:
+            break
+        residual = cleaned.residual.copy()
+        # What the other periods say of this phase: the sample's own leverage is removed.
+        kept = 1 - average.number / average.samples
+        residual[first] = residual[first] - noise[first] / np.sqrt(kept)
+        cleaned = replace(series, residual=residual)
+    order = sorted(found, key=lambda k: -abs(found[k]))
+    return np.array(order, dtype=np.int64), np.array([found[k] for k in order]), float(limit)
+
+
+def _farthest(series: Series) -> tuple[Array, Array]:
+    """Times and scores of the farthest outliers, padded with NaN."""
+    places, scores, _ = outliers_of(series)
+    listed = places[:LISTED]
+    time, score = np.full((2, LISTED), np.nan)
+    time[: listed.size] = listed * series.time_step
+    score[: listed.size] = scores[:LISTED]
+    return time, score
+
+
+def correlograms(series: Series) -> tuple[Array, Array]:
+    """Autocorrelation of the residual and of what does not repeat, at ``LAGS`` lags a period."""
+    steps = np.arange(CYCLES * LAGS + 1) / LAGS
+    unit = series.period if series.periodic else max(series.residual.size // (4 * CYCLES), 1)
+    lags = np.round(steps * unit).astype(int)
+    lags = lags[lags < series.residual.size - 2]
+    found = np.full((2, steps.size), np.nan)
+    for row, values in zip(found, (series.residual, noise_of(series)), strict=True):
+        row[: lags.size] = tests.autocorrelation(values, int(lags[-1]))[lags]
+    return found[0], found[1]
+
+
+def _between(series: Sequence[Series], output: str) -> dict[str, float]:
+    """Do mean residuals differ from run to run, and run means from group to group."""
+    chosen = [one for one in series if one.output == output]
+    found = dict.fromkeys(_ACROSS, np.nan)
+    if len(chosen) < 2:
+        return found
+    means = np.array([one.residual.mean() for one in chosen])
+    effective = np.array([one.residual.size / tests.memory(noise_of(one)) for one in chosen])
+    noise = np.array([float(np.var(noise_of(one))) for one in chosen])
+    whole = np.concatenate([one.residual for one in chosen])
+    sizes = np.array([one.residual.size for one in chosen])
+    found["share_of_runs"] = float(
+        np.sum(sizes * (means - whole.mean()) ** 2) / np.sum((whole - whole.mean()) ** 2)
+    )
+    # Means with errors of their own: chi-square about their weighted mean.
+    weight = effective / np.maximum(noise, np.finfo(float).tiny)
+    centre = float(np.sum(weight * means) / weight.sum())
+    chi_square = float(np.sum(weight * (means - centre) ** 2))
+    found["share_of_runs_p"] = float(stats.chi2.sf(chi_square, len(chosen) - 1))
+    groups = [[m for m, one in zip(means, chosen, strict=True) if one.group == g] for g in
+              dict.fromkeys(one.group for one in chosen)]  # fmt: skip
+    if len(groups) > 1 and len(chosen) > len(groups):
+        total = float(np.sum((means - means.mean()) ** 2))
+        inside = float(sum(np.sum((np.array(g) - np.mean(g)) ** 2) for g in groups))
+        found["share_of_groups"] = 1 - inside / total
+        free = len(chosen) - len(groups)
+        ratio = (total - inside) / (len(groups) - 1) / max(inside / free, np.finfo(float).tiny)
+        found["share_of_groups_p"] = float(stats.f.sf(ratio, len(groups) - 1, free))
+    return found
+
+
+def assessment_text(data: xr.Dataset) -> str:
+    """One line a series; a star marks what chance alone hardly gives."""
+    head = ["output", "run", "rms", "runs z", "skew", "kurt.", "memory", "same phase"]
+    head += ["over noise", "outliers", "depends on"]
+    rows = []
+    for output in data[schema.OUTPUT].values:
+        for run in data[schema.RUN].values:
+            one = data.sel(output=output, run=run)
+            if np.isfinite(float(one["rms"])):
+                rows.append([str(output), str(run), *_cells(one, data.attrs["series"])])
+    end = f"* less than {MARKED:g} by chance, over all {data.attrs['series']} series together"
+    lines = [columns(head, rows), end]
+    for output in data[schema.OUTPUT].values:
+        one = data.sel(output=output)
+        for key, words in (("runs", "from run to run"), ("groups", "from group to group")):
+            p_value = float(one[f"share_of_{key}_p"])
+            if p_value < MARKED:
+                part = 100 * float(one[f"share_of_{key}"])
+                what = "the residual's variance" if key == "runs" else "that of run means"
+                lines.append(f"{output}: means differ {words} ({part:.2g} % of {what})")
+    return "\n".join(lines)
+
+
+def _cells(one: xr.Dataset, series: int) -> list[str]:
+    def marked(text: str, p_value: float) -> str:
+        return text + ("*" if p_value * series < MARKED else " ")
+
+    number = {str(key): float(one[key]) for key in _NUMBERS}
+    share, p_value = one["share"].values, one["share_p"].values
+    best = "–"
+    sure = np.flatnonzero(p_value * series * share.size < MARKED)
+    if sure.size:
+        k = int(sure[np.argmax(share[sure])])
+        best = f"{one['variable'].values[k]} ({100 * share[k]:.2g} %)"
+    ratio = number["ratio_to_noise"]
+    return [
+        f"{number['rms']:.3g}",
+        marked(f"{number['runs_z']:.1f}", number["runs_p"]),
+        f"{number['skewness']:.2f}",
+        marked(f"{number['kurtosis']:.2f}", number["normality_p"]),
+        f"{number['memory']:.1f}",
+        f"{number['same_phase']:.2f}" if np.isfinite(number["same_phase"]) else "–",
+        marked(f"{ratio:.2f}", number["lack_of_fit_p"]) if np.isfinite(ratio) else "–",
+        f"{number['outliers']:.0f}",
+        best,
+    ]

@@ -1,0 +1,251 @@
+"""The tests, each a pure function of a residual: a statistic and the probability of as much by
+chance.
+
+Samples follow each other faster than the model's error or the noise changes, so that thousands of
+them may hold the information of dozens. Where a test's distribution depends on it, the memory of
+the residual is measured and taken into account.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, stats
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A test's statistic and the probability of one as extreme if nothing is wrong."""
+
+    statistic: float
+    p_value: float
+
+
+#: Bins of a variable at most.
+BINS = 24
+NOTHING = Outcome(float("nan"), float("nan"))
+
+
+def runs_of_signs(residual: Array) -> Outcome:
+    """Test on runs of signs (Bard 1974, section 7.9; Wald and Wolfowitz 1940).
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        In the order of time, or of any variable.
+
+    Returns
+    -------
+    Outcome
+        Standard normal where signs come in random order; negative where they cluster, as they do
+        where the model misses something. Two-sided.
+    """
+    signs = np.sign(residual[residual != 0])
+    above = int((signs > 0).sum())
+    below = signs.size - above
+    if signs.size < 10:
+        return NOTHING
+    if min(above, below) == 0:  # as many of each were to be expected, and one run came
+        z = -np.sqrt(signs.size - 1)
+        return Outcome(float(z), float(2 * stats.norm.sf(-z)))
+    runs = 1 + int((np.diff(signs) != 0).sum())
+    mean = 1 + 2 * above * below / signs.size
+    variance = (mean - 1) * (mean - 2) / (signs.size - 1)
+    if variance <= 0:
+        return NOTHING
+    z = (runs - mean) / np.sqrt(variance)
+    return Outcome(float(z), float(2 * stats.norm.sf(abs(z))))
+
+
+def autocorrelation(values: Array, lags: int) -> Array:
+    """Autocorrelation about the mean at lags ``0 .. lags``, each over its own overlap.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+    lags : int
+        Below ``n``.
+
+    Returns
+    -------
+    ndarray, shape (lags + 1,)
+    """
+    centred = values - values.mean()
+    length = fft.next_fast_len(2 * values.size)
+    sums = fft.irfft(np.abs(fft.rfft(centred, length)) ** 2, length)[: lags + 1]
+    overlap = values.size - np.arange(lags + 1)
+    return sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny)
+
+
+def memory(values: Array) -> float:
+    """Samples that hold the information of one: the integrated autocorrelation time, at least one.
+
+    Summed over a window of five times itself (Sokal 1997).
+    """
+    if values.size < 20:
+        return 1.0
+    rho = autocorrelation(values, values.size // 4)
+    total = 1.0 + 2.0 * np.cumsum(rho[1:])
+    window = np.arange(1, rho.size) >= 5.0 * np.maximum(total, 1.0)
+    end = int(np.argmax(window)) if window.any() else total.size - 1
+    return float(max(total[end], 1.0))
+
+
+def normality(residual: Array) -> tuple[float, float, Outcome]:
+    """Skewness, excess kurtosis, and whether they may be those of a normal process.
+
+    The test of Lobato and Velasco (2004): that of Jarque and Bera with variances of the moments
+    that the autocorrelation ``rho`` implies, ``6 sum rho**3`` and ``24 sum rho**4``.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+
+    Returns
+    -------
+    skewness, kurtosis : float
+    Outcome
+        Chi-square with two degrees of freedom.
+    """
+    n = residual.size
+    skewness, kurtosis = float(stats.skew(residual)), float(stats.kurtosis(residual))
+    if n < 20 or not np.isfinite(skewness):
+        return skewness, kurtosis, NOTHING
+    rho = autocorrelation(residual, n - 1)
+    rho = rho * (n - np.arange(n)) / n  # the biased estimate, whose sums converge
+    third = 1 + 2 * float(np.sum(rho[1:] ** 3))
+    fourth = 1 + 2 * float(np.sum(rho[1:] ** 4))
+    statistic = n * (skewness**2 / (6 * max(third, 1e-3)) + kurtosis**2 / (24 * fourth))
+    return skewness, kurtosis, Outcome(statistic, float(stats.chi2.sf(statistic, 2)))
+
+
+def same_phase(repeating: float, sigma: float, samples: int, number: int) -> float:
+    """Correlation of residuals of the same phase in different periods.
+
+    The intraclass correlation: the part of the variance that repeats. Where a model's error repeats
+    with the motion, more periods do not make residuals independent.
+
+    Parameters
+    ----------
+    repeating, sigma : float
+        Root mean square of the average over periods, and standard deviation about it.
+    samples, number : int
+        Of the record, and of the coefficients of the average.
+    """
+    # The average contains its own share of the noise.
+    signal = repeating**2 - sigma**2 * number / samples
+    return float(np.clip(signal / (signal + sigma**2), -1.0, 1.0)) if sigma > 0 else 1.0
+
+
+def lack_of_fit(
+    repeating: float, sigma: float, samples: int, number: int, input_noise: float = 0.0
+) -> Outcome:
+    """What repeats of a residual against the noise of that average: pure error between periods.
+
+    Parameters
+    ----------
+    repeating, sigma, samples, number
+        As in :func:`same_phase`.
+    input_noise : float, optional
+        Noise of the inputs in the average; it repeats, and is not the model's.
+
+    Returns
+    -------
+    Outcome
+        Ratio of mean squares, F-distributed with ``number`` and ``samples - number`` degrees of
+        freedom; the root of it is the loop's ratio to the noise.
+    """
+    noise = sigma**2 * number / samples + input_noise**2
+    if noise <= 0:
+        return NOTHING
+    ratio = repeating**2 / noise
+    return Outcome(float(ratio), float(stats.f.sf(ratio, number, samples - number)))
+
+
+def outliers(values: Array, level: float = 0.05) -> tuple[Array, NDArray[np.int64], float]:
+    """Samples too far out for normal noise, by a scale that they cannot inflate.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Noise: what does not repeat.
+    level : float, optional
+        Probability of naming any sample of normal noise.
+
+    Returns
+    -------
+    scores : ndarray, shape (n,)
+        Distance from the median in robust standard deviations.
+    places : ndarray of int
+        Outliers, the farthest first.
+    limit : float
+        Score beyond which a sample is one.
+    """
+    centre = float(np.median(values))
+    # The median absolute deviation of a standard normal is 0.6745.
+    spread = float(np.median(np.abs(values - centre))) / 0.6744897501960817
+    limit = float(stats.norm.isf(level / (2 * values.size)))
+    if spread == 0:
+        return np.zeros(values.size), np.zeros(0, dtype=np.int64), limit
+    scores = (values - centre) / spread
+    far = np.flatnonzero(np.abs(scores) > limit)
+    return scores, far[np.argsort(-np.abs(scores[far]))], limit
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """How a residual depends on a variable.
+
+    Parameters
+    ----------
+    centres, means, errors : ndarray, shape (bins,)
+        Mean of the variable, mean of the residual and its standard error by bin of equally many
+        samples.
+    share : float
+        Part of the residual's variance that the variable explains, beyond what chance does.
+    outcome : Outcome
+        F-test of the bins, samples counted by their memory.
+    """
+
+    centres: Array
+    means: Array
+    errors: Array
+    share: float
+    outcome: Outcome
+
+
+def dependence(residual: Array, variable: Array, effective: float, bins: int = BINS) -> Dependence:
+    """Mean residual by bins of a variable.
+
+    Parameters
+    ----------
+    residual, variable : ndarray, shape (n,)
+    effective : float
+        Samples that hold the information of one, see :func:`memory`.
+    bins : int, optional
+        At most; each holds the information of ten samples or more.
+    """
+    n = residual.size
+    count = int(np.clip(n / (10 * max(effective, 1.0)), 2, bins))
+    parts = np.array_split(np.argsort(variable, kind="stable"), count)
+    centres = np.array([variable[part].mean() for part in parts])
+    means = np.array([residual[part].mean() for part in parts])
+    sizes = np.array([part.size for part in parts])
+    within = float(sum(np.sum((residual[p] - m) ** 2) for p, m in zip(parts, means, strict=True)))
+    between = float(np.sum(sizes * (means - residual.mean()) ** 2))
+    free = n / max(effective, 1.0) - count
+    total = between + within
+    if free <= 0 or total <= 0:
+        return Dependence(centres, means, np.full(count, np.nan), 0.0, NOTHING)
+    # Scatter within bins, of as many independent samples as there are.
+    scatter = within / (n - count * effective) if n > count * effective else within / n
+    errors = np.sqrt(scatter * max(effective, 1.0) / sizes)
+    ratio = between / (count - 1) / max(scatter * max(effective, 1.0), np.finfo(float).tiny)
+    share = max(0.0, 1 - (within / free) / (total / (free + count - 1)))
+    return Dependence(
+        centres, means, errors, share, Outcome(ratio, float(stats.f.sf(ratio, count - 1, free)))
+    )
