@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.solvers import unrolled
 from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 
 Array = NDArray[np.float64]
@@ -45,6 +46,15 @@ class BackwardDifferences:
     def width(self) -> int:
         """Unknowns at a node."""
         return len(self.orders)
+
+    @property
+    def program(self) -> unrolled.Program | None:
+        """Compiled pieces of a Newton step, where there is code for these orders."""
+        return unrolled.differences(self.orders, tuple(FIRST.tolist()), tuple(SECOND.tolist()))
+
+    def lengths(self, n: int, step: float) -> Array:
+        """Length of each step, s, shape (n,)."""
+        return np.full(n, step)
 
     def phases(self, n: int) -> Array:
         """Phases in cycles of the nodes, where the equations hold, shape (n,)."""
@@ -143,7 +153,7 @@ BLOCK = 32
 def _linear(gz, right, lanes, h, orders, first, second, initial, dx, monodromy, ok):
     d, n, k = orders.size, gz.shape[3], right.shape[2]
     D = 3 * d
-    work, scale = np.empty((d, d + D + k, BLOCK)), np.empty((d, BLOCK))
+    work, scale = np.empty((d, d + D + k, BLOCK)), np.empty((2, d, BLOCK))
     transfer = np.zeros((D, D + k, n))
     for i in range(2 * d):
         transfer[d + i, i] = 1.0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import collocation_kernels as kernels
+from bayesoleo.solvers import unrolled
 from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.tableau import Tableau
 
@@ -70,6 +71,11 @@ class Collocation:
         """Order of the error at the nodes."""
         return self.method.order
 
+    @property
+    def program(self) -> unrolled.Program | None:
+        """Compiled pieces of a Newton step, where there is code for these orders."""
+        return unrolled.collocation(self.method, self.orders)
+
     def phases(self, n: int) -> Array:
         """Phases in cycles of the ``N = n s`` points at which equations hold, shape (N,)."""
         if self.mesh is not None:
@@ -88,7 +94,7 @@ class Collocation:
             )
         return self.mesh
 
-    def _lengths(self, n: int, step: float) -> Array:
+    def lengths(self, n: int, step: float) -> Array:
         """Length of each step, s, shape (n,)."""
         return np.full(n, step) if self.mesh is None else step * self._mesh_of(n).relative
 
@@ -118,7 +124,7 @@ class Collocation:
     def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
         method = self.method
-        h = self._lengths(x.shape[1], step)
+        h = self.lengths(x.shape[1], step)
         kernels.rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
 
     def plan(self, phase: Array, n: int, *, initial: bool = False) -> SamplePlan:
@@ -142,9 +148,12 @@ class Collocation:
         if self.mesh is None:
             scaled = inside * n
             index = np.minimum(scaled.astype(np.int64), n - 1)
-            position = scaled - index
-        else:
-            index, position = self._mesh_of(n).locate(inside)
+            return self.plan_in(index, scaled - index)
+        return self.plan_in(*self._mesh_of(n).locate(inside))
+
+    def plan_in(self, index: NDArray[np.int64], position: Array) -> SamplePlan:
+        """Given steps ``(N,)`` and positions in them, from 0 to 1: at an edge, which side to take.
+        """
         w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
         if self.mesh is not None:
             relative = self.mesh.relative[index]
@@ -184,6 +193,7 @@ class Collocation:
         step: float,
         *,
         initial: bool = False,
+        jumps: Array | None = None,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Solve ``G dx = -right`` with the periodic closure.
 
@@ -201,6 +211,8 @@ class Collocation:
             Mean length of a step, s.
         initial : bool
             Hold the first state instead of closing the period.
+        jumps : ndarray, shape (L, D, k, n), optional
+            Added to the state at the end of each step.
 
         Returns
         -------
@@ -213,11 +225,12 @@ class Collocation:
         monodromy = np.zeros((count, self.state_size, self.state_size))
         ok = np.ones(count, dtype=np.bool_)
         present = np.zeros((1, 1, 1)) if x is None else x
+        added = np.zeros((1, 1, 1, 0)) if jumps is None else jumps
         method = self.method
-        h = self._lengths(n, step)
+        h = self.lengths(n, step)
         kernels.linear(
-            gz, right, present, x is not None, lanes, h, method.a, method.a @ method.a, method.b,
-            method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
+            gz, right, present, x is not None, added, lanes, h, method.a, method.a @ method.a,
+            method.b, method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
         )  # fmt: skip
         return dx, monodromy, ok
 

@@ -102,12 +102,14 @@ BLOCK = 32
 
 
 @jit
-def linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok):
+def linear(
+    gz, right, x, newton, jumps, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok
+):  # fmt: skip
     """Eliminate every step's stages, close the period, and recover the stages."""
     d, s = orders.size, b.size
     D, n, k = orders.sum(), dx.shape[1], right.shape[2]
     size = s * d
-    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((size, BLOCK))
+    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((2, size, BLOCK))
     stages = np.empty((size, D + k, n))
     transfer = np.empty((D, D + k, n))
     states = np.empty((D, k, n))
@@ -127,6 +129,8 @@ def linear(gz, right, x, newton, lanes, h, a, aa, b, ba, c, orders, initial, dx,
             _transfer(stages, h, b, ba, orders, transfer)
             if newton:
                 _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
+            if jumps.shape[3] == n:
+                transfer[:, D:] += jumps[lane]
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers import measures
+from bayesoleo.solvers import measures, newton
 from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.unrolled import Program
 
 Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
@@ -25,11 +27,11 @@ class Equations(Protocol):
     """What a solver needs of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
 
     @property
-    def jacobian(self) -> Callable[..., Any]: ...
+    def jacobian(self) -> Any: ...
     @property
     def parameters(self) -> Callable[..., Any]: ...
     @property
-    def admissible(self) -> Callable[..., Any]: ...
+    def admissible(self) -> Any: ...
 
 
 class Scheme(Protocol):
@@ -41,6 +43,9 @@ class Scheme(Protocol):
     def state_size(self) -> int: ...
     @property
     def width(self) -> int: ...
+    @property
+    def program(self) -> Program | None: ...
+    def lengths(self, n: int, step: float) -> Array: ...
     def phases(self, n: int) -> Array: ...
     def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array: ...
     def rows(self, x: Array, lanes: Lanes, step: float, z: Array) -> None: ...
@@ -88,6 +93,18 @@ class Boundary:
     def step(self, n: int) -> float:
         """Length of one of ``n`` steps, s."""
         return self.period / n
+
+    @cached_property
+    def arranged(self) -> newton.Arranged | None:
+        """Inputs as the compiled iteration sweeps them; None where it has no code for the scheme,
+        or the equations are not compiled."""
+        program = self.scheme.program if hasattr(self.equations.jacobian, "pointer") else None
+        if program is None:
+            return None
+        n = self.inputs.shape[1] // program.stages
+        if n < newton.LEAST_STEPS:
+            return None
+        return newton.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
 
 
 @dataclass(frozen=True)
@@ -145,7 +162,40 @@ def solve_periodic(
     ----------
     Verbeek (1993), section 4.3.1.
     """
-    return _Newton(problem, p, start.copy(), max_iterations, monotone).run()
+    if problem.arranged is None:
+        return _Newton(problem, p, start.copy(), max_iterations, monotone).run()
+    solution = _compiled(problem, problem.arranged, p, start, max_iterations, monotone)
+    again = np.flatnonzero(solution.status == newton.NEEDS_EXCHANGE)
+    if again.size:
+        other = _Newton(problem, p[again], start[again].copy(), max_iterations, monotone).run()
+        solution.x[again] = other.x
+        solution.status[again], solution.iterations[again] = other.status, other.iterations
+    return solution
+
+
+def _compiled(
+    problem: Boundary,
+    arranged: newton.Arranged,
+    p: Array,
+    start: Array,
+    max_iterations: int,
+    monotone: bool,
+) -> Solution:
+    """The same iteration, lane by lane, in one compiled call."""
+    x, equations, program = start.copy(), problem.equations, arranged.program
+    status = np.empty(x.shape[0], dtype=np.int64)
+    iterations = np.zeros(x.shape[0], dtype=np.int64)
+    sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
+    pieces = newton.Pieces(
+        equations.jacobian.pointer, equations.admissible.pointer, program.rows, program.measure,
+        program.eliminate, program.chain, program.update,
+    )  # fmt: skip
+    sweep = arranged.sweep
+    newton.solve_lanes(
+        pieces, sizes, sweep, newton.work_space(sizes, sweep),
+        newton.Options(max_iterations, monotone, False), p, x, status, iterations,
+    )  # fmt: skip
+    return Solution(x, status, iterations)
 
 
 class _Newton:

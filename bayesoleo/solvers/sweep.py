@@ -69,9 +69,9 @@ def eliminate(matrix, right, least):
     return True
 
 
-#: A pivot this small against the largest entry of its row asks for the elimination that exchanges
-#: rows.
-SMALL_PIVOT = 1e-3
+#: Part of its digits that a pivot may lose, to cancellation or beside a large multiple of another
+#: row, before the elimination that exchanges rows is asked for.
+SMALL_PIVOT = 1e-4
 
 
 @jit
@@ -80,20 +80,18 @@ def eliminate_together(work, scale, count, m):
     ``[matrix | right]``, systems last.
 
     The right-hand columns become the solutions. Returns False, with ``work`` spoilt, where a pivot
-    is too small for that.
+    is too small for that: against the sizes of what made it, which does not depend on the units of
+    rows and columns. ``scale (2, m, block)`` is work space.
     """
     width = work.shape[1]
     for i in range(m):
         for t in range(count):
-            scale[i, t] = abs(work[i, 0, t])
-        for j in range(1, m):
-            for t in range(count):
-                scale[i, t] = max(scale[i, t], abs(work[i, j, t]))
+            scale[0, i, t] = scale[1, i, t] = abs(work[i, i, t])
     for column in range(m):
         bad = 0
         for t in range(count):
-            pivot = abs(work[column, column, t])
-            bad += not (pivot > SMALL_PIVOT * scale[column, t] and pivot < np.inf)
+            pivot, size = abs(work[column, column, t]), SMALL_PIVOT * scale[1, column, t]
+            bad += not (pivot > size and size <= scale[0, column, t] and pivot < np.inf)
         if bad > 0:
             return False
         for t in range(count):
@@ -101,6 +99,7 @@ def eliminate_together(work, scale, count, m):
         for i in range(column + 1, m):
             for t in range(count):
                 work[i, column, t] *= work[column, column, t]
+                scale[1, i, t] += abs(work[i, column, t] * work[column, i, t])
             for j in range(column + 1, width):
                 for t in range(count):
                     work[i, j, t] -= work[i, column, t] * work[column, j, t]

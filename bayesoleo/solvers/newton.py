@@ -1,0 +1,513 @@
+"""Newton's method on one period, compiled: the same iteration as in ``periodic``, with everything a
+lane needs in the processor's cache.
+
+Models and schemes come as compiled pieces of fixed signature (``bayesoleo.compiled``,
+``bayesoleo.solvers.unrolled``), so this is compiled once. Steps are kept in the order in which
+they are swept: :data:`~bayesoleo.solvers.unrolled.WIDTH` chunks side by side, with as many rows
+before and after them as a scheme looks at; chunks that are a step shorter are filled up with the
+first step of the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.compiled import BLOCK, pointer
+from bayesoleo.solvers.measures import total
+from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.sweep import ROUND_OFF, eliminate, jit
+from bayesoleo.solvers.unrolled import REACH, WIDTH, Program, chunks
+
+Array = NDArray[np.float64]
+Lanes = NDArray[np.int64]
+
+#: A pivot that asks for an exchange of rows, or a recursion that grows so much that its rounding
+#: errors would spoil the closure: neither is a failure of the problem, only of this elimination.
+NEEDS_EXCHANGE = -1
+#: Growth of the recursion over a period beyond which half of the digits are lost.
+LARGEST_GROWTH = 1e8
+
+CONVERGED = Status.CONVERGED.value
+INADMISSIBLE = Status.INADMISSIBLE.value
+NO_CONVERGENCE = Status.NO_CONVERGENCE.value
+SINGULAR = Status.SINGULAR.value
+NOT_FINITE = Status.NOT_FINITE.value
+
+#: Newton's error squares from step to step: with steps of sizes s1, s2 the next is s2 (s2/s1)^2. A
+#: step is the last if what it leaves is, by that, below this part of the solution's size.
+REMAINDER = 1e-12
+#: The same without quadratic contraction (at a kink), where a small step is all there is to see.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+#: Fewer steps than that leave chunks empty.
+LEAST_STEPS = WIDTH
+
+
+class Sizes(NamedTuple):
+    """Numbers that a compiled lane needs; see :class:`~bayesoleo.solvers.unrolled.Program`."""
+
+    steps: int
+    rows: int
+    inputs: int
+    constants: int
+    nz: int
+    d: int
+    conditions: int
+    unknowns: int
+    state: int
+    new: int
+    front: int
+    stages: int
+    block: int
+    transfer: int
+    keep: int
+    measured: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the steps of a period stand while they are swept.
+
+    Parameters
+    ----------
+    place : ndarray of int, shape (n,)
+        Position of each step, in rows of ``WIDTH`` chunks, rows before the first included.
+    source : ndarray of int, shape (positions,)
+        Step that stands at each position; steps stand more than once.
+    lengths : ndarray of int, shape (WIDTH,)
+        Of the chunks.
+    """
+
+    place: NDArray[np.int64]
+    source: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+
+    @staticmethod
+    def of(n: int, front: int, block: int) -> Layout:
+        """Of a period of ``n`` steps in blocks of ``block``, with ``front`` rows before it."""
+        lengths = chunks(n)
+        first = np.concatenate(([0], np.cumsum(lengths)[:-1]))
+        rows = int(lengths[0])
+        whole = -(-rows * WIDTH // block) * block // WIDTH
+        t = np.arange(-front, whole + 1)  # the last block, and what its last row looks at
+        source = (first + t[:, None]) % n
+        place = np.empty(n, dtype=np.int64)
+        for c in range(WIDTH):
+            own = np.arange(lengths[c])
+            place[first[c] + own] = (front + own) * WIDTH + c
+        return Layout(place, source.ravel(), lengths)
+
+
+class Pieces(NamedTuple):
+    """Compiled functions of a model and of a scheme."""
+
+    jacobian: Any
+    admissible: Any
+    rows: Any
+    measure: Any
+    eliminate: Any
+    chain: Any
+    update: Any
+
+
+class Sweep(NamedTuple):
+    """Order of the steps, inputs and lengths of steps, as they are swept."""
+
+    place: Any
+    source: Any
+    lengths: Any
+    order: Any
+    inputs: Any
+    h: Any
+
+
+class Work(NamedTuple):
+    """Arrays of one lane at a time, allocated once."""
+
+    now: Any
+    base: Any
+    dx: Any
+    x_block: Any
+    dx_block: Any
+    z: Any
+    out: Any
+    sums: Any
+    peaks: Any
+    transfer: Any
+    history: Any
+    start: Any
+    measures: Any
+    before: Any
+    constants: Any
+
+
+def work_space(sizes: Sizes, sweep: Sweep) -> Work:
+    """Arrays for lanes of given sizes."""
+    positions, w, D, d = sweep.source.size, sizes.unknowns, sizes.state, sizes.d
+    rows = max(d * (1 + sizes.nz), sizes.conditions)
+    blocks = sweep.inputs.shape[0]
+    length = (blocks * sizes.block // WIDTH + 1) * sizes.new + D
+    history = np.zeros((length, D + 1, WIDTH))
+    history[sweep.order, np.arange(D)] = 1.0  # a chunk's first state, in terms of itself
+    return Work(
+        now=np.empty((w, positions)),
+        base=np.empty((w, positions)),
+        dx=np.zeros((w, positions)),
+        x_block=np.zeros((w, REACH)),
+        dx_block=np.zeros((w, BLOCK)),
+        z=np.zeros((sizes.nz, BLOCK)),
+        out=np.zeros((rows, BLOCK)),
+        sums=np.zeros((2 * d, BLOCK)),
+        peaks=np.empty((3, BLOCK)),
+        transfer=np.zeros((blocks if sizes.keep else 1, sizes.transfer * sizes.block)),
+        history=history,
+        start=np.zeros((D, WIDTH)),
+        measures=np.zeros(2 * d),
+        before=np.zeros(2 * d),
+        constants=np.zeros(max(sizes.constants, 1)),
+    )
+
+
+class Options(NamedTuple):
+    """How the iteration goes; see :func:`bayesoleo.solvers.periodic.solve_periodic`."""
+
+    max_iterations: int
+    monotone: bool
+    initial: bool
+
+
+@jit
+def solve_lanes(pieces, sizes, sweep, work, options, p, x, status, iterations):
+    """Newton's method for every lane of ``x (L, n, w)``, in place; see ``periodic``."""
+    now = work.now
+    for lane in range(x.shape[0]):
+        for k in range(sizes.constants):
+            work.constants[k] = p[lane, k]
+        for k in range(sizes.unknowns):
+            for i in range(sweep.source.size):
+                now[k, i] = x[lane, sweep.source[i], k]
+        status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
+        if status[lane] != NEEDS_EXCHANGE:
+            for m in range(sizes.steps):
+                for k in range(sizes.unknowns):
+                    x[lane, m, k] = now[k, sweep.place[m]]
+
+
+@jit
+def _iterate(pieces, sizes, sweep, work, options):
+    """Newton's method from ``work.now``; returns how it ended and the number of iterations."""
+    outcome = _evaluate(pieces, sizes, sweep, work)
+    if outcome != CONVERGED:
+        return outcome, 0
+    last = np.inf
+    for iteration in range(1, options.max_iterations + 1):
+        outcome = _step(pieces, sizes, sweep, work, options.initial)
+        if outcome != CONVERGED:
+            return outcome, iteration
+        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.peaks)
+        if not size < np.inf:
+            return SINGULAR, iteration
+        ratio = size / last if last < np.inf else 1.0
+        if size < SMALL_STEP or (ratio < 0.1 and size * ratio**2 < REMAINDER):
+            _keep(work.now, work.base)
+            _take(work, 1.0)
+            return CONVERGED, iteration
+        outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
+        if outcome != CONVERGED:
+            return outcome, iteration
+        last = size if fraction == 1.0 else np.inf
+        # A linear problem is solved by its first step.
+        if merit < 1e-14 and iteration > 1:
+            return CONVERGED, iteration
+    return NO_CONVERGENCE, options.max_iterations
+
+
+@jit
+def _advance(pieces, sizes, sweep, work, monotone, size):
+    """Take the step, halved while it is inadmissible or does not reduce the residual; returns how
+    that ended, the fraction taken and the residual's size after it."""
+    _keep(work.now, work.base)
+    _keep(work.measures, work.before)
+    fraction, outcome = 1.0, CONVERGED
+    for _ in range(MAXIMUM_HALVINGS):
+        _take(work, fraction)
+        outcome = _evaluate(pieces, sizes, sweep, work)
+        if outcome == NEEDS_EXCHANGE:
+            return outcome, fraction, np.inf
+        if outcome == CONVERGED:
+            falls, merit = _reduces(work.before, work.measures, sizes.d)
+            # Close to the solution round-off keeps the residual from falling; the step's own size
+            # then decides.
+            if falls or size < 1e-5 or not monotone:
+                return outcome, fraction, merit
+        fraction *= 0.5
+    _keep(work.base, work.now)
+    return (INADMISSIBLE if outcome == INADMISSIBLE else NO_CONVERGENCE), fraction, np.inf
+
+
+@jit
+def _keep(source, target):
+    from_, to = source.reshape(source.size), target.reshape(target.size)
+    for i in range(from_.size):
+        to[i] = from_[i]
+
+
+@jit
+def _take(work, fraction):
+    size = work.now.size
+    base, dx, now = work.base.reshape(size), work.dx.reshape(size), work.now.reshape(size)
+    for i in range(now.size):
+        now[i] = base[i] + fraction * dx[i]
+
+
+@jit
+def _step(pieces, sizes, sweep, work, initial):
+    """The Newton step at all positions, from the recursion of the last evaluation."""
+    outcome = _close(sizes, sweep, work.history, work.start, initial)
+    if outcome == CONVERGED:
+        _update(pieces.update, sizes, sweep, work)
+    return outcome
+
+
+@jit
+def _evaluate(pieces, sizes, sweep, work):
+    """Equations at the present unknowns, and the recursion that solves them linearised."""
+    steps, stages = sizes.block, sizes.stages
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
+    work.sums[:] = 0.0
+    bad, outside = 0, 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        for k in range(sizes.unknowns):
+            for i in range(steps + (sizes.front + 1) * WIDTH):
+                work.x_block[k, i] = work.now[k, b * steps + i]
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        pieces.rows(x, length, z, steps)
+        if sizes.conditions > 0:
+            pieces.admissible(z, inputs, p, out, points)
+            outside += _outside(work.out, sizes, count)
+        pieces.jacobian(z, inputs, p, out, points)
+        if b == u.shape[0] - 1:
+            _silence(sizes, sweep.lengths, b, count, work.z, work.out)
+        pieces.measure(z, out, sums, points)
+        transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
+        bad += pieces.eliminate(out, x, length, transfer, count)
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        pieces.chain(transfer, history, count // WIDTH, WIDTH)
+    if outside > 0:
+        return INADMISSIBLE
+    finite = True
+    for k in range(2 * sizes.d):
+        work.measures[k] = total(work.sums[k]) / (sizes.steps * stages)
+        finite = finite and work.measures[k] < np.inf
+    if not finite:
+        return NOT_FINITE
+    return NEEDS_EXCHANGE if bad > 0 else CONVERGED
+
+
+@jit
+def _outside(a, sizes, count):
+    """How many points break a condition; one that is not a number shows in the equations."""
+    outside = 0
+    for k in range(sizes.conditions):
+        for stage in range(sizes.stages):
+            for i in range(stage * sizes.block, stage * sizes.block + count):
+                outside += a[k, i] <= 0.0
+    return outside
+
+
+@jit
+def _silence(sizes, lengths, b, count, z, out):
+    """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
+
+    They are equations of a step that stands elsewhere, and can be solved; nothing uses the result.
+    """
+    steps = sizes.block
+    begin = (sizes.rows - 1) * WIDTH - b * steps
+    for stage in range(sizes.stages):
+        for i in range(steps):
+            short = begin <= i < begin + WIDTH and lengths[i - begin] < lengths[0]
+            if i >= count or short:
+                for k in range(sizes.d):
+                    out[k, stage * steps + i] = 0.0
+                for k in range(sizes.nz):
+                    z[k, stage * steps + i] = 0.0
+
+
+@jit
+def _close(sizes, sweep, history, start, initial):
+    """First state of every chunk from the closure of the period, or from zero."""
+    D, lengths, order = sizes.state, sweep.lengths, sweep.order
+    product, following = np.zeros((D, D + 1)), np.zeros((D, D + 1))
+    if not initial:
+        for i in range(D):
+            product[i, i] = 1.0
+        for c in range(WIDTH):
+            first = lengths[c] * sizes.new
+            for i in range(D):
+                for k in range(D + 1):
+                    value = history[first + order[i], D, c] if k == D else 0.0
+                    for o in range(D):
+                        value += history[first + order[i], o, c] * product[o, k]
+                    following[i, k] = value
+            product, following = following, product
+        closure, right = np.empty((D, D)), np.empty((D, 1))
+        growth = 0.0
+        for i in range(D):
+            largest, size = 0.0, 1.0
+            for k in range(D):
+                closure[i, k] = (1.0 if i == k else 0.0) - product[i, k]
+                largest = max(largest, abs(closure[i, k]))
+                size += abs(product[i, k])
+            growth = max(growth, size)
+            right[i, 0] = product[i, D]
+            if not largest > ROUND_OFF * size:
+                return SINGULAR
+        if growth > LARGEST_GROWTH:
+            return NEEDS_EXCHANGE
+        if not eliminate(closure, right, ROUND_OFF):
+            return SINGULAR
+        for i in range(D):
+            start[i, 0] = right[i, 0]
+    else:
+        start[:, 0] = 0.0
+    for c in range(WIDTH - 1):
+        first = lengths[c] * sizes.new
+        for i in range(D):
+            value = history[first + order[i], D, c]
+            for o in range(D):
+                value += history[first + order[i], o, c] * start[o, c]
+            start[i, c + 1] = value
+    return CONVERGED
+
+
+@jit
+def _update(update, sizes, sweep, work):
+    """The Newton step block by block, and at positions that repeat a step."""
+    steps, dx = sizes.block, work.dx
+    per_row = sizes.new * (sizes.state + 1) * WIDTH
+    start, to = pointer(work.start, 0), pointer(work.dx_block, 0)
+    for b in range(sweep.inputs.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        update(transfer, history, start, to, count // WIDTH, WIDTH)
+        begin = sizes.front * WIDTH + b * steps
+        for k in range(sizes.unknowns):
+            for i in range(count):
+                dx[k, begin + i] = work.dx_block[k, i]
+    for k in range(sizes.unknowns):
+        for i in range(sizes.front * WIDTH):
+            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
+        for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
+            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
+
+
+@jit
+def _size(x, dx, begin, measured, peaks):
+    """Largest change of a state over its largest value; not finite where one is not.
+
+    Maxima of 64 interleaved parts: what waits for nothing becomes vector instructions.
+    """
+    size = 0.0
+    spoilt, change, largest = peaks[0], peaks[1], peaks[2]
+    spoilt[:] = 0.0
+    for k in range(x.shape[0]):
+        change[:], largest[:] = 0.0, 1e-300
+        for first in range(begin, x.shape[1], BLOCK):
+            for i in range(min(BLOCK, x.shape[1] - first)):
+                step, value = abs(dx[k, first + i]), abs(x[k, first + i])
+                spoilt[i] += step * 0.0
+                change[i] = step if step > change[i] else change[i]
+                largest[i] = value if value > largest[i] else largest[i]
+        if k < measured:
+            size = max(size, change.max() / largest.max())
+    return size if total(spoilt) == 0.0 else np.inf
+
+
+@jit
+def _reduces(before, after, d):
+    """Whether the residual fell, in units of the equations' terms, and its size in them.
+
+    The larger of the terms before and after: terms before alone would be nothing for an equation
+    that a start at rest fulfils, and forbid to leave it.
+    """
+    old = new = 0.0
+    for e in range(d):
+        unit = max(before[d + e], after[d + e]) + 1e-300
+        old += before[e] / unit
+        new += after[e] / unit
+    return np.sqrt(new) < np.sqrt(old), np.sqrt(new)
+
+
+@dataclass(frozen=True)
+class Arranged:
+    """A period's inputs and mesh as they are swept.
+
+    Parameters
+    ----------
+    program : Program
+        The scheme's compiled pieces.
+    layout : Layout
+        Order of the steps.
+    inputs, lengths : ndarray, shapes (b, nu, BLOCK) and (b, BLOCK)
+        Of each block.
+    """
+
+    program: Program
+    layout: Layout
+    inputs: Array
+    lengths: Array
+
+    @staticmethod
+    def of(program: Program, inputs: Array, lengths: Array) -> Arranged:
+        """From inputs ``(nu, n s)`` at the points and lengths ``(n,)`` of the steps, s."""
+        layout = Layout.of(lengths.size, program.front, program.steps)
+        steps, s, nu = program.steps, program.stages, inputs.shape[0]
+        count = -(-int(layout.lengths[0]) * WIDTH // steps)
+        blocks = np.zeros((count, max(nu, 1), BLOCK))
+        of_steps = np.ones((count, BLOCK))
+        for b in range(count):
+            begin = program.front * WIDTH + b * steps
+            chosen = layout.source[begin : begin + steps]
+            of_steps[b, :steps] = lengths[chosen]
+            for stage in range(s):
+                part = slice(stage * steps, (stage + 1) * steps)
+                blocks[b, :nu, part] = inputs[:, chosen * s + stage]
+        return Arranged(program, layout, blocks, of_steps)
+
+    @property
+    def sweep(self) -> Sweep:
+        """The same for compiled code."""
+        layout, order = self.layout, np.array(self.program.order, dtype=np.int64)
+        place, source = layout.place, layout.source
+        return Sweep(place, source, layout.lengths, order, self.inputs, self.lengths)
+
+    def sizes(self, inputs: int, constants: int, conditions: int) -> Sizes:
+        """Sizes for a model with so many inputs, constants and admissibility conditions."""
+        program = self.program
+        d = len(program.orders)
+        return Sizes(
+            steps=self.layout.place.size,
+            rows=int(self.layout.lengths[0]),
+            inputs=inputs,
+            constants=constants,
+            nz=sum(program.orders) + d,
+            d=d,
+            conditions=conditions,
+            unknowns=program.unknowns,
+            state=program.state,
+            new=program.new,
+            front=program.front,
+            stages=program.stages,
+            block=program.steps,
+            transfer=program.transfer,
+            keep=int(program.stages > 1),
+            measured=min(sum(program.orders), program.unknowns),
+        )
