@@ -37,9 +37,10 @@ NO_CONVERGENCE = Status.NO_CONVERGENCE.value
 SINGULAR = Status.SINGULAR.value
 NOT_FINITE = Status.NOT_FINITE.value
 
-#: Newton's error squares from step to step: with steps of sizes s1, s2 the next is s2 (s2/s1)^2. A
-#: step is the last if what it leaves is, by that, below this part of the solution's size.
-REMAINDER = 1e-12
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step from
+#: the last two is safe.
+LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
@@ -212,7 +213,7 @@ def _iterate(pieces, sizes, sweep, work, options):
         if not size < np.inf:
             return SINGULAR, iteration
         ratio = size / last if last < np.inf else 1.0
-        if size < SMALL_STEP or (ratio < 0.1 and size * ratio**2 < REMAINDER):
+        if size < SMALL_STEP or (ratio < 0.1 and size < LAST_STEP):
             _keep(work.now, work.base)
             _take(work, 1.0)
             return CONVERGED, iteration
