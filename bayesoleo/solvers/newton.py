@@ -38,8 +38,8 @@ SINGULAR = Status.SINGULAR.value
 NOT_FINITE = Status.NOT_FINITE.value
 
 #: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
-#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step from
-#: the last two is safe.
+#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step
+#: from the last two is safe.
 LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
