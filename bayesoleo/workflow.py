@@ -165,7 +165,9 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     """
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
-    assembly, reduced = _with_nuisance(Assembly(model, drive), reduced, settings.nuisance)
+    starts = not all(record.periodic for record in reduced.records)
+    assembly = Assembly(model, drive, starts=starts)
+    assembly, reduced = _with_nuisance(assembly, reduced, settings.nuisance)
     roles = assign(reduced.records)
     driven = assembly.model()
     # Building a predictor of one step checks channels, conditions and priors of every run without

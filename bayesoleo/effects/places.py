@@ -10,6 +10,7 @@ import sympy as sp
 
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import derivative_symbol, split_derivative
+from bayesoleo.model.initial import with_starts
 
 
 def force_places(model: Model) -> dict[str, Coordinate]:
@@ -102,6 +103,7 @@ def substitute(model: Model, table: Mapping[sp.Symbol, sp.Expr]) -> Model:
 
     return replace(
         model,
+        dofs=with_starts(model, swap),
         definitions={name: swap(e) for name, e in model.definitions.items()},
         equations={
             name: {term: swap(e) for term, e in terms.items()}

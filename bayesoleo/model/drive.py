@@ -82,7 +82,10 @@ def driven_by(model: Model, channel: str) -> Model:
         return _replace_dof(driven, dof, inverse)
     equation = {"measured": measured, "drive": -symbol(channel)}
     # The dof stays close to what is measured: a far better first guess than a static value.
-    dofs = {**driven.dofs, dof: replace(driven.dofs[dof], guess=channel)}
+    stays = replace(
+        driven.dofs[dof], guess=channel, initial="equilibrium", initial_rate=f"dot({channel})"
+    )
+    dofs = {**driven.dofs, dof: stays}
     return replace(driven, dofs=dofs, equations={**driven.equations, dof: equation})
 
 

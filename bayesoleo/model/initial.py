@@ -12,6 +12,7 @@ ruin" a transient; an unknown a run costs less than that.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import sympy as sp
@@ -19,7 +20,7 @@ import sympy as sp
 from bayesoleo.errors import ModelError
 from bayesoleo.model.expressions import derivative_symbol, parse, symbol
 from bayesoleo.model.model import Model
-from bayesoleo.model.parameter import Parameter
+from bayesoleo.model.parameter import Dof, Parameter
 
 #: The value at which nothing moves, in an initial expression.
 EQUILIBRIUM = "equilibrium"
@@ -87,6 +88,18 @@ def _parsed(model: Model, dof: str, text: str | float | sp.Expr) -> sp.Expr:
     return parse(text, {name: symbol(name) for name in names}, channels, where)
 
 
+def with_starts(model: Model, swap: Callable[[sp.Expr], sp.Expr]) -> dict[str, Dof]:
+    """The dofs with their declared starts rewritten, as effects rewrite equations."""
+    changed = dict(model.dofs)
+    for name, dof in model.dofs.items():
+        if dof.initial is not None:
+            changed[name] = replace(changed[name], initial=swap(_parsed(model, name, dof.initial)))
+        if dof.initial_rate is not None:
+            rate = swap(_parsed(model, name, dof.initial_rate))
+            changed[name] = replace(changed[name], initial_rate=rate)
+    return changed
+
+
 def undeclared_starts(model: Model) -> tuple[str, ...]:
     """Dofs whose start is to be estimated."""
     return tuple(
@@ -101,10 +114,14 @@ def with_estimated_starts(model: Model) -> Model:
     -------
     Model
         With the parameters ``start_<dof>``, and ``start_rate_<dof>`` of dofs of second order: what
-        is to be added to where the dof probably starts. Their null is zero.
+        is to be added to where the dof probably starts. Their null is zero. A dof whose rate no
+        equation holds has no choice: it starts in equilibrium.
     """
     for name in undeclared_starts(model):
         centre, dof = centre_of(model, name), model.dofs[name]
+        if not _has_rate(model, name):
+            model = replace(model, dofs={**model.dofs, name: replace(dof, initial=EQUILIBRIUM)})
+            continue
         new = {START + name: _estimated(model, name, dof.unit, "start")}
         value = centre.value + symbol(START + name)
         rate: sp.Expr = centre.rate
@@ -119,6 +136,11 @@ def with_estimated_starts(model: Model) -> Model:
             parameters={**model.parameters, **new},
         )
     return model
+
+
+def _has_rate(model: Model, name: str) -> bool:
+    found = {item for dof in model.dofs for item in model.equation(dof).free_symbols}
+    return any(derivative_symbol(name, order) in found for order in (1, 2))
 
 
 def _estimated(model: Model, name: str, unit: str, what: str) -> Parameter:

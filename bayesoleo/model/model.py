@@ -206,10 +206,14 @@ class Model:
 
     def expand(self, expression: sp.Expr) -> sp.Expr:
         """Replace the names of definitions by what stands behind them."""
-        for name in reversed(list(self.definitions)):
-            item = symbol(name)
-            if expression.has(item):
-                expression = expression.xreplace({item: self.definitions[name]})
+        table = {symbol(name): body for name, body in self.definitions.items()}
+        # One pass is enough for names declared in order; an effect may refer to a later one.
+        for _ in range(len(table)):
+            for item in reversed(table):
+                if expression.has(item):
+                    expression = expression.xreplace({item: table[item]})
+            if not expression.free_symbols & set(table):
+                break
         return expression
 
     def equation(self, dof: str) -> sp.Expr:

@@ -2,19 +2,26 @@
 
 The input's harmonics are known with a variance each. What their errors do to the prediction repeats
 in every period, so the scatter between periods does not contain it: it has to be computed, by the
-same linear periodic problem that gives parameter sensitivities.
+same linear problem that gives parameter sensitivities. A transient's smooth input has an error at
+every sample; a few draws of it stand for its covariance.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.prediction.inputs import harmonics_of
 from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.prediction.smoothing import Smoothed
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
+
+#: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
+DRAWS = 16
 
 
 def input_columns(run: RunPredictor, p: Array) -> Array:
@@ -30,12 +37,12 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     Returns
     -------
     ndarray, shape (ny, k, N)
-        Real and imaginary parts of all significant harmonics of all inputs; SI; no columns where
-        the run could not be solved.
+        Real and imaginary parts of all significant harmonics of all inputs, of a transient draws
+        over the root of their number; SI; no columns where the run could not be solved.
     """
     derived, boundary = run.kernels.derived, run.boundary
     ny, samples = run.measured.shape
-    at_samples = _input_changes(run, run.record.phase)
+    at_samples = _input_changes(run, run.record.position)
     lanes, one = np.zeros(1, dtype=np.int64), p[None]
     z = np.empty((1, 0, samples))
     moved = np.zeros((1, 0, at_samples.shape[1], samples))
@@ -67,12 +74,15 @@ def _states(run: RunPredictor, p: Array, x: Array) -> Array:
     run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
     run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
     right = np.einsum("lduN,ukN->ldkN", gu, _input_changes(run, run.points))
-    return run.scheme.linear(gz, right, None, lanes, boundary.step(run.steps))[0]
+    step, held = boundary.step(run.steps), not run.record.periodic
+    return run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
 
 
 def _input_changes(run: RunPredictor, phase: Array) -> Array:
     """Change of every input row by one standard deviation of each coefficient, shape (nu, k, N)."""
     rows, record = run.kernels.derived.inputs, run.record
+    if not record.periodic:
+        return _drawn_changes(run, phase)
     channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
     blocks = []
     for channel in channels:
@@ -93,3 +103,24 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
                 )
         blocks.append(block[:, np.abs(block).max(axis=(0, 2)) > 0])
     return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))
+
+
+@lru_cache(maxsize=64)
+def _errors(signal: Smoothed) -> tuple[Smoothed, ...]:
+    return tuple(signal.errors(DRAWS))
+
+
+def _drawn_changes(run: RunPredictor, position: Array) -> Array:
+    """The same of a transient: draws of its inputs' errors."""
+    rows, record = run.kernels.derived.inputs, run.record
+    blocks = []
+    for channel in run.model.inputs:
+        if any(row[0] == channel for row in rows):
+            draws = _errors(record.smoothed[channel])
+            block = np.zeros((len(rows), len(draws), position.size))
+            for k, (name, derivative) in enumerate(rows):
+                if name == channel:
+                    for j, draw in enumerate(draws):
+                        block[k, j] = draw.evaluate(position, record.rate, derivative)
+            blocks.append(block / np.sqrt(DRAWS))
+    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, position.size))

@@ -17,7 +17,7 @@ time series analysis. Biometrika 89(3), 603-616.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -36,7 +36,7 @@ ROUGHNESS = np.linspace(-16.0, 6.0, 23)
 DIFFUSE = 1e9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Smoothed:
     """A curve through equidistant samples, quintic between them.
 
@@ -89,6 +89,10 @@ class Smoothed:
             falling = float(np.prod(np.arange(power - derivative + 1, power + 1)))
             total = total * inside + falling * coefficients[:, power]
         return total / self.step**derivative
+
+    def part(self, samples: slice) -> Smoothed:
+        """The same curve over some of the samples, counted from the first of them."""
+        return replace(self, states=self.states[samples])
 
     def errors(self, count: int, seed: int = 0) -> list[Smoothed]:
         """Draws of what may lie between this curve and the true one.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,6 +89,16 @@ class TransientRun(RunPredictor):
         self.chosen: Mesh | None = None if like is None else like.chosen
         self.motions: dict[str, Motion] = {} if like is None else like.known_motions()
         self._adopt(self.chosen or equidistant(1))
+
+    def resampled(self, record: Record) -> TransientRun:
+        """The same run, anchor and mesh included, looked at at other times of the same span."""
+        other = copy(self)
+        other.record, other.position = record, record.position
+        other.sample_inputs = input_rows(record, self.kernels.derived.inputs, other.position)
+        other.measured = np.stack([record.samples[name] for name in self.kernels.derived.outputs])
+        if self.plan is not None:
+            other.plan = self.collocation.plan(other.position, self.steps, initial=True)
+        return other
 
     def _inputs(self, time: Array) -> Array:
         return input_rows(self.record, self.kernels.derived.inputs, time / self.period)

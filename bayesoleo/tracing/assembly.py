@@ -14,6 +14,7 @@ from bayesoleo.effects import Candidate, Effect, Scales, candidates, catalogue
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation.nuisance import Nuisance
 from bayesoleo.model import Model, Parameter, driven_by
+from bayesoleo.model.initial import with_estimated_starts
 
 #: Added effects by name: (effect, target).
 Added = tuple[str, str]
@@ -84,6 +85,8 @@ class Assembly:
         The model before any effect; ``None`` stands for ``native``.
     nuisance : Nuisance
         Conditions and channels that are known to a tolerance only.
+    starts : bool
+        Whether starts that the model does not declare are estimated: there are transient runs.
     """
 
     native: Model
@@ -93,6 +96,7 @@ class Assembly:
     steps: tuple[Step, ...] = ()
     declared: Model | None = None
     nuisance: Nuisance = field(default_factory=Nuisance)
+    starts: bool = False
 
     @property
     def added(self) -> tuple[Added, ...]:
@@ -105,6 +109,7 @@ class Assembly:
         for effect, target, scales in self.sensors:
             model = effect.extend(model, target, scales).model
         model = self.nuisance.extend(model)
+        model = with_estimated_starts(model) if self.starts else model
         return model.with_parameters(**self.parameters)
 
     def with_parameters(self, changed: Mapping[str, Parameter]) -> Assembly:
@@ -126,7 +131,8 @@ class Assembly:
 
     def without(self, step: Step) -> Assembly:
         """The same assembly with one effect left out."""
-        base = Assembly(self.declared or self.native, self.drive, nuisance=self.nuisance)
+        declared = self.declared or self.native
+        base = Assembly(declared, self.drive, nuisance=self.nuisance, starts=self.starts)
         for other in self.steps:
             if other is not step:
                 base = base._with_step(other.effect, other.target, other.scales)[1]

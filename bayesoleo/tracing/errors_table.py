@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.data import PeriodicAverage, periodic_average
+from bayesoleo.data.local_average import LocalAverage, local_average
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
+from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.holdout import Prediction
 
 Array = NDArray[np.float64]
@@ -27,8 +29,8 @@ class RunError:
         Where.
     rms : float
         Root mean square over the raw samples, SI.
-    average : PeriodicAverage
-        The residual averaged over the recorded periods.
+    average : PeriodicAverage or LocalAverage
+        The residual averaged over the recorded periods; of a transient, over neighbouring samples.
     input_noise : float
         Part of the noise that comes from the input, SI.
     """
@@ -37,7 +39,7 @@ class RunError:
     role: str
     output: str
     rms: float
-    average: PeriodicAverage
+    average: PeriodicAverage | LocalAverage
     input_noise: float
 
     @property
@@ -135,15 +137,21 @@ def error_table(
 
 def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
     record, predictor = prediction.record, prediction.predictor
-    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
     spread = np.sqrt(np.mean(np.sum(columns**2, axis=1), axis=1))
     entries = []
     for b, output in enumerate(predictor.outputs):
         residual = record.samples[output] - prediction.y[b]
-        average = periodic_average(residual, step, record.frequency)
+        average = _average(record, residual)
         rms = float(np.sqrt(np.mean(residual**2)))
         entries.append(
             RunError(record.label, roles[record.label], output, rms, average, float(spread[b]))
         )
     return entries
+
+
+def _average(record: Record, residual: Array) -> PeriodicAverage | LocalAverage:
+    if not record.periodic:
+        return local_average(residual)
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    return periodic_average(residual, step, record.frequency)

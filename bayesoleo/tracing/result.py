@@ -16,6 +16,7 @@ from bayesoleo.estimation import to_dataset
 from bayesoleo.posterior import Samples, choose_draws, to_datasets
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fit import Fit
 from bayesoleo.tracing.holdout import Prediction
@@ -189,16 +190,16 @@ def _coordinate(state: State) -> dict[str, tuple[list[Array], str]]:
         record, run = prediction.record, prediction.predictor.runs[0]
         motion = run.known_motions().get(place.name)
         if motion is not None:
-            rows = motion(record.phase)
+            rows = motion(record.position)
             position.append(rows[0])
             velocity.append(rows[1])
             continue
-        channel = place.name if place.name in record.harmonics else state.assembly.drive
+        channel = place.name if place.name in record.signals else state.assembly.drive
         if channel is None:
             return {}
-        item = record.harmonics[channel]
-        position.append(item.evaluate(record.phase, record.frequency))
-        velocity.append(item.evaluate(record.phase, record.frequency, 1))
+        item = record.signals[channel]
+        position.append(item.evaluate(record.position, record.rate))
+        velocity.append(item.evaluate(record.position, record.rate, 1))
     return {
         schema.STROKE: (position, unit),
         schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s"),
@@ -311,20 +312,24 @@ def _predictive(state: State, samples: Samples, seed: int) -> xr.Dataset:
 
 
 def _on_phases(prediction: Prediction, theta: Array) -> Array:
-    """Outputs on a grid of one period for many vectors, shape (K, ny, PHASES)."""
+    """Outputs on a grid of one period, or of a transient's length, for many vectors, shape (K, ny,
+    PHASES)."""
     old, record = prediction.predictor, prediction.record
-    time = np.arange(PHASES) / PHASES / record.frequency
+    times = np.arange(PHASES) / (PHASES if record.periodic else PHASES - 1)
     blank = {name: np.zeros(PHASES) for name in record.samples}
     grid: Mapping[str, Array] = blank
     predictor = Predictor(
         old.model,
-        [replace(record, time=time, samples=grid)],
+        [replace(record, time=record.span * times, samples=grid)],
         steps=old.steps,
         scheme=old.scheme,
         backend=old.backend,
         jobs=1,
     )
-    predictor.runs[0].anchor = old.runs[0].anchor
+    run = old.runs[0]
+    if isinstance(run, TransientRun):
+        predictor.runs[0] = run.resampled(predictor.records[0])
+    predictor.runs[0].anchor = run.anchor
     found = predictor.simulate(theta, 0)
     y = found.y
     y[found.status != Status.CONVERGED.value] = np.nan

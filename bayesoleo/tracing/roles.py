@@ -40,14 +40,8 @@ def assign(records: Sequence[Record]) -> Roles:
     Raises
     ------
     CampaignError
-        If a run is a transient, for which there is no solver yet, or no run is to be fitted.
+        If no run is to be fitted.
     """
-    for record in records:
-        if record.kind != "periodic":
-            raise CampaignError(
-                "a transient run cannot be fitted", run=record.label, key="kind", value=record.kind,
-                hint="leave it out of the campaign; only periodic runs are identified",
-            )  # fmt: skip
     fitted = tuple(record for record in records if record.role == "fit")
     held_out = tuple(record for record in records if record.role != "fit")
     if not fitted:
@@ -69,7 +63,8 @@ def assign(records: Sequence[Record]) -> Roles:
             "one run and no hold-out: fitted to the first half of its periods, held out the second"
         )
         return Roles((first,), (second,), "split periods", text)
-    return Roles(fitted, (), "none", "one run of too few periods: nothing could be held out")
+    what = "one run of too few periods" if only.periodic else "one transient run"
+    return Roles(fitted, (), "none", f"{what}: nothing could be held out")
 
 
 def _halves(record: Record) -> tuple[Record, Record]:

@@ -24,6 +24,7 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.assembly import Option
 from bayesoleo.tracing.fit import Fit
@@ -33,6 +34,8 @@ Array = NDArray[np.float64]
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.
 MOST_SAMPLES = 1500
+#: Stretches of a transient whose scatter stands in for that between periods.
+STRETCHES = 8
 #: Probability with which white noise may be taken for coloured.
 COLOURED = 0.05
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
@@ -180,7 +183,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
             (run.measured - fit.predictions[r].y).ravel(),
             _flat(columns),
             _flat(input_columns(run, _present(fit, r))),
-            np.tile(np.floor(record.phase + 1e-9).astype(np.int64), len(sigma)),
+            np.tile(_replicate(record), len(sigma)),
         )
         cross, _, _ = present.products(present.sensitivity)
         gram += cross
@@ -191,6 +194,13 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
             excess += record.time.size * (repeating**2 - floor**2) / value**2
         runs.append(present)
     return Base(fit, runs, gram, gradient, noise, excess)
+
+
+def _replicate(record: Record) -> NDArray[np.int64]:
+    """Number of the period that each sample lies in; of a transient, of the stretch."""
+    if record.periodic:
+        return np.floor(record.phase + 1e-9).astype(np.int64)
+    return np.minimum((STRETCHES * record.position).astype(np.int64), STRETCHES - 1)
 
 
 def _sigma(noise: float, measured: Array) -> float:

@@ -68,7 +68,14 @@ def test_no_run_to_fit_is_an_error(records):
         assign([r for r in records if r.role != "fit"])
 
 
-def test_a_transient_is_an_error_that_names_the_run(records):
-    with pytest.raises(CampaignError, match=r"transient run cannot be fitted.*") as caught:
-        assign([replace(records[0], kind="transient"), *records[1:]])
-    assert "'a'" in str(caught.value) or "run a" in str(caught.value)
+def test_transients_are_fitted_and_held_out_like_periodic_runs(records):
+    mixed = [replace(records[0], kind="transient"), *records[1:]]
+    assert [record.label for record in assign(mixed).fitted] == [
+        record.label for record in assign(records).fitted
+    ]
+
+
+def test_a_lone_transient_leaves_nothing_to_hold_out(records):
+    roles = assign([replace(records[0], kind="transient", periods=0)])
+    assert roles.strategy == "none"
+    assert "transient" in roles.description

@@ -1,0 +1,80 @@
+"""What a transient's residual keeps over neighbouring samples, and its noise.
+
+A transient repeats nothing that could be averaged over periods. What the model lacks is smooth on
+the scale of the samples and noise is not, so that averages over a few neighbours say the same: they
+are the noise's standard error where nothing is missing, and larger where something is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.data.smoothing import innovation_noise
+
+Array = NDArray[np.float64]
+
+#: Averages of a run, and samples in one at least.
+MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
+
+
+@dataclass(frozen=True)
+class LocalAverage:
+    """Averages over blocks of neighbouring samples, in the terms of a periodic average.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        The average of each sample's block, in the signal's unit.
+    samples, number : int
+        Number N of samples and M of blocks.
+    repeating : float
+        Root mean square of ``values``.
+    sigma : float
+        Standard deviation of a single sample's noise, from differences of neighbours.
+    noise : float
+        Standard error of a block's average, root mean square over the blocks.
+    """
+
+    values: Array
+    samples: int
+    number: int
+    repeating: float
+    sigma: float
+    noise: float
+
+    @property
+    def ratio(self) -> float:
+        """``repeating / noise``: about one where nothing is left but noise."""
+        return self.repeating / self.noise
+
+    def on_phase(self, points: int) -> Array:
+        """A transient has no phase: not a number, shape (points,)."""
+        return np.full(points, np.nan)
+
+
+def local_average(values: Array) -> LocalAverage:
+    """Average a signal over neighbouring samples.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+    """
+    signal = np.asarray(values, dtype=float)
+    size = max(FEWEST_SAMPLES, signal.size // MOST_AVERAGES)
+    number = max(signal.size // size, 1)
+    block = np.minimum(np.arange(signal.size) // size, number - 1)
+    counts = np.bincount(block)
+    means = (np.bincount(block, signal) / counts)[block]
+    sigma = innovation_noise(signal)
+    return LocalAverage(
+        values=means,
+        samples=signal.size,
+        number=number,
+        repeating=float(np.sqrt(np.mean(means**2))),
+        sigma=sigma,
+        noise=sigma * float(np.sqrt(number / signal.size)),
+    )
