@@ -29,18 +29,19 @@ class Study:
     ----------
     name : str
         Of the page; names of stored files begin with it.
-    data : str
-        Folder of the data set below ``BAYESOLEO_DATA``. Nothing is ever fetched.
+    data : str, optional
+        Folder of the data set below ``BAYESOLEO_DATA``; without one the page needs none. Nothing is
+        ever fetched.
     slow : bool
         Whether to run only when the store is to be renewed.
     """
 
-    def __init__(self, name: str, data: str, *, slow: bool = False) -> None:
+    def __init__(self, name: str, data: str | None = None, *, slow: bool = False) -> None:
         self.name = name
         root = os.environ.get("BAYESOLEO_DATA")
-        self.folder = Path(root) / data if root else None
+        self.folder = Path(root) / data if root and data else None
         self.storing = os.environ.get("BAYESOLEO_STORE_FIGURES") == "1"
-        present = self.folder is not None and self.folder.is_dir()
+        present = data is None or (self.folder is not None and self.folder.is_dir())
         self.live = present and (self.storing or not slow)
         if not present:
             print(
