@@ -290,18 +290,20 @@ def _run(
     dynamics: Dynamics, p: Array, start: Array, task: loop.Task, columns: Array, scale: Array,
     stages: int, by_parameter: bool,
 ) -> tuple[loop.Path, int, int, int]:  # fmt: skip
-    active = dynamics.active if by_parameter else 0
     constants = np.concatenate([p, np.ones(dynamics.switches + 1)])
-    modes = np.arange(p.size, p.size + dynamics.switches, dtype=np.int64)
+    system = loop.System(
+        np.array(dynamics.orders, dtype=np.int64), radau_method(stages), dynamics.signal, constants,
+        np.arange(p.size, p.size + dynamics.switches, dtype=np.int64),
+        dynamics.active if by_parameter else 0, dynamics.conditions,
+    )  # fmt: skip
     work = workspace(
         stages, dynamics.orders, dynamics.signal.cosine.shape[0], dynamics.active,
         dynamics.conditions, dynamics.switches,
     )  # fmt: skip
-    return loop.march(
-        *dynamics.functions(), task, np.array(start, dtype=float), columns, scale,
-        radau_method(stages), np.array(dynamics.orders, dtype=np.int64), dynamics.signal, constants,
-        modes, active, dynamics.conditions, work,
-    )  # fmt: skip
+    run: Any = loop.march  # mypy takes what Numba returns for a function without arguments
+    return run(
+        *dynamics.functions(), task, np.array(start, dtype=float), columns, scale, system, work
+    )
 
 
 def _check(dynamics: Dynamics, start: Array, times: Array, stages: int) -> None:

@@ -11,18 +11,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.solvers.march_start import is_inside, rate_at_start, starts
 from bayesoleo.solvers.radau_step import (
     SINGULAR,
     SOLVED,
     UNDEFINED,
+    Method,
+    copy_to,
     differentiate_step,
     end_of_step,
     local_error,
     solve_stages,
     stretch,
 )
-from bayesoleo.solvers.signals import rows_at
-from bayesoleo.solvers.sweep import eliminate, jit
+from bayesoleo.solvers.signals import Signal, rows_at
+from bayesoleo.solvers.sweep import jit
 from bayesoleo.solvers.switching import (
     first_switch,
     jump_of_derivatives,
@@ -91,6 +94,76 @@ class Path(NamedTuple):
     tops_by: Array
 
 
+class System(NamedTuple):
+    """What is integrated, beside its kernels.
+
+    Parameters
+    ----------
+    orders : ndarray of int, shape (d,)
+        Of the dofs.
+    method : Method
+        Radau IIA.
+    signal : Signal
+        Inputs.
+    p : ndarray, shape (np + ns,)
+        Constants, then modes, which a march exchanges.
+    modes : ndarray of int, shape (ns,)
+        Where in ``p`` the modes are.
+    active : int
+        Number of derivatives by parameters among those carried.
+    conditions : int
+        Number of conditions on the admissible region.
+    """
+
+    orders: NDArray[np.int64]
+    method: Method
+    signal: Signal
+    p: Array
+    modes: NDArray[np.int64]
+    active: int
+    conditions: int
+
+
+class Front(NamedTuple):
+    """Where a march is: the state at the start of a step ``(D,)`` and at its end, the highest
+    derivatives at its start ``(d,)``, those of its stages ``(s, d)`` and of the last step's, the
+    derivatives carried ``(D, C)``, sizes, and what determines the next length.
+    """
+
+    state: Array
+    following: Array
+    rate: Array
+    before: Array
+    stages: Array
+    last_stages: Array
+    error: Array
+    columns: Array
+    columns_after: Array
+    stages_by: Array
+    scale: Array
+    range_from: Array
+    largest: Array
+    pace: Array
+
+
+#: Entries of ``Front.pace``: length to be tried, that of the polynomial known (zero for none),
+#: length and error of the last step accepted, and whether this one was rejected before.
+LENGTH, KNOWN, LAST_LENGTH, LAST_ERROR, REJECTED = range(5)
+
+
+@jit
+def _front(system, task, start, columns, scale):
+    D, d, s, count = start.size, system.orders.size, system.method.c.size, columns.shape[1]
+    pace = np.zeros(5)
+    pace[LENGTH] = pace[LAST_LENGTH] = task.first_step
+    pace[LAST_ERROR] = 1.0
+    return Front(
+        start.copy(), start.copy(), np.zeros(d), np.zeros(d), np.zeros((s, d)), np.zeros((s, d)),
+        np.zeros(D), columns, columns.copy(), np.zeros((s * d, count)), scale, start,
+        np.zeros(system.modes.size), pace,
+    )  # fmt: skip
+
+
 @jit
 def _room(task, D, d, s, ns, columns):
     n, kept = task.capacity, task.capacity if task.dense else 0
@@ -107,270 +180,211 @@ def _room(task, D, d, s, ns, columns):
 
 
 @jit
-def _rate_at_start(jacobian, state, top, t, orders, signal, p, work):
-    """Highest derivatives ``top (d,)`` at one time; false where there are none."""
-    d, row, first = orders.size, 0, 0
-    rows_at(signal, t, 0.0, np.zeros(1), work.u1)
-    for j in range(d):
-        for k in range(orders[j]):
-            work.z1[row + k, 0] = state[first + k]
-        row += orders[j] + 1
-        first += orders[j]
-    matrix = np.empty((d, d))
-    for iteration in range(20):
-        row = -1
-        for j in range(d):
-            row += orders[j] + 1
-            work.z1[row, 0] = top[j]
-        jacobian(work.z1.ctypes, work.u1.ctypes, p.ctypes, work.g1.ctypes, 1)
-        for e in range(d):
-            work.small[e, 0] = -work.g1[e, 0]
-            row = d + e * (d + state.size) - 1
-            for j in range(d):
-                row += orders[j] + 1
-                matrix[e, j] = work.g1[row, 0]
-        if not eliminate(matrix, work.small, 1e-14):
-            return False
-        change = size = 0.0
-        for j in range(d):
-            top[j] += work.small[j, 0]
-            change = max(change, abs(work.small[j, 0]))
-            size = max(size, abs(top[j]))
-        if not np.isfinite(size):
-            return False
-        if iteration > 0 and change <= 1e-10 * size + 1e-200:
-            break
-    return True
-
-
-@jit
-def _is_inside(admissible, conditions, z, u, count, p, work):
-    """Whether all points lie in the admissible region."""
-    if conditions == 0:
-        return True
-    admissible(z.ctypes, u.ctypes, p.ctypes, work.a.ctypes, count)
-    for k in range(conditions):
-        for i in range(count):
-            if not (work.a[k, i] > 0.0):
-                return False
-    return True
-
-
-@jit
-def _starts(
-    jacobian, switches, admissible, conditions, state, top, t, h, modes, orders, signal, p, work
-):  # fmt: skip
-    """Rates and modes at the start; false if there are none or it is not admissible."""
-    for _ in range(2 if modes.size > 0 else 1):
-        # Modes depend on the rates only where a state starts on a switch.
-        if not _rate_at_start(jacobian, state, top, t, orders, signal, p, work):
-            return False
-        _initial_modes(switches, state, top, t, h, modes, orders, signal, p, work)
-    rows_at(signal, t, 0.0, np.zeros(1), work.u1)
-    return _is_inside(admissible, conditions, work.z1, work.u1, 1, p, work)
-
-
-@jit
-def _initial_modes(switches, state, top, t, h, modes, orders, signal, p, work):
-    """Modes by the signs of the switching functions at the start, or just after it."""
-    if modes.size == 0:
-        return
-    row = first = 0
-    for part in (0.0, 1e-6):
-        row = first = 0
-        rows_at(signal, t, part * h, np.ones(1), work.u1)
-        for j in range(orders.size):
-            for k in range(orders[j]):
-                rate = state[first + 1] if orders[j] == 2 and k == 0 else top[j]
-                work.z1[row + k, 0] = state[first + k] + part * h * rate
-            work.z1[row + orders[j], 0] = top[j]
-            row += orders[j] + 1
-            first += orders[j]
-        switches(work.z1.ctypes, work.u1.ctypes, p.ctypes, work.y.ctypes, 1)
-        for k in range(modes.size):
-            if part == 0.0 or p[modes[k]] == 0.5:
-                value = work.y[k, 0]
-                p[modes[k]] = 1.0 if value > 0.0 else (0.5 if value == 0.0 else 0.0)
-    for k in range(modes.size):
-        if p[modes[k]] == 0.5:
-            p[modes[k]] = 1.0
-
-
-@jit
 def march(
-    jacobian, parameters, switches, slopes, admissible,
-    task, start, columns, scale, method, orders, signal, p, modes, active, conditions, work,
+    jacobian, parameters, switches, slopes, admissible, task, start, columns, scale, system, work
 ):  # fmt: skip
     """Integrate one lane from ``start (D,)`` through ``task.nodes``.
 
-    ``columns (D, C)`` are derivatives at the start, ``active`` of them by parameters, and at the
-    end on return. ``scale (D,)`` are sizes of the state components, enlarged as they are met.
-    Returns a path, its number of steps, the outcome and the number of points evaluated.
+    The kernels come first, as function pointers. ``columns (D, C)`` are derivatives at the start,
+    ``system.active`` of them by parameters, and at the end on return; ``scale (D,)`` are sizes of
+    the state components, enlarged as they are met. Returns a path, its number of steps, the outcome
+    and the number of points evaluated.
     """
-    D, d, s = start.size, orders.size, method.c.size
-    count = columns.shape[1]
-    path = _room(task, D, d, s, modes.size, count)
-    nodes, end = task.nodes, task.nodes[-1]
-    t, state, following = nodes[0], start.copy(), start.copy()
-    top0, top, guess = np.zeros(d), np.zeros((s, d)), np.zeros((s, d))
-    before, error = np.zeros(d), np.zeros(D)
-    after, top_by = np.empty((D, count)), np.empty((s * d, count))
-    largest = np.zeros(modes.size)
-    shortest = 1e-14 * (abs(nodes[-1] - nodes[0]) + abs(t))
-    h, last_h, last_error, known = task.first_step, 0.0, 1.0, False
-    node, n, points, flips = 1, 0, 0, 0
-    reason, rejected = LOST, False
-    path.times[0], path.states[0] = t, start
-    if task.dense:
-        path.by[0] = columns
-    step_before = h
-    if not _starts(
-        jacobian, switches, admissible, conditions, state, top0, t, h, modes, orders, signal, p,
-        work,
-    ):  # fmt: skip
-        inside = _is_inside(admissible, conditions, work.z1, work.u1, 1, p, work)
-        return path, 0, NOT_A_NUMBER if inside else OUTSIDE, 1
+    sizes = (start.size, system.orders.size, system.method.c.size)
+    path = _room(task, sizes[0], sizes[1], sizes[2], system.modes.size, columns.shape[1])
+    front = _front(system, task, start, columns, scale)
+    n, outcome, points = _walk(
+        jacobian, parameters, switches, slopes, admissible, task, system, front, path, work
+    )
+    return path, n, outcome, points
+
+
+@jit
+def _walk(
+    jacobian, parameters, switches, slopes, admissible, task, system, front, path, work
+):  # fmt: skip
+    """Step after step to the last node: number of steps, outcome, points."""
+    t, end, s = task.nodes[0], task.nodes[-1], system.method.c.size
+    shortest = 1e-14 * (end - t + abs(t))
+    node, n, points, flips, reason = 1, 0, 1, 0, LOST
+    if not starts(jacobian, switches, admissible, front, t, task.first_step, system, work):
+        inside = is_inside(admissible, work.z1, work.u1, 1, system, work)
+        return 0, NOT_A_NUMBER if inside else OUTSIDE, points
+    _keep(task, front, path, 0, t)
     while t < end:
         if n >= task.capacity:
-            return path, n, FULL, points
-        while not task.adaptive and nodes[node] <= t + shortest:
-            node += 1
-        target = end if task.adaptive else nodes[node]
-        if not task.adaptive:
-            h = target - t
-        elif h > task.longest:
-            h = task.longest
-        lands = t + h >= target - shortest or (task.adaptive and t + 1.01 * h >= target)
-        if lands:
-            h = target - t
-        if h < shortest and not lands:
-            return path, n, reason, points
-        rows_at(signal, t, h, method.c, work.u)
-        if known:
-            stretch(top, h / last_h, method, guess)
-        else:
-            for i in range(s):
-                guess[i] = top0
-        for j in range(D):
-            scale[j] = max(scale[j], 1e-3 * abs(state[j]))
-        outcome, iterations = solve_stages(
-            jacobian, state, guess, h, scale, task.enough, method, orders, p, work
-        )
+            return n, FULL, points
+        node, aim = _aim(task, front, node, t, shortest)
+        h = aim - t
+        if h < shortest and aim < end:
+            return n, reason, points
+        outcome, size, iterations = _attempt(jacobian, admissible, task, system, front, t, h, work)
         points += s * (iterations + 1)
-        inside = _is_inside(admissible, conditions, work.z, work.u, s, p, work)
-        if outcome != SOLVED or not inside:
-            reason = (
-                OUTSIDE if not inside
-                else NOT_A_NUMBER if outcome == UNDEFINED
-                else DEGENERATE if outcome == SINGULAR
-                else LOST
-            )  # fmt: skip
+        if outcome != FINISHED:
             if not task.adaptive:
-                return path, n, COARSE, points
-            h *= 0.25
-            if known and h < 0.05 * last_h:
-                known = False
-            rejected = True
+                return n, COARSE, points
+            reason = outcome
             continue
-        size = local_error(state, top0, h, scale, method, orders, work, error) / task.tolerance
-        if not task.adaptive and size > GENEROSITY:
-            return path, n, COARSE, points
-        factor = 0.9 * max(size, 1e-12) ** (-1.0 / (s + 1))
-        if task.adaptive and size > 1.0:
-            h *= max(0.1, factor)
-            reason, rejected = LOST, True
-            continue
-        switch = -1
-        if modes.size > 0:
-            position, switch = first_switch(
-                switches, t, state, guess, h, modes, largest, method, orders, signal, p, work
+        switch, length, slope = -1, h, 1.0
+        if system.modes.size > 0:
+            switch, length, slope = _find_switch(
+                jacobian, switches, task.enough, system, front, t, h, work
             )
+            flips = flips + 1 if switch >= 0 and not (length > 1e-12 * abs(t)) else 0
+            if flips > 2 * system.modes.size + 4:
+                return n, CHATTERS, points
+            if length < 0.0:
+                return n, LOST, points
+        if length > 0.0:
+            if not _advance(jacobian, parameters, task, system, front, path, n, length, work):
+                return n, DEGENERATE, points
+            path.switched[n], path.aims[n] = switch >= 0, aim
+            t, n = (aim if switch < 0 else t + length), n + 1
         if switch >= 0:
-            flips += 1
-            if flips > 2 * modes.size + 4:
-                return path, n, CHATTERS, points
-            before[:] = guess[s - 1]
-            slope = 1.0
-            if position > 1e-13:
-                length = step_to_switch(
-                    jacobian, switches, switch, position, t, state, guess, h,
-                    scale, task.enough, largest, method, orders, signal, p, work,
-                )  # fmt: skip
-                if length <= 0.0:
-                    return path, n, LOST, points
-                points += 4 * s
-                before[:] = guess[s - 1]
-                slope = slope_of_switch(
-                    switches, switch, t, state, guess, length,
-                    method, orders, signal, p, work,
-                )  # fmt: skip
-                if length > 1e-12 * abs(t):
-                    flips = 1
-            else:
-                # The switch is where the step begins: exchange the mode and step again.
-                length = 0.0
-            taken = length
-        else:
-            flips, taken = 0, h
-        if taken > 0.0:
-            end_of_step(work, s, orders, following)
-            path.tops[n], path.times[n + 1] = guess, target if lands and switch < 0 else t + taken
-            for k in range(modes.size):
-                path.modes[n, k] = p[modes[k]]
-            path.switched[n], path.aims[n] = switch >= 0, target if lands else t + h
-            if count > 0:
-                if not differentiate_step(
-                    jacobian, parameters, columns, top_by, after, taken, method, orders, p, work,
-                    active,
-                ):  # fmt: skip
-                    return path, n, DEGENERATE, points
-                columns[:] = after
-                if task.dense:
-                    path.tops_by[n] = top_by
-            t = path.times[n + 1]
-            state[:] = following
-            for j in range(D):
-                scale[j] = max(scale[j], abs(state[j] - start[j]))
-            top[:] = guess
-            top0[:] = guess[s - 1]
-            last_h, known = taken, True
-        if switch >= 0:
-            p[modes[switch]] = 1.0 - p[modes[switch]]
-            known = False
-            if not _rate_at_start(jacobian, state, top0, t, orders, signal, p, work):
-                return path, n, NOT_A_NUMBER, points
-            points += 2
-            if taken > 0.0 and count > 0:
-                jump_of_derivatives(
-                    slopes,
-                    switch,
-                    slope,
-                    top_by,
-                    before,
-                    top0,
-                    columns,
-                    s,
-                    modes.size,
-                    orders,
-                    p,
-                    work,
-                    active,
-                )
-        if taken > 0.0:
-            path.states[n + 1] = state
-            if task.dense:
-                path.by[n + 1] = columns
-            n += 1
-        if switch < 0 or (taken > 0.0 and not task.adaptive and task.cut[node - 1]):
+            if not _exchange(jacobian, slopes, system, front, switch, slope, length, t, work):
+                return n, NOT_A_NUMBER, points
+        elif task.adaptive:
+            _next_length(front, size, h, s)
+        if length > 0.0:
+            _keep(task, front, path, n, t)
+            if switch < 0 or (not task.adaptive and task.cut[node - 1]):
+                node += 1
+    return n, FINISHED, points
+
+
+@jit
+def _aim(task, front, node, t, shortest):
+    """Number of the node ahead and time at which the next step is to end."""
+    if not task.adaptive:
+        while task.nodes[node] <= t + shortest:
             node += 1
-        if switch < 0 and task.adaptive:
-            # Predictive control (Hairer and Wanner 1996, eq. IV.8.25).
-            if n > 1:
-                trend = (last_error / max(size, 1e-12)) ** (1.0 / (s + 1))
-                factor = min(factor, factor * h / step_before * trend)
-            last_error, step_before = max(size, 1e-2), h
-            factor = min(max(factor, 0.2), 1.0 if rejected else 8.0)
-            if not (1.0 <= factor < 1.2):
-                h *= factor
-            rejected = False
-    return path, n, FINISHED, points
+        return node, task.nodes[node]
+    h, end = min(front.pace[LENGTH], task.longest), task.nodes[-1]
+    return node, end if t + 1.01 * h >= end else t + h
+
+
+@jit
+def _attempt(jacobian, admissible, task, system, front, t, h, work):
+    """Solve a step: outcome, error over tolerance, iterations. Shorten the next one if it fails."""
+    s, pace, method = system.method.c.size, front.pace, system.method
+    rows_at(system.signal, t, h, method.c, work.u)
+    # What is known of the last step does not reach far beyond a failure.
+    if pace[KNOWN] > 0.0 and h > 0.01 * pace[KNOWN]:
+        stretch(front.last_stages, h / pace[KNOWN], method, front.stages)
+    else:
+        for i in range(s):
+            for j in range(front.rate.size):
+                front.stages[i, j] = front.rate[j]
+    for j in range(front.scale.size):
+        front.scale[j] = max(front.scale[j], 1e-3 * abs(front.state[j]))
+    outcome, iterations = solve_stages(
+        jacobian, front.state, front.stages, h, front.scale, task.enough, method, system.orders,
+        system.p, work,
+    )  # fmt: skip
+    inside = is_inside(admissible, work.z, work.u, s, system, work)
+    pace[LENGTH] = h
+    if outcome != SOLVED or not inside:
+        pace[LENGTH], pace[REJECTED] = 0.25 * h, 1.0
+        if not inside:
+            return OUTSIDE, np.inf, iterations
+        reason = NOT_A_NUMBER if outcome == UNDEFINED else LOST
+        return DEGENERATE if outcome == SINGULAR else reason, np.inf, iterations
+    size = (
+        local_error(
+            front.state, front.rate, h, front.scale, method, system.orders, work, front.error
+        )
+        / task.tolerance
+    )
+    if size > (1.0 if task.adaptive else GENEROSITY):
+        pace[LENGTH], pace[REJECTED] = h * max(0.1, 0.9 * size ** (-1.0 / (s + 1))), 1.0
+        return LOST, size, iterations
+    return FINISHED, size, iterations
+
+
+@jit
+def _find_switch(jacobian, switches, enough, system, front, t, h, work):
+    """Switch in the solved step, or -1, with the length up to it and the switching function's
+    slope there; the step is solved again to end there. A negative length is a failure, zero a
+    switch where the step begins.
+    """
+    orders, method, signal, p = system.orders, system.method, system.signal, system.p
+    position, switch = first_switch(
+        switches, t, front.state, front.stages, h, system.modes, front.largest, method, orders,
+        signal, p, work,
+    )  # fmt: skip
+    if switch < 0:
+        return -1, h, 1.0
+    if position <= 1e-13:
+        return switch, 0.0, 1.0
+    length = step_to_switch(
+        jacobian, switches, switch, position, t, front.state, front.stages, h, front.scale,
+        enough, front.largest, method, orders, signal, p, work,
+    )  # fmt: skip
+    slope = slope_of_switch(
+        switches, switch, t, front.state, front.stages, length, method, orders, signal, p, work
+    )
+    return switch, length, slope
+
+
+@jit
+def _advance(jacobian, parameters, task, system, front, path, n, length, work):
+    """Differentiate the step, keep its stages and go to its end; false if it is singular."""
+    s, d = front.stages.shape
+    if front.columns.shape[1] > 0:
+        if not differentiate_step(
+            jacobian, parameters, front.columns, front.stages_by, front.columns_after, length,
+            system.method, system.orders, system.p, work, system.active,
+        ):  # fmt: skip
+            return False
+        copy_to(front.columns_after, front.columns)
+        if task.dense:
+            copy_to(front.stages_by, path.tops_by[n])
+    end_of_step(work, s, system.orders, front.state)
+    for k in range(system.modes.size):
+        path.modes[n, k] = system.p[system.modes[k]]
+    for j in range(front.state.size):
+        front.scale[j] = max(front.scale[j], abs(front.state[j] - front.range_from[j]))
+    for i in range(s):
+        for j in range(d):
+            path.tops[n, i, j] = front.last_stages[i, j] = front.stages[i, j]
+            front.rate[j] = front.before[j] = front.stages[i, j]
+    front.pace[KNOWN] = length
+    return True
+
+
+@jit
+def _exchange(jacobian, slopes, system, front, switch, slope, length, t, work):
+    """Exchange a mode: rates are new, and derivatives jump where they do; false without rates."""
+    mode = system.modes[switch]
+    system.p[mode] = 1.0 - system.p[mode]
+    front.pace[KNOWN] = 0.0
+    if not rate_at_start(jacobian, front.state, front.rate, t, system, work):
+        return False
+    if length > 0.0 and front.columns.shape[1] > 0:
+        jump_of_derivatives(
+            slopes, switch, slope, front.stages_by, front.before, front.rate, front.columns,
+            system.method.c.size, system.modes.size, system.orders, system.p, work, system.active,
+        )  # fmt: skip
+    return True
+
+
+@jit
+def _next_length(front, size, h, stages):
+    """Predictive control of the step's length (Hairer and Wanner 1996, eq. IV.8.25)."""
+    pace, small = front.pace, max(size, 1e-12)
+    factor = 0.9 * small ** (-1.0 / (stages + 1))
+    trend = (pace[LAST_ERROR] / small) ** (1.0 / (stages + 1))
+    factor = min(factor, factor * h / pace[LAST_LENGTH] * trend)
+    factor = min(max(factor, 0.2), 1.0 if pace[REJECTED] > 0.0 else 8.0)
+    # A factorisation is not kept, but a polynomial extrapolates best to its own length.
+    pace[LENGTH] = h if 1.0 <= factor < 1.2 else h * factor
+    pace[LAST_ERROR], pace[LAST_LENGTH], pace[REJECTED] = max(size, 1e-2), h, 0.0
+
+
+@jit
+def _keep(task, front, path, n, t):
+    path.times[n] = t
+    for j in range(front.state.size):
+        path.states[n, j] = front.state[j]
+    if task.dense:
+        copy_to(front.columns, path.by[n])

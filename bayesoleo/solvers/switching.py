@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.solvers.radau_step import SOLVED, interpolate, solve_stages, stretch
+from bayesoleo.solvers.radau_step import SOLVED, copy_to, interpolate, solve_stages, stretch
 from bayesoleo.solvers.signals import rows_at
 from bayesoleo.solvers.sweep import jit
 
@@ -38,7 +38,8 @@ def first_switch(switches, t, state, top, h, modes, largest, method, orders, sig
     """
     s = method.c.size
     switches(work.z.ctypes, work.u.ctypes, p.ctypes, work.y.ctypes, s)
-    values = work.y[: modes.size, :s].copy()
+    values = np.empty((modes.size, s))
+    copy_to(work.y[: modes.size, :s], values)
     earliest, which = 2.0, -1
     for k in range(modes.size):
         sign = 2.0 * p[modes[k]] - 1.0
@@ -109,7 +110,7 @@ def step_to_switch(
     guess = np.empty_like(top)
     for _ in range(8):
         stretch(top, -position, method, guess)
-        top[:] = guess
+        copy_to(guess, top)
         h *= position
         rows_at(signal, t, h, method.c, work.u)
         outcome, _ = solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work)
