@@ -144,8 +144,7 @@ def _flat(result: Array) -> Array:
     return flat
 
 
-@intrinsic
-def pointer(typing_context, array, offset):
+def _pointer(typing_context, array, offset):
     """Pointer to the element of a contiguous array that lies ``offset`` elements behind its first.
 
     Unlike ``array[k].ctypes`` it counts no references: that costs more than a kernel's call.
@@ -156,6 +155,9 @@ def pointer(typing_context, array, offset):
         return builder.gep(structure.data, [arguments[1]])
 
     return _POINTER(array, types.intp), generate
+
+
+pointer: Any = intrinsic(_pointer)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
