@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.compiled import BlockKernel
 from bayesoleo.solvers import measures, newton
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.unrolled import Program
@@ -98,7 +99,8 @@ class Boundary:
     def arranged(self) -> newton.Arranged | None:
         """Inputs as the compiled iteration sweeps them; None where it has no code for the scheme,
         or the equations are not compiled."""
-        program = self.scheme.program if hasattr(self.equations.jacobian, "pointer") else None
+        compiled = isinstance(self.equations.jacobian, BlockKernel)
+        program = self.scheme.program if compiled else None
         if program is None:
             return None
         n = self.inputs.shape[1] // program.stages

@@ -1,0 +1,70 @@
+"""The compiled sweep of chunks takes the same iteration to the same orbit as the general one."""
+
+import numpy as np
+import pytest
+from periodic_problems import (
+    coupled,
+    duffing,
+    friction_oscillator,
+    gas_spring,
+    harmonics,
+    relaxation,
+    rest,
+)
+from periodic_problems import problem as discretised
+
+from bayesoleo.solvers import newton, periodic
+from bayesoleo.solvers.status import Status
+
+FORCE = harmonics(h0=0.3, h1=1.0, h3=0.2j)
+MODELS = [duffing(quadratic=0.4), relaxation(), coupled(), friction_oscillator()]
+
+
+def both(model, name, n, force=FORCE, start=0.0, **options):
+    boundary, p = discretised(model, force, 0.2, name, n, backend="numba")
+    assert boundary.arranged is not None
+    x = rest(boundary, n, start)
+    settings = {"max_iterations": 40, "monotone": True} | options
+    compiled = periodic._compiled(boundary, boundary.arranged, p, x, *settings.values())
+    general = periodic._Newton(boundary, p, x.copy(), *settings.values()).run()
+    return compiled, general
+
+
+# One step more or less than whole chunks, a whole block and one more: every way to fill the rest.
+@pytest.mark.parametrize("n", [8, 13, 64, 65, 100, 257])
+@pytest.mark.parametrize("name", ["radau2", "radau3", "gauss3", "thesis"])
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+def test_orbits_agree(model, name, n):
+    compiled, general = both(model, name, n)
+    assert general.status[0] == Status.CONVERGED.value
+    assert compiled.status[0] == Status.CONVERGED.value
+    size = np.abs(general.x).max()
+    # Both end within a last step of 1e-7 that squares: differences of rounding, over the period.
+    np.testing.assert_allclose(compiled.x, general.x, rtol=0, atol=1e-9 * size)
+    assert abs(compiled.iterations[0] - general.iterations[0]) <= 1
+
+
+def test_statuses_agree_where_the_gas_law_ends():
+    compiled, general = both(gas_spring(), "radau3", 32, start=1.5)
+    assert compiled.status[0] == general.status[0] == Status.INADMISSIBLE.value
+
+
+def test_statuses_agree_where_iterations_run_out():
+    compiled, general = both(duffing(), "radau3", 32, max_iterations=1)
+    assert compiled.status[0] == general.status[0] == Status.NO_CONVERGENCE.value
+
+
+def test_long_systems_and_few_steps_are_left_to_the_general_iteration():
+    boundary, _ = discretised(duffing(), FORCE, 0.2, "radau3", newton.LEAST_STEPS - 1, "numba")
+    assert boundary.arranged is None
+
+
+@pytest.mark.parametrize("name", ["radau3", "thesis"])
+def test_lanes_do_not_know_each_other(name):
+    boundary, p = discretised(friction_oscillator(), FORCE, 0.2, name, 50, backend="numba")
+    many = p * np.linspace(0.97, 1.03, 7)[:, None]
+    start = np.repeat(rest(boundary, 50), 7, axis=0)
+    together = periodic.solve_periodic(boundary, many, start)
+    for lane in range(7):
+        alone = periodic.solve_periodic(boundary, many[lane : lane + 1], start[:1])
+        np.testing.assert_array_equal(alone.x[0], together.x[lane])
