@@ -32,6 +32,11 @@ POSTERIOR_PREDICTIVE: Final = "posterior_predictive"
 RESIDUAL: Final = "residual"
 PREDICTION: Final = "prediction"
 DISCOVERY: Final = "discovery"
+SAMPLING_DISTRIBUTION: Final = "sampling_distribution"
+INDIFFERENCE: Final = "indifference"
+PROFILE: Final = "profile"
+SENSITIVITY: Final = "sensitivity"
+ASSESSMENT: Final = "assessment"
 
 GROUPS: Final = (
     OBSERVED_DATA,
@@ -46,6 +51,11 @@ GROUPS: Final = (
     RESIDUAL,
     PREDICTION,
     DISCOVERY,
+    SAMPLING_DISTRIBUTION,
+    INDIFFERENCE,
+    PROFILE,
+    SENSITIVITY,
+    ASSESSMENT,
 )
 
 # Dims; each that is not just a counter has a coordinate of the same name

@@ -4,6 +4,7 @@ Figures are made without pyplot, hence without global state: they can be drawn i
 machines without a display, and are saved with ``figure.savefig(path)``.
 """
 
+from bayesoleo.plots.assessments import assessment
 from bayesoleo.plots.corners import corner
 from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
@@ -11,22 +12,30 @@ from bayesoleo.plots.forest import point_against_posterior
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.rankings import ranking
 from bayesoleo.plots.records import records
+from bayesoleo.plots.regions import indifference, profile
+from bayesoleo.plots.replications import sampling_distribution
 from bayesoleo.plots.residuals import residual
+from bayesoleo.plots.sensitivities import sensitivity
 from bayesoleo.plots.traces import trace
 from bayesoleo.plots.units import Scale, engineering, format_unit, format_value
 
 __all__ = [
     "Scale",
+    "assessment",
     "corner",
     "engineering",
     "error",
     "fit",
     "format_unit",
     "format_value",
+    "indifference",
     "point_against_posterior",
     "predictive",
+    "profile",
     "ranking",
     "records",
     "residual",
+    "sampling_distribution",
+    "sensitivity",
     "trace",
 ]

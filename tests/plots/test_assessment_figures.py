@@ -1,0 +1,73 @@
+"""Figures of regions, replications, sensitivities and assessments show what the data hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_campaigns import damper, damper_campaign, with_friction
+
+from bayesoleo import plots
+from bayesoleo.assessment import assess
+from bayesoleo.estimation import (
+    estimate,
+    indifference,
+    local_sensitivity,
+    profile,
+    sampling_distribution,
+    sobol,
+)
+from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.model.priors import Normal
+from bayesoleo.prediction.predictor import Predictor
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    reduced = damper_campaign(tmp_path_factory.mktemp("damper"), with_friction, periods=4)
+    problem = CampaignProblem(Predictor(damper(), reduced.records[:3], backend="numpy", jobs=1))
+    return problem, estimate(problem)
+
+
+def test_contours_and_ellipses_are_drawn(fitted):
+    found = indifference(*fitted, [("damping", "stiffness")], points=12)
+    figure = plots.indifference(found.data)
+    (axes,) = figure.axes
+    curves = [line.get_xydata() for line in axes.lines]
+    np.testing.assert_allclose(curves[1][:-1], found["contour"].values[0, 0])
+    np.testing.assert_allclose(curves[2][:-1], found["ellipse"].values[1, 0])
+    assert axes.get_xlabel() == "damping"
+
+
+def test_profile_shows_falls_and_level(fitted):
+    found = profile(*fitted, ["cubic"])
+    (axes,) = plots.profile(found.data).axes
+    np.testing.assert_allclose(axes.lines[1].get_ydata(), found["fall"].values[0])
+    assert axes.lines[2].get_ydata()[0] == pytest.approx(1.92, abs=0.01)
+
+
+def test_histograms_hold_all_replications(fitted):
+    found = sampling_distribution(*fitted, replications=30, input_noise=False)
+    figure = plots.sampling_distribution(found.data)
+    assert len(figure.axes) == 3
+    bars = figure.axes[0].patches
+    assert sum(bar.get_height() * bar.get_width() for bar in bars) == pytest.approx(1.0)
+
+
+def test_table_of_sensitivities_has_its_numbers(fitted):
+    problem, point = fitted
+    local = local_sensitivity(problem, point.theta)
+    texts = [t.get_text() for t in plots.sensitivity(local.data).axes[0].texts]
+    assert texts[0] == f"{float(local['percent'][0, 0]):+.3g} %"
+    priors = [Normal(0, 1), Normal(0, 2)]
+    shares = sobol(lambda t: t.sum(1, keepdims=True), priors, ["a", "b"], ["y"], samples=256)
+    texts = [t.get_text() for t in plots.sensitivity(shares.data).axes[0].texts]
+    assert texts[1].startswith(f"{float(shares['total'][0, 1]):.2f} (")
+
+
+def test_assessment_shows_runs_and_variables(fitted):
+    found = assess(*fitted)
+    correlogram, ratios, shares = plots.assessment(found.data).axes
+    assert len(correlogram.lines) == 2 * 3 + 1
+    np.testing.assert_allclose(ratios.lines[0].get_ydata(), found["ratio_to_noise"][0])
+    labels = [label.get_text() for label in shares.get_xticklabels()]
+    assert labels == list(found["variable"].values)
