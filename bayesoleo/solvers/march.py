@@ -210,6 +210,7 @@ def _walk(
     if not starts(jacobian, switches, admissible, front, t, task.first_step, system, work):
         inside = is_inside(admissible, work.z1, work.u1, 1, system, work)
         return 0, NOT_A_NUMBER if inside else OUTSIDE, points
+    _first_sizes(front, system.orders, task.first_step)
     _keep(task, front, path, 0, t)
     while t < end:
         if n >= task.capacity:
@@ -250,6 +251,20 @@ def _walk(
             if switch < 0 or (not task.adaptive and task.cut[node - 1]):
                 node += 1
     return n, FINISHED, points
+
+
+@jit
+def _first_sizes(front, orders, h):
+    """From rest, a state is as large as its rates make it in the first step."""
+    first = 0
+    for j in range(orders.size):
+        last = first + orders[j] - 1
+        change = h * abs(front.rate[j])
+        front.scale[last] = max(front.scale[last], change)
+        if orders[j] == 2:
+            change = h * (abs(front.state[last]) + change)
+            front.scale[first] = max(front.scale[first], change)
+        first += orders[j]
 
 
 @jit

@@ -29,8 +29,10 @@ NOISE = 30.0
 LAST_CORRECTION = 1e-7
 #: From a correction this small on steps are kept.
 CLOSE = 1e-3
-MAXIMUM_PASSES = 60
+MAXIMUM_PASSES = 25
 MAXIMUM_HALVINGS = 12
+#: How often, and for how many periods, a motion may settle where Newton's method gets stuck.
+SETTLINGS, PERIODS = 3, 10
 #: Closures with a smaller reciprocal condition number are singular but for round-off.
 SINGULAR = 1e-13
 
@@ -162,10 +164,33 @@ class _Shooter:
         self.scale: Array | None = None
 
     def run(self, start: Array) -> Shot:
+        """Newton's method; where it gets stuck, again from where the motion has settled to."""
+        shot = self.newton(start)
+        for _ in range(SETTLINGS):
+            if shot.status is not Status.NO_CONVERGENCE:
+                break
+            settled = self.settle(start)
+            if settled is None:
+                break
+            start, shot = settled, self.newton(settled)
+        return shot
+
+    def settle(self, start: Array) -> Array | None:
+        """State some periods later: a stable motion attracts from further than Newton's method."""
+        for _ in range(PERIODS):
+            path = self.adaptive(start, LOOSE)
+            if not path.status.ok:
+                return None
+            start = path.states[-1]
+        return start
+
+    def newton(self, start: Array) -> Shot:
         """Newton's method with step halving, tighter as it comes closer."""
         tolerance = max(self.tolerance, LOOSE)
         path = self.adaptive(start, tolerance)
-        while path.status.ok and self.iterations < MAXIMUM_PASSES:
+        for _ in range(MAXIMUM_PASSES):
+            if not path.status.ok:
+                break
             step, size = self.correction(path)
             if step is None:
                 return self.failed(path, Status.SINGULAR)
