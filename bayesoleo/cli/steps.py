@@ -48,7 +48,8 @@ def reduce(
 
     Frequencies are refined from the declared ones; leading periods that have not settled are left
     out. Of each channel the significant harmonics are counted; its noise is the standard deviation
-    of a single sample about the periodic mean. Writes nothing without --out.
+    of a single sample about the periodic mean. A channel that drifts and a frequency that is half
+    the true one are warned of. Writes nothing without --out.
 
     \b
     Examples:
@@ -56,6 +57,7 @@ def reduce(
       bayesoleo reduce shaker --json > runs.json
     """
     from bayesoleo import workflow
+    from bayesoleo.data import findings
 
     if out is not None:
         shell.check_writable(out.parent)
@@ -65,9 +67,12 @@ def reduce(
     if as_json:
         units = {name: channel.si_unit for name, channel in found.campaign.channels.items()}
         facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
+        facts["findings"] = findings(found.records)
         shell.print_json(tables.plain(facts))
     else:
         _print_records(found, shell.console())
+        for sentence in findings(found.records):
+            shell.complain(f"warning: {sentence}")
 
 
 def _runs(reduced: ReducedCampaign) -> list[dict[str, Any]]:

@@ -217,6 +217,14 @@ class CampaignSource:
         known = set(predictor.model.inputs) & set(problem.outputs)
         if known:
             raise InputError("a channel is both input and output", key=", ".join(sorted(known)))
+        transient = [record.label for record in predictor.records if not record.periodic]
+        if input_noise and transient:
+            raise InputError(
+                "new noise is not drawn for the input of a transient",
+                run=transient[0],
+                key="input_noise",
+                hint="use input_noise=False, or periodic runs only",
+            )
         names = predictor.layout.names
         self.free = np.array([names.index(name) for name in problem.names], dtype=np.int64)
         self.truth = predictor.predict(problem.full(self.theta[None])[0])

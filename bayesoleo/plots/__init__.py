@@ -9,6 +9,7 @@ from bayesoleo.plots.corners import corner
 from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
 from bayesoleo.plots.forest import point_against_posterior
+from bayesoleo.plots.period_search import period_search
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.rankings import ranking
 from bayesoleo.plots.records import records
@@ -29,6 +30,7 @@ __all__ = [
     "format_unit",
     "format_value",
     "indifference",
+    "period_search",
     "point_against_posterior",
     "predictive",
     "profile",

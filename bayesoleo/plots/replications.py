@@ -39,8 +39,8 @@ def sampling_distribution(data: xr.Dataset) -> Figure:
         unit = float(one["bound_sd"])
         scaled = (one["replicate"].values[good] - float(one["truth"])) / unit
         axes.hist(
-            np.clip(scaled, -WIDTHS, WIDTHS), np.linspace(-WIDTHS, WIDTHS, bins), density=True,
-            color=style.SIMILAR,
+            np.clip(scaled, -WIDTHS, WIDTHS), np.linspace(-WIDTHS, WIDTHS, bins).tolist(),
+            density=True, color=style.SIMILAR,
         )  # fmt: skip
         axes.plot(grid, stats.norm.pdf(grid), color=style.AFTER, lw=1.6)
         expected = float(one["expected_sd"]) / unit

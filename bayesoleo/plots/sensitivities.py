@@ -71,7 +71,7 @@ def table(
     axes.set_xticks(range(len(columns)), [style.plain(c, 24) for c in columns], rotation=30)
     axes.xaxis.tick_top()
     for label in axes.get_xticklabels():
-        label.set_ha("left")
+        label.set_horizontalalignment("left")
     axes.set_yticks(range(len(rows)), [style.plain(r, 30) for r in rows])
     axes.tick_params(length=0, labelsize=style.SMALL)
     for spine in axes.spines.values():
