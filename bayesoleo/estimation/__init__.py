@@ -4,6 +4,7 @@ from bayesoleo.estimation.axes import principal_axes
 from bayesoleo.estimation.estimate import estimate, polish
 from bayesoleo.estimation.function_problem import FunctionProblem
 from bayesoleo.estimation.hierarchy import Hierarchy, between_runs
+from bayesoleo.estimation.identifiability import data_against_prior
 from bayesoleo.estimation.indifference import indifference
 from bayesoleo.estimation.intervals import (
     linearised_covariance,
@@ -49,6 +50,7 @@ __all__ = [
     "Step",
     "as_text",
     "between_runs",
+    "data_against_prior",
     "declared_nuisance",
     "estimate",
     "estimate_each",

@@ -14,6 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "studies"))
 
+import drop_tests
 import shaker_tables
 import thesis_tables
 
@@ -25,7 +26,7 @@ def main() -> None:
         "--table",
         nargs="+",
         default=["6.5to6.2"],
-        choices=["6.5to6.2", *shaker_tables.TABLES],
+        choices=["6.5to6.2", "drop", *shaker_tables.TABLES],
         help="which, by default 6.5to6.2",
     )
     parser.add_argument("--drive", default="force", choices=["force", "displacement"])
@@ -38,7 +39,11 @@ def main() -> None:
             for variant in thesis_tables.VARIANTS
         }
         thesis_tables.print_comparison(found)
-    rest = [table for table in asked.table if table != "6.5to6.2"]
+    if "drop" in asked.table:
+        fits = drop_tests.fitted(shaker_tables.Shaker.load(asked.jobs).reduced.records, asked.jobs)
+        drop_tests.print_damping(fits)
+        drop_tests.print_drops(drop_tests.predictions_of(fits))
+    rest = [table for table in asked.table if table in shaker_tables.TABLES]
     if rest:
         shaker = shaker_tables.Shaker.load(asked.jobs)
         for table in rest:

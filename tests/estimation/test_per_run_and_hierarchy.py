@@ -119,10 +119,11 @@ def lines():
 
 
 def test_each_run_is_estimated_as_if_it_were_alone(lines):
-    each = estimate_each(lines, units=["N", "N/m"], jobs=2)
+    options = {"tolerance": 1e-6, "max_iterations": 50}
+    each = estimate_each(lines, units=["N", "N/m"], jobs=2, **options)
     assert dict(each.sizes) == {"run": 3, "parameter": 2, "parameter_column": 2, "output": 1}
     for label, problem in lines.items():
-        alone = estimate(problem, "mbe")
+        alone = estimate(problem, "mbe", **options)
         run = each.sel(run=label)
         np.testing.assert_array_equal(run["estimate"], alone.theta)
         np.testing.assert_array_equal(run["covariance_likelihood"], alone.covariance_likelihood)
