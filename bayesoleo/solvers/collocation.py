@@ -152,8 +152,7 @@ class Collocation:
         return self.plan_in(*self._mesh_of(n).locate(inside))
 
     def plan_in(self, index: NDArray[np.int64], position: Array) -> SamplePlan:
-        """Given steps ``(N,)`` and positions in them, from 0 to 1: at an edge, which side to take.
-        """
+        """Given steps ``(N,)`` and positions in them, from 0 to 1: on one side of an edge."""
         w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
         if self.mesh is not None:
             relative = self.mesh.relative[index]
