@@ -13,8 +13,10 @@ from bayesoleo.estimation.intervals import (
 )
 from bayesoleo.estimation.iterate import Iteration
 from bayesoleo.estimation.laplace import mode_covariance
+from bayesoleo.estimation.methods import METHODS
 from bayesoleo.estimation.multistart import Modes, multistart
 from bayesoleo.estimation.nuisance import Nuisance, declared_nuisance
+from bayesoleo.estimation.objective import OBJECTIVES, Objective
 from bayesoleo.estimation.objectives import (
     log_likelihood,
     log_posterior,
@@ -31,11 +33,12 @@ from bayesoleo.estimation.replicate import Replications, estimate_many
 from bayesoleo.estimation.sampling_distribution import sampling_distribution
 from bayesoleo.estimation.sensitivity import global_sensitivity, local_sensitivity, sobol
 from bayesoleo.estimation.shown import Shown
-from bayesoleo.estimation.steps import METHODS, Step
+from bayesoleo.estimation.steps import Step
 from bayesoleo.estimation.table import as_text, to_dataset
 
 __all__ = [
     "METHODS",
+    "OBJECTIVES",
     "Evaluation",
     "FunctionProblem",
     "Hierarchy",
@@ -43,6 +46,7 @@ __all__ = [
     "Misfit",
     "Modes",
     "Nuisance",
+    "Objective",
     "PointEstimate",
     "Problem",
     "Replications",

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from bayesoleo.estimation.bounded import bounded_step
+from bayesoleo.estimation.bounded import bounded_step, on_limit
 from bayesoleo.estimation.linearise import inverse_gram
 from bayesoleo.estimation.problem import Array
 
@@ -30,6 +31,10 @@ class Equations:
         Distances to the limits of the support, or to how far a logarithm may go in one step.
     root : ndarray, shape (l, l)
         Rows ``P`` with ``P'P`` the prior's precision; upper triangular.
+    place : ndarray, shape (l,)
+        Scaled unknowns where this is, by which a first step is judged.
+    noise : float
+        Standard deviation by which rows were whitened, the outputs' geometric mean.
     """
 
     jacobian: Array
@@ -37,11 +42,21 @@ class Equations:
     slope: Array
     room: tuple[Array, Array]
     root: Array
+    place: Array
+    noise: float = 1.0
 
     @property
     def gradient(self) -> Array:
         """Slope of the merit function, shape (l,)."""
         return self.jacobian.T @ self.residual + self.slope
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Which unknowns lie on a limit and would leave, shape (l,)."""
+        down, up = self.room
+        return on_limit(
+            (np.where(self.gradient < 0, down, np.inf), np.where(self.gradient > 0, up, np.inf))
+        )
 
     def solve(self, rows: Array) -> Array:
         """Step, shape (l,), with the weight ``rows' rows`` added to ``A``."""

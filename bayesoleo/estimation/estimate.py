@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.bounded import on_limit
 from bayesoleo.estimation.iterate import Iteration, Outcome, iterate
-from bayesoleo.estimation.linearise import Linearised, inverse_gram
-from bayesoleo.estimation.objectives import output_counts, staged_variance, sums_of_squares
+from bayesoleo.estimation.methods import method as find_method
+from bayesoleo.estimation.objective import Objective, objective_of
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array, Problem
 from bayesoleo.estimation.scaling import PriorScale
+from bayesoleo.estimation.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.steps import Step
-from bayesoleo.estimation.steps import method as find_method
+from bayesoleo.estimation.summarise import summarise
 
 Progress = Callable[[Iteration], None]
+Method = str | Step[Any]
+
+#: MBE finds its way where the prior says how far to go, Levenberg-Marquardt where it says nothing.
+DEFAULT_METHODS: tuple[Method, ...] = ("mbe", "levenberg-marquardt")
 
 
 def estimate(
     problem: Problem,
-    method: str | Step = "mbe",
+    method: Method | Sequence[Method] = DEFAULT_METHODS,
     *,
+    objective: str | Objective = "diagonal",
+    error_covariance: object = None,
     start: ArrayLike | None = None,
-    tolerance: float = 1e-6,
-    max_iterations: int = 50,
+    tolerance: float = 1e-8,
+    max_iterations: int | None = None,
     resolution: float = 0.0,
     bias_corrected: bool = False,
     progress: Progress | None = None,
@@ -38,18 +46,29 @@ def estimate(
     ----------
     problem : Problem
         What is fitted.
-    method : str or Step, optional
-        ``"be"``, ``"mve"``, ``"mmve"``, ``"mbe"``, ``"gauss-newton"`` or
-        ``"levenberg-marquardt"``. All but the first end in the maximum-likelihood point, for which
-        the priors only scale the steps; ``"be"`` ends in a mode of the posterior. Unknowns with a
-        log-normal prior are stepped in their logarithm, but the mode is that of the density per
-        unit of the unknown itself.
+    method : str or Step, or sequence of them, optional
+        ``"be"``, ``"mve"``, ``"mmve"``, ``"mbe"``, ``"gauss-newton"``, ``"levenberg-marquardt"``,
+        ``"newton"``, or ``"scipy:"`` and the name of one of SciPy's optimisers. Of several, each
+        begins at the start until one converges. ``"be"``, ``"newton"`` and SciPy's end in a mode of
+        the posterior where the objective has a prior; the others in the maximum-likelihood point,
+        for which the prior only scales the steps. Unknowns with a log-normal prior are stepped in
+        their logarithm, but the mode is that of the density per unit of the unknown itself.
+    objective : str or Objective, optional
+        What is maximised: ``"diagonal"`` (the thesis's standard), ``"full"``, ``"given"``,
+        ``"likelihood"``, ``"determinant"``, ``"weighted"`` or ``"unweighted"``; see
+        :data:`bayesoleo.estimation.OBJECTIVES`.
+    error_covariance : array_like or sequence of array_like, optional
+        Known errors for ``"given"`` and ``"weighted"``: a variance for each output, (s,); an array
+        of variances by sample for each output; a covariance, (s, s), or one by sample, (n, s, s).
+        By default the noise that was measured in a campaign's records.
     start : array_like, shape (l,), optional
         By default the problem's own.
     tolerance : float, optional
         Relative step: converged when every step is below this part of the unknown, or of its
         linearised standard deviation where that is larger.
     max_iterations : int, optional
+        By default 100, and 1000 for Levenberg-Marquardt and for SciPy's optimisers, which take
+        many small steps where the others would have given up.
     resolution : float, optional
         Converged also where the optimum is nearer than this many standard deviations: what is
         below, the data cannot tell. Zero asks for digits alone.
@@ -70,30 +89,73 @@ def estimate(
 
     References
     ----------
-    Verbeek (1993), sections 3.2 and 3.3, eqs. 3.17-3.23.
+    Verbeek (1993), section 2.3, eqs. 2.25-2.35 (objectives), sections 3.2 and 3.3, eqs. 3.17-3.23
+    (estimators).
     """
-    step = find_method(method)
     scale = PriorScale.of(problem.priors, problem.names)
     begin = checked_start(problem, scale, problem.start if start is None else start)
-    outcome = iterate(
-        problem,
-        step,
-        begin,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        resolution=resolution,
-        bias_corrected=bias_corrected,
-        progress=progress,
-    )
-    return _summarise(problem, scale, step, begin, outcome, bias_corrected)
+    wanted = objective_of(problem, objective, error_covariance)
+    limits = _Limits(tolerance, max_iterations, resolution, bias_corrected, progress)
+    found: list[PointEstimate] = []
+    for each in [method] if isinstance(method, str | Step) else method:
+        name, outcome = limits.run(problem, each, begin, wanted)
+        found.append(summarise(problem, scale, name, begin, outcome, wanted, bias_corrected))
+        if outcome.status.ok:
+            break
+    best = found[-1] if found[-1].status.ok else max(found, key=_height)
+    return replace(best, evaluations=sum(point.evaluations for point in found))
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """When an estimator stops, and whom it tells."""
+
+    tolerance: float
+    max_iterations: int | None
+    resolution: float
+    bias_corrected: bool
+    progress: Progress | None
+
+    def run(
+        self, problem: Problem, method: Method, start: Array, objective: Objective
+    ) -> tuple[str, Outcome]:
+        """Name of the estimator, and how it ended."""
+        common: dict[str, Any] = {
+            "tolerance": self.tolerance,
+            "bias_corrected": self.bias_corrected,
+            "max_iterations": self.max_iterations,
+        }
+        if isinstance(method, str) and method.startswith(PREFIX):
+            name = method.removeprefix(PREFIX)
+            common["max_iterations"] = self.max_iterations or MOST_ITERATIONS
+            return method, run_scipy(problem, name, start, objective, **common)
+        step = find_method(method)
+        if step.name == "be" and not objective.prior:
+            raise InputError(
+                f"the objective {objective.name!r} has no prior, which BE would weigh",
+                key="method",
+                value="be",
+                hint="use mbe, levenberg-marquardt, gauss-newton or newton",
+            )
+        common["max_iterations"] = self.max_iterations or step.most
+        common |= {"resolution": self.resolution, "progress": self.progress}
+        return step.name, iterate(problem, step, start, objective, **common)
+
+
+def _height(point: PointEstimate) -> float:
+    """By which failed estimates are compared: what they have reached in the likelihood."""
+    with np.errstate(divide="ignore"):
+        return -float(np.nan_to_num(np.log(point.variance), nan=np.inf).sum())
 
 
 def polish(
     problem: Problem,
     point: PointEstimate,
     *,
-    tolerance: float = 1e-6,
-    max_iterations: int = 50,
+    objective: str | Objective = "diagonal",
+    error_covariance: object = None,
+    tolerance: float = 1e-8,
+    max_iterations: int | None = None,
     resolution: float = 0.0,
     progress: Progress | None = None,
 ) -> PointEstimate:
@@ -107,7 +169,7 @@ def polish(
     problem : Problem
     point : PointEstimate
         Where to begin.
-    tolerance, max_iterations, resolution, progress
+    objective, error_covariance, tolerance, max_iterations, resolution, progress
         As in :func:`estimate`.
 
     Returns
@@ -117,6 +179,8 @@ def polish(
     return estimate(
         problem,
         "be",
+        objective=objective,
+        error_covariance=error_covariance,
         start=point.theta,
         tolerance=tolerance,
         max_iterations=max_iterations,
@@ -146,49 +210,3 @@ def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Arra
                 hint=f"use a value between {low:g} and {high:g}",
             )
     return theta
-
-
-def _summarise(
-    problem: Problem,
-    scale: PriorScale,
-    step: Step,
-    start: Array,
-    outcome: Outcome,
-    bias_corrected: bool,
-) -> PointEstimate:
-    unknowns, outputs = len(problem.names), len(problem.outputs)
-    variance = np.full(outputs, np.nan)
-    covariance = likelihood = np.full((unknowns, unknowns), np.nan)
-    history = outcome.history
-    if history:
-        sums, counts = sums_of_squares(outcome.evaluation), output_counts(problem.counts)
-        variance = staged_variance(sums, counts, unknowns, bias_corrected=bias_corrected)
-        unit = scale.unit(outcome.theta)
-        rows = Linearised.of(outcome.evaluation, unit).whitened(variance)[0]
-        units = np.outer(unit, unit)
-        covariance = units * inverse_gram(np.vstack((rows, scale.root)))
-        likelihood = units * inverse_gram(rows)
-    held = on_limit(scale.room(outcome.theta))
-    return PointEstimate(
-        names=tuple(problem.names),
-        outputs=tuple(problem.outputs),
-        theta=outcome.theta,
-        variance=variance,
-        covariance=covariance,
-        covariance_likelihood=likelihood,
-        method=step.name,
-        status=outcome.status,
-        iterations=max(len(history) - 1, 0),
-        halvings=sum(line.halvings for line in history),
-        evaluations=outcome.evaluations,
-        objective=history[-1].objective if history else np.nan,
-        distance=outcome.distance,
-        start=start,
-        history=np.array([line.theta for line in history]).reshape(len(history), unknowns),
-        history_variance=np.array([line.variance for line in history]).reshape(
-            len(history), outputs
-        ),
-        history_objective=np.array([line.objective for line in history]),
-        history_halvings=np.array([line.halvings for line in history], dtype=np.int64),
-        on_limit=tuple(name for name, at in zip(problem.names, held, strict=True) if at),
-    )

@@ -16,12 +16,16 @@ from bayesoleo.estimation.problem import Array, Evaluation, Misfit
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
 
-# Sixth-order central difference. At a relative step of 1e-3 rounding costs about 1e-13 of a
-# derivative, and truncation stays below 1e-8 even where the function changes e-fold within 1 % of
-# a parameter.
+# Sixth-order central difference, and the fourth order below it. At a relative step of 1e-3 rounding
+# costs about 1e-13 of a derivative, and truncation stays below 1e-8 even where the function changes
+# e-fold within 1 % of a parameter.
 _OFFSETS = np.array([1.0, 2.0, 3.0])
-_WEIGHTS = np.array([45.0, -9.0, 1.0]) / 60
+_WEIGHTS = np.array([[45.0, -9.0, 1.0], [40.0, -5.0, 0.0]]) / 60
 _RELATIVE_STEP = 1e-3
+# Where the fourth order differs from the sixth by more than this part of the largest derivative,
+# the step is longer than the function is smooth - the prior may be far wider than it - and is
+# shortened.
+_ROUGH, _FINER, _REFINEMENTS = 1e-8, 10.0, 4
 # Numbers of one batch of predictions: about what stays in a core's cache.
 _BATCH = 2**17
 
@@ -199,6 +203,20 @@ class FunctionProblem:
                 rows = [np.array(self._jacobian(self._x, row), dtype=float) for row in theta]
             return np.stack(rows)
         step = self._steps(theta)
+        found, error = self._differences(theta, step)
+        for _ in range(_REFINEMENTS):
+            rough = np.flatnonzero((error > _ROUGH).any(axis=1))
+            if not rough.size:
+                break
+            step[rough] = np.where(error[rough] > _ROUGH, step[rough] / _FINER, step[rough])
+            again, left = self._differences(theta[rough], step[rough])
+            better = left < error[rough]
+            found[rough] = np.where(better[:, None], again, found[rough])
+            error[rough] = np.where(better, left, error[rough])
+        return found
+
+    def _differences(self, theta: Array, step: Array) -> tuple[Array, Array]:
+        """Derivatives (L, n, l) with steps (L, l), and how far a lower order is off, (L, l)."""
         # vectors (offset, L, unknown, l): each moves one unknown by a multiple of its step
         moved = _OFFSETS[:, None, None, None] * (step[:, :, None] * np.eye(theta.shape[1]))
         ahead, behind = theta[:, None] + moved, theta[:, None] - moved
@@ -207,8 +225,10 @@ class FunctionProblem:
         both = np.concatenate((ahead, behind)).reshape(-1, theta.shape[1])
         ends = self._prediction.many(both).reshape(2, *moved.shape[:3], -1)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            slopes = (ends[0] - ends[1]) / taken[..., None]
-            return np.einsum("o,olkn->lnk", _WEIGHTS, np.asarray(slopes, dtype=float))
+            slopes = np.asarray((ends[0] - ends[1]) / taken[..., None], dtype=float)
+            sixth, fourth = np.einsum("wo,olkn->wlnk", _WEIGHTS, slopes)
+            error = np.abs(sixth - fourth).max(axis=1) / np.abs(sixth).max(axis=1)
+        return sixth, np.nan_to_num(error, nan=0.0, posinf=0.0)
 
     def _steps(self, theta: Array) -> Array:
         """Steps of the differences, shape (L, l): the stencil stays inside the support."""

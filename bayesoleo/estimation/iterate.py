@@ -8,21 +8,18 @@ Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.bounded import is_cut
 from bayesoleo.estimation.equations import Equations
-from bayesoleo.estimation.linearise import Linearised
-from bayesoleo.estimation.objectives import (
-    log_likelihood,
-    log_prior,
-    output_counts,
-    staged_variance,
-    sums_of_squares,
-)
+from bayesoleo.estimation.newton import newton_equations
+from bayesoleo.estimation.objective import Objective
+from bayesoleo.estimation.objectives import log_prior, output_counts
+from bayesoleo.estimation.pace import Pace
 from bayesoleo.estimation.problem import Array, Evaluation, Problem
 from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.steps import Step
@@ -39,15 +36,6 @@ _NEGLIGIBLE_GAIN = 1e-6
 _MANY_HALVINGS = 4
 # Distance to the fixed point, in standard deviations, up to which a small step means convergence.
 _NEAR = 0.1
-# A step that turns back by more than this part of the last one overshoots: linear equations that
-# lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
-_OVERSHOOT = 0.3
-# After so many steps in a row along one line, each longer than that part of the one before, steps
-# are lengthened, at most so far: the same equations can also fall short for ever.
-_STEADY = 4
-_LONGEST = 10.0
-# Cosine from which two steps lie on one line; off it nothing is known of the overshoot.
-_ON_ONE_LINE = 0.9
 # So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
 _IDLE = 3
 # Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
@@ -69,8 +57,8 @@ class Iteration:
     number : int
         Zero at the start.
     theta : ndarray, shape (l,)
-    variance : ndarray, shape (s,)
-        Staged at ``theta``.
+    variance : ndarray, shape (s,) or (s, s)
+        Staged at ``theta``; a matrix where the objective estimates one.
     objective : float
         The method's own objective at both.
     halvings : int
@@ -110,8 +98,9 @@ class Outcome:
 
 def iterate(
     problem: Problem,
-    step: Step,
+    step: Step[Any],
     start: Array,
+    objective: Objective,
     *,
     tolerance: float,
     max_iterations: int,
@@ -128,6 +117,8 @@ def iterate(
         The estimator.
     start : ndarray, shape (l,)
         Inside the priors' support.
+    objective : Objective
+        What is maximised.
     tolerance : float
         Converged when every unknown's step is below this part of its value, or of its linearised
         standard deviation where that is larger.
@@ -145,7 +136,7 @@ def iterate(
     Outcome
         Ends on the last point that improved, so never on a worse one than the start.
     """
-    loop = _Loop(problem, step, bias_corrected, progress)
+    loop = _Loop(problem, step, objective, bias_corrected, progress)
     with single_blas_thread():
         loop.move(loop.look(np.array(start, dtype=float)), 0)
         status = loop.point.status
@@ -168,71 +159,13 @@ def iterate(
 class _Point:
     theta: Array
     evaluation: Evaluation
-    sums: Array
+    moments: Array
 
     @property
     def status(self) -> Status:
-        if self.evaluation.status.ok and not np.isfinite(self.sums).all():
+        if self.evaluation.status.ok and not np.isfinite(self.moments).all():
             return Status.NOT_FINITE
         return self.evaluation.status
-
-
-@dataclass(frozen=True)
-class _Pace:
-    """How a step compares with the one before it, by which it is shortened or lengthened.
-
-    Near the fixed point the error along one line shrinks from ``e`` to ``(1 - s k) e``, where ``s``
-    is the part of the proposed step that was taken and ``k`` how far a whole one goes. Two
-    proposals on that line tell ``k``, and the part ``1/k`` goes all the way (Aitken's process,
-    1926): at once where steps turn back, with care where they creep.
-
-    Parameters
-    ----------
-    taken : ndarray, shape (l,)
-        The last step, in scaled unknowns.
-    part : float
-        Of the proposal that was taken.
-    idle : int
-        Iterations in a row that were slow and gained nothing.
-    slow : bool
-        The present proposal is not much shorter than the last step.
-    steady : int
-        Steps in a row that crept along one line.
-    wanted : float
-        Part of the present proposal to take; one where nothing says otherwise.
-    """
-
-    taken: Array | None = None
-    part: float = 1.0
-    idle: int = 0
-    slow: bool = False
-    steady: int = 0
-    wanted: float = 1.0
-
-    def look(self, proposal: Array, rows: Array) -> _Pace:
-        """Compare a proposal with the last step in the metric ``rows' rows``."""
-        if self.taken is None:
-            return self
-        new, old = rows @ proposal, rows @ self.taken
-        lengths = float(np.linalg.norm(new)), float(np.linalg.norm(old))
-        if min(lengths) == 0:
-            return replace(self, slow=False, steady=0, wanted=1.0)
-        cosine = float(new @ old) / (lengths[0] * lengths[1])
-        ratio = lengths[0] / lengths[1]
-        reach = 1 / self.part - float(np.sign(cosine)) * ratio
-        on_line = abs(cosine) >= _ON_ONE_LINE
-        creeps = on_line and 0 < reach < 1 - _OVERSHOOT
-        steady = self.steady + 1 if creeps else 0
-        wanted = 1.0
-        if on_line and reach > 1 + _OVERSHOOT:
-            wanted = 1 / reach
-        elif steady >= _STEADY:
-            wanted = min(1 / reach, _LONGEST)
-        return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
-
-    def after(self, taken: Array, part: float, idle: bool) -> _Pace:
-        """Pace after a step that was a part of its proposal and gained nothing, or something."""
-        return _Pace(taken, part, self.idle + 1 if idle and self.slow else 0, steady=self.steady)
 
 
 class _Loop:
@@ -241,11 +174,12 @@ class _Loop:
     def __init__(
         self,
         problem: Problem,
-        step: Step,
+        step: Step[Any],
+        objective: Objective,
         bias_corrected: bool,
         progress: Callable[[Iteration], None] | None,
     ) -> None:
-        self.problem, self.step = problem, step
+        self.problem, self.step, self.objective = problem, step, objective
         self.bias_corrected, self.progress = bias_corrected, progress
         self.counts: NDArray[np.int64] = output_counts(problem.counts)
         self.scale = PriorScale.of(problem.priors, problem.names)
@@ -257,7 +191,7 @@ class _Loop:
     def look(self, theta: Array) -> _Point:
         self.evaluations += 1
         evaluation = self.problem.evaluate(theta)
-        return _Point(theta, evaluation, sums_of_squares(evaluation))
+        return _Point(theta, evaluation, self.objective.errors.moments(evaluation))
 
     def move(self, point: _Point, halvings: int) -> None:
         """Make a point the current one, and a line of the history."""
@@ -274,12 +208,13 @@ class _Loop:
 
     def run(self, tolerance: float, max_iterations: int, resolution: float) -> Status:
         """Iterate until a step is small and the fixed point near, or nothing helps."""
-        pace = _Pace()
+        pace = Pace()
         for _ in range(max_iterations):
             variance = self.variance()
             equations = self.equations(variance)
             if not np.isfinite(equations.jacobian).all():
                 return Status.NOT_FINITE
+            self.state = self.step.prepare(self.state, equations)
             weight = self.step.rows(self.state, equations.jacobian)
             proposal = equations.solve(weight)
             pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
@@ -304,10 +239,10 @@ class _Loop:
                     return Status.NO_CONVERGENCE
             expected = equations.expected_gain(taken)
             ratio = won / expected if expected > 0 else 1.0
-            self.state = self.step.accept(self.state, equations.jacobian, ratio)
+            self.state = self.step.accept(self.state, equations.jacobian, ratio, taken)
         return Status.NO_CONVERGENCE
 
-    def part_of(self, proposal: Array, pace: _Pace, equations: Equations) -> float:
+    def part_of(self, proposal: Array, pace: Pace, equations: Equations) -> float:
         """How much of a proposal to take: more than all of it only well inside the support."""
         if pace.wanted <= 1:
             return pace.wanted
@@ -329,33 +264,56 @@ class _Loop:
             trial = self.look(self.scale.moved(self.point.theta, proposal))
             if trial.status.ok and self.merit(trial, variance) >= merit:
                 return trial, halvings, proposal
-            softer = self.step.refuse(self.state)
+            softer = self.step.refuse(self.state, proposal)
             if softer is None:
                 proposal = proposal / 2
             else:
-                self.state = softer
-                proposal = equations.solve(self.step.rows(softer, equations.jacobian))
+                self.state = self.step.prepare(softer, equations)
+                proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
         return (self.point if trial.status.ok else trial), _MAX_HALVINGS, proposal
 
+    @property
+    def pulls(self) -> bool:
+        """Whether the prior stays where it was declared and counts in the objective."""
+        return self.step.fixed_prior and self.objective.prior
+
     def variance(self) -> Array:
+        """Staged covariance of the errors at the current point."""
         unknowns = len(self.scale.sd)
-        return staged_variance(
-            self.point.sums, self.counts, unknowns, bias_corrected=self.bias_corrected
+        return self.objective.errors.stage(
+            self.point.moments, self.counts, unknowns, self.bias_corrected
         )
 
     def merit(self, point: _Point, variance: Array) -> float:
         """Objective with ``v`` held; the prior counts only where it is fixed at its centre."""
-        value = log_likelihood(point.sums, variance, self.counts)
-        if self.step.fixed_prior:
+        value = self.objective.errors.log_likelihood(point.moments, variance, self.counts)
+        if self.pulls:
             value += log_prior(self.scale.priors, point.theta)
         return value
 
     def equations(self, variance: Array) -> Equations:
-        theta = self.point.theta
-        rows = Linearised.of(self.point.evaluation, self.scale.unit(theta)).whitened(variance)
-        fixed = self.step.fixed_prior
-        slope = self.scale.slope(theta) if fixed else np.zeros(theta.size)
-        return Equations(*rows, slope, self.scale.room(theta), self.scale.root)
+        """Linear equations at the current point, with ``v`` held."""
+        theta, errors = self.point.theta, self.objective.errors
+        rows = errors.rows(self.point.evaluation, self.scale.unit(theta), variance)
+        slope = self.scale.slope(theta) if self.pulls else np.zeros(theta.size)
+        # a matrix has its entries' size on its diagonal
+        sizes = np.diag(variance) if variance.ndim == 2 else variance
+        noise = float(np.exp(0.5 * np.mean(np.log(sizes))))
+        place = theta / self.scale.unit(theta)
+        equations = Equations(*rows, slope, self.scale.room(theta), self.scale.root, place, noise)
+        if not self.step.second_order:
+            return equations
+        self.evaluations += 2 * theta.size
+        return newton_equations(
+            self.problem,
+            errors,
+            self.scale,
+            theta,
+            self.point.evaluation,
+            variance,
+            equations,
+            prior=self.pulls,
+        )
 
     def is_small(
         self, proposal: Array, equations: Equations, tolerance: float, resolution: float
@@ -364,6 +322,9 @@ class _Loop:
             return False
         if not self.step.locks and equations.distance() <= resolution:
             return True
+        if self.step.limits_length:  # a short step then means caution as often as arrival
+            own = equations.solve(equations.root)
+            proposal = np.where(np.abs(own) > np.abs(proposal), own, proposal)
         unit = self.scale.unit(self.point.theta)
         least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
         return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
@@ -371,7 +332,7 @@ class _Loop:
     def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:
         """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
         nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
-        rows = np.eye(len(equations.slope))
+        rows = equations.root
         if not self.step.fixed_prior:
             # A prior that only scales the steps must not hide how far the optimum is, if any.
             flat = self.scale.logarithmic & (equations.sd() > _FLAT)

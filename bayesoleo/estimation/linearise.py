@@ -34,7 +34,7 @@ class Linearised:
         """Compress an evaluation whose unknowns are measured in ``scale``, shape (l,)."""
         return cls(
             tuple(
-                _triangle(np.column_stack((sensitivity * scale, residual)))
+                triangle(np.column_stack((sensitivity * scale, residual)))
                 for residual, sensitivity in zip(
                     evaluation.residual, evaluation.sensitivity, strict=True
                 )
@@ -44,11 +44,11 @@ class Linearised:
     def whitened(self, variance: Array) -> tuple[Array, Array]:
         """Rows ``J`` (k, l) and ``e`` (k,) of ``A = J'J`` and ``b = -J'e``, for v (s,)."""
         rows = [factor / np.sqrt(v) for factor, v in zip(self.factors, variance, strict=True)]
-        stacked = _triangle(np.vstack(rows))
+        stacked = triangle(np.vstack(rows))
         return stacked[:, :-1], stacked[:, -1]
 
 
-def _triangle(matrix: Array) -> Array:
+def triangle(matrix: Array) -> Array:
     """Triangular factor of a tall matrix: blocks that stay in the cache first, then their factors.
 
     Orthogonal whatever the cut, and small enough for a linear algebra library to start no threads.
@@ -60,7 +60,7 @@ def _triangle(matrix: Array) -> Array:
     if blocks > 1 and 4 * width <= _BLOCK:
         cut = blocks * _BLOCK
         heads = np.linalg.qr(matrix[:cut].reshape(blocks, _BLOCK, width), mode="r")
-        return _triangle(np.vstack((heads.reshape(-1, width), matrix[cut:])))
+        return triangle(np.vstack((heads.reshape(-1, width), matrix[cut:])))
     return np.linalg.qr(matrix, mode="r")
 
 

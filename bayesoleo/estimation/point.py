@@ -53,6 +53,10 @@ class PointEstimate:
     history_halvings : ndarray of int, shape (iterations + 1,)
     on_limit : tuple of str
         Unknowns that lie on a limit of their prior's support.
+    objective_name : str
+        What was maximised, one of :data:`bayesoleo.estimation.OBJECTIVES`.
+    error_covariance : ndarray, shape (s, s), optional
+        Of the outputs' errors; diagonal unless the objective is of correlated ones.
     """
 
     names: tuple[str, ...]
@@ -74,6 +78,8 @@ class PointEstimate:
     history_objective: Array = field(repr=False)
     history_halvings: NDArray[np.int64] = field(repr=False)
     on_limit: tuple[str, ...] = ()
+    objective_name: str = "diagonal"
+    error_covariance: Array | None = field(default=None, repr=False)
 
     @property
     def sd(self) -> Array:

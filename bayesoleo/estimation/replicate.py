@@ -21,12 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.batch import BatchProblem, NormalEquations
 from bayesoleo.estimation.estimate import checked_start, estimate
+from bayesoleo.estimation.methods import method as find_method
 from bayesoleo.estimation.objectives import output_counts, staged_variance
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array
 from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.steps import Step
-from bayesoleo.estimation.steps import method as find_method
 from bayesoleo.parallel import single_blas_thread, thread_map
 from bayesoleo.solvers.status import Status
 

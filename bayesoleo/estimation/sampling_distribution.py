@@ -23,12 +23,12 @@ from bayesoleo.estimation.batch import BatchProblem
 from bayesoleo.estimation.bounds import cramer_rao, propagated
 from bayesoleo.estimation.curvature import prior_precision
 from bayesoleo.estimation.estimate import estimate
+from bayesoleo.estimation.methods import method as find_method
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array, Problem
 from bayesoleo.estimation.redraw import DataSource, NoiseBlock, data_source
 from bayesoleo.estimation.replicate import estimate_many
 from bayesoleo.estimation.shown import Shown, columns
-from bayesoleo.estimation.steps import method as find_method
 from bayesoleo.parallel import thread_map
 from bayesoleo.solvers.status import Status, count
 from bayesoleo.storage.slots import Arrays, Slots

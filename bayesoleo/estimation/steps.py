@@ -6,25 +6,25 @@ are carried on, and of whether the prior pulls: ``r`` is its slope for BE and ze
 
 References
 ----------
-Verbeek (1993), eqs. 3.19-3.23, with Hendriks's MMVE; Marquardt (1963), Moré (1978) and Nielsen
-(1999, IMM-REP-1999-05) for the damping.
+Verbeek (1993), eqs. 3.19-3.23, with Hendriks's MMVE.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from bayesoleo.errors import InputError
+from bayesoleo.estimation.equations import Equations
 from bayesoleo.estimation.problem import Array
 
 
 @dataclass(frozen=True)
-class Step:
-    """What an estimator adds to the least-squares equations; the base adds the prior's weight.
+class Step[State]:
+    """What an estimator adds to the least-squares equations.
 
     The state is whatever a step carries from one iteration to the next.
     """
@@ -42,25 +42,47 @@ class Step:
     #: whether the prior enters at all
     weighted: ClassVar[bool] = True
 
-    def begin(self, root: Array) -> Array:
-        """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
-        return root
+    #: whether it keeps steps within a length of its own
+    limits_length: ClassVar[bool] = False
+    #: iterations after which it is given up
+    most: ClassVar[int] = 100
+    #: whether it takes the residual's second derivatives into account
+    second_order: ClassVar[bool] = False
 
-    def rows(self, state: Array, jacobian: Array) -> Array:
-        """Rows ``P``, shape (l, l), for whitened sensitivities of shape (k, l)."""
+    @abstractmethod
+    def begin(self, root: Array) -> State:
+        """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
+
+    def prepare(self, state: State, equations: Equations) -> State:
+        """State with what the equations of this iteration ask for."""
         return state
 
-    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
+    @abstractmethod
+    def rows(self, state: State, jacobian: Array) -> Array:
+        """Rows ``P``, shape (l, l) or (0, l), for whitened sensitivities of shape (k, l)."""
+
+    def accept(self, state: State, jacobian: Array, ratio: float, taken: Array) -> State:
         """State after a step with these sensitivities, and its ratio of real to expected gain."""
         return state
 
-    def refuse(self, state: Array) -> Array | None:
+    def refuse(self, state: State, step: Array) -> State | None:
         """State with which to try a shorter step, or None to halve the step instead."""
         return None
 
 
 @dataclass(frozen=True)
-class BayesianStep(Step):
+class PriorStep(Step[Array]):
+    """A step whose state is the rows that it adds: at first the prior's."""
+
+    def begin(self, root: Array) -> Array:
+        return root
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        return state
+
+
+@dataclass(frozen=True)
+class BayesianStep(PriorStep):
     """Bayesian estimator, BE: the prior stays at its centre (Verbeek 1993, eq. 3.19)."""
 
     name: ClassVar[str] = "be"
@@ -69,7 +91,7 @@ class BayesianStep(Step):
 
 
 @dataclass(frozen=True)
-class ModifiedBayesianStep(Step):
+class ModifiedBayesianStep(PriorStep):
     """Modified Bayesian estimator, MBE: the prior is re-centred on the current estimate.
 
     It acts as a trust region; the fixed point is the maximum-likelihood point whatever the prior's
@@ -81,7 +103,7 @@ class ModifiedBayesianStep(Step):
 
 
 @dataclass(frozen=True)
-class MinimumVarianceStep(Step):
+class MinimumVarianceStep(PriorStep):
     """Minimum-variance estimator, MVE: the weight grows by ``A`` in every iteration.
 
     ``V <- (A + V^-1)^-1`` from ``V = diag(w)`` shrinks like 1/i, and so do the steps: the estimator
@@ -91,12 +113,12 @@ class MinimumVarianceStep(Step):
     name: ClassVar[str] = "mve"
     locks: ClassVar[bool] = True
 
-    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
+    def accept(self, state: Array, jacobian: Array, ratio: float, taken: Array) -> Array:
         return np.linalg.qr(np.vstack((jacobian, state)), mode="r")
 
 
 @dataclass(frozen=True)
-class ModifiedMinimumVarianceStep(Step):
+class ModifiedMinimumVarianceStep(PriorStep):
     """Modified MVE: the prior variance is added again in every iteration, so nothing locks up.
 
     The state is ``V``, zero at the start, above ``diag(w)``; the weight is ``(V + diag(w))^-1``
@@ -114,14 +136,14 @@ class ModifiedMinimumVarianceStep(Step):
         identity = np.eye(state.shape[1])
         return solve_triangular(cholesky(state[0] + state[1], lower=True), identity, lower=True)
 
-    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
+    def accept(self, state: Array, jacobian: Array, ratio: float, taken: Array) -> Array:
         triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")
         root = solve_triangular(triangle, np.eye(state.shape[1]))
         return np.stack((root @ root.T, state[1]))
 
 
 @dataclass(frozen=True)
-class GaussNewtonStep(Step):
+class GaussNewtonStep(PriorStep):
     """Gauss-Newton with a pseudo-inverse: the prior does not enter at all."""
 
     name: ClassVar[str] = "gauss-newton"
@@ -133,61 +155,15 @@ class GaussNewtonStep(Step):
 
 
 @dataclass(frozen=True)
-class LevenbergMarquardtStep(Step):
-    """Levenberg-Marquardt: like MBE, but the weight follows success instead of the prior.
+class NewtonStep(PriorStep):
+    """Newton's method on the objective with ``v`` eliminated (Verbeek 1993, Appendix A).
 
-    The state is the damping, the factor by which it grows when a step fails, and the longest
-    columns of the sensitivities so far, shape (2 + l,).
+    All that it adds is in its equations: see :func:`bayesoleo.estimation.newton.newton_equations`.
     """
 
-    name: ClassVar[str] = "levenberg-marquardt"
-    smallest: ClassVar[float] = 1e-14
-
-    def begin(self, root: Array) -> Array:
-        return np.concatenate(([1e-3, 2.0], np.zeros(len(root))))
+    name: ClassVar[str] = "newton"
+    fixed_prior: ClassVar[bool] = True
+    second_order: ClassVar[bool] = True
 
     def rows(self, state: Array, jacobian: Array) -> Array:
-        return np.sqrt(state[0]) * np.diag(self._length(state, jacobian))
-
-    def accept(self, state: Array, jacobian: Array, ratio: float) -> Array:
-        # a step as good as promised divides the damping by three, a useless one doubles it
-        factor = max(1 / 3, 1 - (2 * min(max(ratio, 0.0), 1.0) - 1) ** 3)
-        damping = max(state[0] * factor, self.smallest)
-        return np.concatenate(([damping, 2.0], self._length(state, jacobian)))
-
-    def refuse(self, state: Array) -> Array | None:
-        return np.concatenate(([state[0] * state[1], 2 * state[1]], state[2:]))
-
-    @staticmethod
-    def _length(state: Array, jacobian: Array) -> Array:
-        return np.maximum(state[2:], np.linalg.norm(jacobian, axis=0))
-
-
-METHODS: dict[str, Step] = {
-    step.name: step
-    for step in (
-        BayesianStep(),
-        MinimumVarianceStep(),
-        ModifiedMinimumVarianceStep(),
-        ModifiedBayesianStep(),
-        GaussNewtonStep(),
-        LevenbergMarquardtStep(),
-    )
-}
-
-
-def method(name: str | Step) -> Step:
-    """Estimator of this name, or the step itself.
-
-    Raises
-    ------
-    InputError
-        If there is no estimator of that name.
-    """
-    if isinstance(name, Step):
-        return name
-    if name not in METHODS:
-        raise InputError(
-            "there is no such estimator", key="method", value=name, hint=f"use {', '.join(METHODS)}"
-        )
-    return METHODS[name]
+        return np.zeros((0, jacobian.shape[1]))
