@@ -89,6 +89,7 @@ _HOMES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 #: Subpackages that are there without an import of their own, as ``bayesoleo.plots``.
 _SUBPACKAGES = (
+    "assessment",
     "data",
     "effects",
     "errors",

@@ -58,7 +58,7 @@ def findings(records: Sequence[Record]) -> list[str]:
         if times > 1:
             found.append(
                 f"run {record.label}: the motion repeats {times} times in a declared period; "
-                f"write frequency = {times * record.frequency:.6g}"
+                f"write frequency = {times * record.frequency:.4g}"
             )
         found += [_sentence(record, item) for item in drifting(record)]
     return found

@@ -1,0 +1,55 @@
+"""The commands that say how good an estimate is."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+
+@pytest.fixture
+def traced(run, campaign, model, tmp_path):
+    out = tmp_path / "traced"
+    result = run("trace", campaign, "--model", model, "--out", out, "--quiet")
+    assert result.exit_code == 0, result.output
+    return out / "results.nc"
+
+
+@pytest.mark.slow
+def test_result_is_assessed_in_words_numbers_and_pictures(run, traced, tmp_path):
+    result = run("assess", traced, "--figure", tmp_path / "look.png")
+    assert result.exit_code == 0, result.output
+    assert "over noise" in result.stdout
+    assert (tmp_path / "look-displacement.png").stat().st_size > 10_000
+    numbers = json.loads(run("assess", traced, "--json").stdout)
+    assert numbers["data_vars"]["runs_z"]["dims"] == ["output", "run"]
+    result = run("assess", traced, "--stage", "later")
+    assert result.exit_code == 2
+    assert "use 'before' or 'after'" in result.stderr
+
+
+def test_replications_go_on_where_they_were_stopped(run, campaign, model, tmp_path):
+    arguments = ["replicate", campaign, "--model", model, "--runs", "slow", "-n", 20, "--quiet"]
+    arguments += ["--out", tmp_path / "kept", "--jobs", 1]
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    assert "20 of 20 replications converged" in result.stdout
+    assert len(list((tmp_path / "kept").glob("slot-*.npz"))) == 1
+    assert run(*arguments).stdout == result.stdout
+
+
+def test_unknown_run_is_refused(refused, campaign, model):
+    line = refused("replicate", campaign, "--model", model, "--runs", "slaw")
+    assert "did you mean 'slow'" in line
+
+
+def test_half_the_frequency_is_warned_of(run, campaign):
+    toml = campaign / "campaign.toml"
+    text = toml.read_text(encoding="utf-8")
+    assert "frequency = 2.0" in text
+    toml.write_text(text.replace("frequency = 2.0", "frequency = 1.0"), encoding="utf-8")
+    result = run("reduce", campaign, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "warning: run fast: the motion repeats 2 times" in result.stderr
+    assert "write frequency = 2" in result.stderr
+    assert len(json.loads(run("reduce", campaign, "--json").stdout)["findings"]) == 1
