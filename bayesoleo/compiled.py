@@ -38,7 +38,8 @@ _POINTER = types.CPointer(types.float64)
 #: ``kernel(z (nz, BLOCK), u (nu, BLOCK), p (np,), out (rows, BLOCK), count)``.
 SIGNATURE = types.void(_POINTER, _POINTER, _POINTER, _POINTER, types.intp)
 
-_COMPILING = threading.Lock()
+#: Held while a function is compiled or loaded: threads that solve different runs ask for the same.
+COMPILING = threading.RLock()
 
 
 class BlockKernel:
@@ -58,7 +59,7 @@ class BlockKernel:
     @cached_property
     def pointer(self) -> Any:
         """The compiled function, to be passed to compiled code."""
-        with _COMPILING:
+        with COMPILING:
             return numba.cfunc(SIGNATURE, cache=True, error_model="numpy")(self.function)
 
     def __call__(
@@ -195,8 +196,11 @@ def load(source: str) -> ModuleType:
     The file is named by the source's hash: other source never meets another's compiled code.
     """
     name = "bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24]
-    if name in sys.modules:
-        return sys.modules[name]
+    with COMPILING:  # a module stands in the table of modules before it is whole
+        return sys.modules[name] if name in sys.modules else _import(name, source)
+
+
+def _import(name: str, source: str) -> ModuleType:
     path = cache_folder() / f"{name}.py"
     if not path.is_file():
         _write_atomically(path, source)

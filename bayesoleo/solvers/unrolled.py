@@ -10,16 +10,15 @@ do not overlap.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numba
 import numpy as np
 from numba import types
 
-from bayesoleo.compiled import BLOCK, load
+from bayesoleo.compiled import BLOCK, COMPILING, load
 from bayesoleo.solvers.sweep import SMALL_PIVOT
 from bayesoleo.solvers.tableau import Tableau
 
@@ -443,11 +442,31 @@ def _compile(parts: Sequence[str]) -> dict[str, Any]:
     }
 
 
-@cache
 def differences(
     orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
 ) -> Program | None:
     """Code for backward differences, or None where it would be too long."""
+    return _known(("differences", orders), lambda: _differences(orders, first, second))
+
+
+def collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
+    """Code for a collocation method, or None where it would be too long."""
+    return _known((method.name, orders), lambda: _collocation(method, orders))
+
+
+_PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
+
+
+def _known(key: tuple[str, tuple[int, ...]], make: Callable[[], Program | None]) -> Program | None:
+    with COMPILING:
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = make()
+        return _PROGRAMS[key]
+
+
+def _differences(
+    orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
+) -> Program | None:
     d = len(orders)
     if not 1 <= d <= 2:
         return None
@@ -472,17 +491,6 @@ def differences(
         order=order,
         transfer=d * (3 * d + 1),
     )
-
-
-_COLLOCATIONS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
-
-
-def collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
-    """Code for a collocation method, or None where it would be too long."""
-    key = (method.name, orders)
-    if key not in _COLLOCATIONS:
-        _COLLOCATIONS[key] = _collocation(method, orders)
-    return _COLLOCATIONS[key]
 
 
 def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
