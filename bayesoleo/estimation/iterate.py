@@ -191,7 +191,10 @@ class _Loop:
     def look(self, theta: Array) -> _Point:
         self.evaluations += 1
         evaluation = self.problem.evaluate(theta)
-        return _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        if not evaluation.status.ok:
+            return _Point(theta, evaluation, np.array([np.nan]))
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+            return _Point(theta, evaluation, self.objective.errors.moments(evaluation))
 
     def move(self, point: _Point, halvings: int) -> None:
         """Make a point the current one, and a line of the history."""
