@@ -14,6 +14,7 @@ from bayesoleo.estimation.intervals import (
 from bayesoleo.estimation.iterate import Iteration
 from bayesoleo.estimation.laplace import mode_covariance
 from bayesoleo.estimation.methods import METHODS
+from bayesoleo.estimation.multiple_shooting import ShootingEstimate, Trajectory, multiple_shooting
 from bayesoleo.estimation.multistart import Modes, multistart
 from bayesoleo.estimation.nuisance import Nuisance, declared_nuisance
 from bayesoleo.estimation.objective import OBJECTIVES, Objective
@@ -50,8 +51,10 @@ __all__ = [
     "PointEstimate",
     "Problem",
     "Replications",
+    "ShootingEstimate",
     "Shown",
     "Step",
+    "Trajectory",
     "as_text",
     "between_runs",
     "data_against_prior",
@@ -68,6 +71,7 @@ __all__ = [
     "log_posterior",
     "log_prior",
     "mode_covariance",
+    "multiple_shooting",
     "multistart",
     "output_counts",
     "over_experiments",
