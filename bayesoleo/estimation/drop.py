@@ -95,8 +95,12 @@ class Drop:
         section = Held(self.problem, theta, held)
         method = "be" if self.kind == "posterior" else "mbe"
         found = estimate(section, method, tolerance=1e-5)
+        if not found.status.ok:  # the start was foreseen badly; the estimate itself is another
+            again = estimate(section, method, tolerance=1e-5, start=self.point.theta[section.free])
+            # A loop that stopped short is still a point of the section: it bounds the least fall.
+            objectives = np.nan_to_num([found.objective, again.objective], nan=-np.inf)
+            found = again if objectives[1] > objectives[0] or again.status.ok else found
         whole = section.full(found.theta)
-        # A loop that stopped short is still a point of the section: its fall bounds the least one.
         if not np.isfinite(found.objective):
             return np.inf, theta
         return float(self._fresh(whole)), whole

@@ -39,7 +39,7 @@ class Plane:
     block : ndarray, shape (2, 2)
         Curvature in the plane.
     covariance : ndarray, shape (l, l)
-        Inverse curvature in the unknowns of ``drop``; may be NaN.
+        Inverse curvature in the unknowns of ``drop``, with the prior's.
     """
 
     drop: Drop
@@ -69,15 +69,16 @@ class Plane:
             with np.errstate(invalid="ignore"):
                 shadow = block - cross @ inverse_scaled(matrix[np.ix_(others, others)]) @ cross.T
             block = shadow if np.isfinite(shadow).all() else block
-            return cls(drop, pair, block, inverse_scaled(matrix))
+            return cls(drop, pair, block, _foresight(drop, matrix))
         point, order = drop.point, sorted(index)
         section = Held(drop.problem, point.theta, others)
         inside = replace(point, names=section.names, theta=point.theta[order])
+        own = Drop(section, inside, drop.kind)
         return cls(
-            drop=Drop(section, inside, drop.kind),
+            drop=own,
             pair=(order.index(pair[0]), order.index(pair[1])),
             block=block,
-            covariance=inverse_scaled(matrix[np.ix_(order, order)]),
+            covariance=_foresight(own, matrix[np.ix_(order, order)]),
         )
 
     @property
@@ -176,3 +177,9 @@ class Plane:
         if len(self.drop.problem.names) == 2:
             return self.drop(theta)
         return np.array([self.drop.profiled(row, self.pair)[0] for row in theta])
+
+
+def _foresight(drop: Drop, matrix: Array) -> Array:
+    """Inverse curvature with the prior's, by which steps are foreseen where the data are silent."""
+    precision = np.array([prior.sd**-2 for prior in drop.problem.priors])
+    return inverse_scaled(matrix + np.diag(precision))

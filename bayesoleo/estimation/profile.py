@@ -83,7 +83,9 @@ def profile(
     for name in chosen:
         if progress is not None:
             progress(name)
-        lines.append(Line.follow(drop, problem.names.index(name), limit, covariance))
+        # The covariance with the prior foresees steps: without it a direction that the data leave
+        # open would throw the others out of sight.
+        lines.append(Line.follow(drop, problem.names.index(name), limit, point.covariance))
     problem.evaluate(point.theta)
     data = _dataset(problem, point, chosen, lines, limit, covariance)
     data.attrs = {"kind": drop.kind, "level": level}
@@ -122,12 +124,14 @@ class Line:
         limit : float
             Root of twice the fall.
         covariance : ndarray, shape (l, l)
-            By linearisation; it foresees steps and may be NaN.
+            By linearisation and with the prior; it foresees steps.
         """
         theta = drop.point.theta
-        below = _side(drop, index, -1.0, limit, covariance)
-        above = _side(drop, index, 1.0, limit, covariance)
         here = (float(theta[index]), 0.0, theta)
+        below, above = (
+            _refined(drop, index, here, _side(drop, index, sign, limit, covariance), limit)
+            for sign in (-1.0, 1.0)
+        )
         points = [*reversed(below), here, *above]
         return cls(
             values=np.array([p[0] for p in points]),
@@ -174,6 +178,21 @@ def _side(drop: Drop, index: int, sign: float, limit: float, covariance: Array) 
         pace = gained / taken if gained > 0 else 0.0
         step = min(2 * taken, _PART * limit / pace) if pace > 0 else 2 * taken
     return stops
+
+
+def _refined(drop: Drop, index: int, here: Stop, stops: list[Stop], limit: float) -> list[Stop]:
+    """The same side with one more stop, where the limit is foreseen by interpolation."""
+    place = _crossing([here, *stops], limit, np.nan)
+    if np.isnan(place):
+        return stops
+    next_to = min(range(len(stops)), key=lambda k: abs(stops[k][0] - place))
+    start = stops[next_to][2].copy()
+    start[index] = place
+    fall, found = drop.profiled(start, [index])
+    if not np.isfinite(fall) or any(stop[0] == place for stop in stops):
+        return stops
+    whole = [*stops, (place, max(fall, 0.0), found)]
+    return sorted(whole, key=lambda stop: abs(stop[0] - here[0]))
 
 
 def _inside(drop: Drop, theta: Array, index: int, value: float) -> Array:

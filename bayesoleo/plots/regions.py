@@ -82,6 +82,10 @@ def profile(data: xr.Dataset) -> Figure:
         axes.plot(value[keep], fall[keep], "o-", color=style.AFTER, lw=1.6, ms=3)
         axes.axhline(level, color=style.NEUTRAL, lw=0.8)
         axes.set_ylim(0, 1.6 * level)
+        # The parabola of a parameter that the data leave open would squeeze all else to a point.
+        low, high = value[keep].min(), value[keep].max()
+        if high > low:
+            axes.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
         _dress(axes, [name, "fall"])
     handles = [
         style.line(style.AFTER, f"{data.attrs['kind']}, others re-estimated"),

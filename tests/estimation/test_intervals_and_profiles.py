@@ -137,6 +137,30 @@ def test_profile_tells_what_linearisation_does_not(bent):
     assert float(tighter["high"][0] - tighter["low"][0]) < high - low
 
 
+def test_limits_do_not_suffer_from_what_is_open_beside_them():
+    """Only the quotient of area and volume is seen; the exponent's limits are those at any area."""
+    x = np.linspace(0.0, 0.12, 60)
+
+    def spring(stroke, t):
+        with np.errstate(invalid="ignore"):
+            return t[0] * (1 - 10 * t[2] * stroke / t[3]) ** -t[1]
+
+    y = spring(x, [4.9, 1.1, 3.5, 9.2]) + 0.05 * np.random.default_rng(2).normal(size=60)
+    priors = [Normal(4.9, 0.5), Normal(1.2, 0.15), Normal(3.5, 0.35), Normal(9.2, 0.9)]
+    whole = FunctionProblem(spring, x, y, priors, ["pressure", "exponent", "area", "volume"])
+    point = estimate(whole, tolerance=1e-8)
+    area = point["area"]
+    fixed = FunctionProblem(
+        lambda s, t: spring(s, [t[0], t[1], area, t[2]]), x, y, [priors[k] for k in (0, 1, 3)]
+    )
+    found = profile(whole, point, ["exponent", "area"])
+    expected = profile(fixed, estimate(fixed, tolerance=1e-8), ["theta2"])
+    for end in ("low", "high"):
+        assert float(found[end][0]) == pytest.approx(float(expected[end][0]), rel=1e-3)
+    assert np.isinf(found["low"][1])
+    assert np.isinf(found["high"][1])
+
+
 def test_side_without_limit_is_open():
     """Beyond a slope of 50 all steps look alike at these samples."""
     x = np.linspace(-1.0, 1.0, 20)
