@@ -38,7 +38,7 @@ print(f"{time.perf_counter() - begin:.1f} s")
 
 # %%
 # No bias is seen, although ten thousand replications would show some hundredths of a standard
-# deviation. The efficiency is one: no unbiased estimator scatters less than least squares does here.
+# deviation. The efficiency is one: no unbiased estimator scatters less than least squares here.
 
 figure = plots.sampling_distribution(found.data)
 
