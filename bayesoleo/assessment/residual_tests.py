@@ -62,7 +62,7 @@ def runs_of_signs(residual: Array) -> Outcome:
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
-    """Autocorrelation about the mean at lags ``0 .. lags``, each over its own overlap.
+    """Autocorrelation about the mean at lags 0 to ``lags``, each over its own overlap.
 
     Parameters
     ----------

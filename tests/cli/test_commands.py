@@ -20,7 +20,8 @@ COMMANDS = tuple(typer.main.get_command(app).commands)
 
 def test_the_commands_are_these():
     expected = {"demo", "close", "check", "reduce", "estimate", "sample", "trace"}
-    assert set(COMMANDS) == expected | {"simulate", "report", "systems", "effects"}
+    expected |= {"simulate", "report", "systems", "effects", "assess", "replicate"}
+    assert set(COMMANDS) == expected
 
 
 @pytest.mark.parametrize("command", COMMANDS)
