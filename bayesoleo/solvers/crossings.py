@@ -103,9 +103,10 @@ def _signs(row: Array) -> Array:
 
 
 def _root(values: Callable[[Array], Array], k: int, low: float, high: float) -> float:
-    # A zero at an end has its neighbour's sign, and needs not to be looked for.
-    for end in (low, high):
-        if values(np.array([end]))[k, 0] == 0.0:
-            return end % 1.0
-    result = find_root(lambda phase: values(phase)[k], (np.array([low]), np.array([high])))
-    return float(result.x[0]) % 1.0 if result.success[0] else 0.5 * (low + high)
+    ends = np.array([low, high])
+    at = values(ends)[k]
+    if at[0] * at[1] >= 0.0:
+        # The sign of an end that is zero but for round-off is its neighbour's: the zero is there.
+        return float(ends[np.argmin(np.abs(at))]) % 1.0
+    result = find_root(lambda phase: values(phase)[k], (ends[:1], ends[1:]))
+    return float(result.x[0]) % 1.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,53 +30,48 @@ ROUGH = 1e-3
 def solve_stiffening(
     problem: PeriodicProblem,
     p: Array,
+    start: Motion | Start,
     index: int,
-    start: Motion,
     *,
+    method: str = "radau3",
     tolerance: float = 1e-6,
-    **options: Any,
+    max_steps: int = 20_000,
 ) -> AdaptiveSolution:
     """Solve directly or, where that fails, by continuation in a stiffness.
 
     Parameters
     ----------
-    problem : PeriodicProblem
-        Equations and inputs.
-    p : ndarray, shape (np,)
-        Constants, the stiffness at its full value.
+    problem, p, start
+        As for :func:`~bayesoleo.solvers.adaptive.solve_adaptive`, the stiffness at its full value.
     index : int
         Of the stiffness among the constants.
-    start : callable
-        A guess of the motion, as for :func:`~bayesoleo.solvers.adaptive.solve_adaptive`.
-    tolerance : float
+    method, tolerance, max_steps
         As there; on the way errors of 1e-3 are enough.
-    **options
-        As there.
 
     Returns
     -------
     AdaptiveSolution
-        ``orbit.evaluations`` counts all that was spent on the way.
+        ``orbit.evaluations`` counts all that was spent on the way. Where the walk ends before the
+        full stiffness, the direct solution and its status.
     """
-    direct = solve_adaptive(problem, p, start, tolerance=tolerance, **options)
+    way = _Way(problem, p, index, method, max_steps)
+    direct = way.solve(p[index], start, tolerance)
     if direct.orbit.status is Status.CONVERGED or not p[index] > 0.0:
         return direct
-    way = _Way(problem, p, index, max(tolerance, ROUGH), options)
-    spent = direct.orbit.evaluations
+    spent, rough = direct.orbit.evaluations, max(tolerance, ROUGH)
     for k in range(1, TRIALS + 1):
-        here = way.solve(p[index] * SOFTER**k, start)
+        here = way.solve(p[index] * SOFTER**k, start, rough)
         spent += here.orbit.evaluations
         if here.orbit.status is Status.CONVERGED:
             break
     else:
         return _spent(direct, spent)
-    here, walked = way.walk(here)
+    here, walked = way.walk(here, rough)
     spent += walked
-    if here.p[index] == p[index]:
-        here = solve_adaptive(problem, p, here.start(), tolerance=tolerance, **options)
-        spent += here.orbit.evaluations
-        return _spent(here, spent)
-    return _spent(direct, spent)
+    if here.p[index] != p[index]:
+        return _spent(direct, spent)
+    last = way.solve(p[index], here.start(), tolerance)
+    return _spent(last, spent + last.orbit.evaluations)
 
 
 def _spent(solution: AdaptiveSolution, evaluations: int) -> AdaptiveSolution:
@@ -86,29 +80,33 @@ def _spent(solution: AdaptiveSolution, evaluations: int) -> AdaptiveSolution:
 
 @dataclass(frozen=True, eq=False)
 class _Way:
+    """Solutions at any value of the stiffness."""
+
     problem: PeriodicProblem
     p: Array
     index: int
-    tolerance: float
-    options: dict[str, Any]
+    method: str
+    max_steps: int
 
-    def solve(self, value: float, start: Motion | Start) -> AdaptiveSolution:
+    def solve(self, value: float, start: Motion | Start, tolerance: float) -> AdaptiveSolution:
         p = self.p.copy()
         p[self.index] = value
-        return solve_adaptive(self.problem, p, start, tolerance=self.tolerance, **self.options)
+        return solve_adaptive(
+            self.problem, p, start,
+            method=self.method, tolerance=tolerance, max_steps=self.max_steps,
+        )  # fmt: skip
 
-    def walk(self, here: AdaptiveSolution) -> tuple[AdaptiveSolution, int]:
-        """As far towards the full stiffness as steps succeed."""
+    def walk(self, here: AdaptiveSolution, tolerance: float) -> tuple[AdaptiveSolution, int]:
+        """As far towards the full stiffness as steps succeed, and the evaluations it took."""
         step, spent, full = np.log(FIRST_STEP), 0, self.p[self.index]
         before: AdaptiveSolution | None = None
         while here.p[self.index] < full and step > np.log(SMALLEST_STEP):
             now = here.p[self.index]
-            value = min(full, now * np.exp(step))
-            warp = SAME
+            value, warp = min(full, now * np.exp(step)), SAME
             if before is not None:
                 length = np.log(value / now) / np.log(now / before.p[self.index])
                 warp = extrapolate(before.level.kinks, here.level.kinks, length)
-            trial = self.solve(value, here.start(warp))
+            trial = self.solve(value, here.start(warp), tolerance)
             spent += trial.orbit.evaluations
             if trial.orbit.status is Status.CONVERGED:
                 before, here, step = here, trial, min(2 * step, np.log(LARGEST_STEP))

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import Polynomial, legendre
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
@@ -57,12 +58,16 @@ class Tableau:
             They turn stage values of the highest derivative into that derivative, the one below and
             the one below that.
         """
-        polynomials = _lagrange(self.c)
-        tables = [
-            np.stack([p.integ(k)(position) if k else p(position) for p in polynomials], axis=-1)
-            for k in range(3)
-        ]
+        tables = [np.asarray(polyval(position, c).T, float) for c in _coefficients(tuple(self.c))]
         return tables[0], tables[1], tables[2]
+
+
+@cache
+def _coefficients(c: tuple[float, ...]) -> list[Array]:
+    """Coefficients of the Lagrange polynomials and of their integrals, (degree + 1, s) each."""
+    polynomials = _lagrange(np.array(c))
+    columns = [[(p.integ(k) if k else p).coef for p in polynomials] for k in range(3)]
+    return [np.array(column, dtype=float).T.copy() for column in columns]
 
 
 def _lagrange(c: Array) -> list[Polynomial]:

@@ -1,0 +1,182 @@
+"""What must hold for a solution on any mesh, independent codes, and failures by their names."""
+
+import numpy as np
+import pytest
+from periodic_problems import coupled, duffing, friction_oscillator, harmonics, relaxation
+from scipy.integrate import solve_bvp, solve_ivp
+
+from bayesoleo.errors import InputError
+from bayesoleo.model import Model, Parameter
+from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.solvers.crossings import Crossings, find_crossings
+from bayesoleo.solvers.mesh import equidistant
+from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.switched import state_rows
+from bayesoleo.solvers.warp import SAME, extrapolate, warp_between
+from bayesoleo.systems import system
+
+FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
+FREQUENCY, PERIOD = 0.2, 5.0
+
+
+def answer(model, phase=0.0, **options):
+    found = periodic_answer(
+        model, RunPlan("run", FREQUENCY, {"force": FORCE}, phase=phase), **options
+    )
+    assert found.orbit.status is Status.CONVERGED
+    return found
+
+
+@pytest.mark.parametrize(
+    "model", [duffing(quadratic=0.5), coupled(), relaxation()], ids=lambda m: m.name
+)
+def test_a_shift_of_phase_shifts_the_solution(model):
+    shift, phase = 0.37, np.linspace(0.0, 1.0, 500)
+    here, later = answer(model), answer(model, phase=shift)
+    moved, other = here.solution.motion(phase + shift), later.solution.motion(phase)
+    kept = state_rows(here.solution.level.scheme.orders)
+    size = np.abs(moved).max(axis=1)[kept, None]
+    # Both are good to 1e-6, on meshes that differ.
+    np.testing.assert_allclose((moved[kept] - other[kept]) / size, 0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "model", [duffing(quadratic=0.5), friction_oscillator()], ids=lambda m: m.name
+)
+def test_work_done_equals_what_is_dissipated(model):
+    found = answer(model, tolerance=1e-7)
+    phase = (np.arange(20000) + 0.5) / 20000
+    velocity = found.dof("q", phase, 1)
+    force = FORCE.evaluate(phase, FREQUENCY)
+    lost = 0.3 * velocity**2 + 0.5 * np.abs(velocity) ** 3
+    if model.name == "friction":
+        lost, force = lost + 0.4 * velocity * np.arctan(3 * velocity), force - 0.1
+    work = np.mean(force * velocity)
+    assert work > 0.02
+    # The midpoint rule errs by 1e-9 at most, velocities by 1e-7 of theirs.
+    assert work == pytest.approx(np.mean(lost), rel=1e-6)
+
+
+def test_floquet_multipliers_obey_liouville_across_a_contact():
+    """Their product is the exponential of the integral of the trace, contacts or not."""
+    plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
+    found = periodic_answer(system("end_stop"), plan, {"stop_stiffness": 2500.0})
+    phase = (np.arange(100_000) + 0.5) / 100_000
+    trace = np.mean(-2.0 * np.abs(found.dof("stroke", phase, 1)))
+    product = np.prod(found.orbit.multipliers)
+    assert abs(product.imag) < 1e-12
+    assert product.real == pytest.approx(np.exp(trace), rel=1e-5)
+
+
+def rates(t, y):
+    force = FORCE.evaluate(np.atleast_1d(FREQUENCY * t), FREQUENCY).reshape(np.shape(t))
+    q, v = y
+    return np.array([v, force - 0.3 * v - 0.5 * v * np.abs(v) - q - q**3])
+
+
+@pytest.mark.reference
+def test_agrees_with_a_boundary_value_solver_and_with_integration():
+    found = answer(duffing(quadratic=0.5), tolerance=1e-8)
+    times = np.linspace(0.0, PERIOD, 101)
+    run = solve_ivp(rates, (0, 40 * PERIOD), np.zeros(2), method="LSODA", rtol=1e-10, atol=1e-11)
+    # The integrator's own error is some ten times its tolerance.
+    np.testing.assert_allclose(found.orbit.states[0], run.y[:, -1], atol=5e-8)
+    other = solve_bvp(
+        rates, lambda a, b: a - b, times, found.solution.motion(times / PERIOD)[:2] * 0.9, tol=1e-7
+    )
+    assert other.status == 0
+    np.testing.assert_allclose(
+        found.solution.motion(times / PERIOD)[:2], other.sol(times), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("model", [duffing(quadratic=0.5), coupled()], ids=lambda m: m.name)
+def test_sensitivities_are_those_of_the_solution(model):
+    found, step = answer(model, tolerance=1e-8), 1e-4
+    rows = found.solution.level.scheme.orders
+    by = found.solution.sensitivities()[0]
+    for k, name in enumerate(model.estimated()):
+        nominal = model.parameters[name].value
+        ends = [
+            answer(model, tolerance=1e-10, values={name: nominal + sign * step}).orbit.states[0]
+            for sign in (1, -1)
+        ]
+        difference = (ends[0] - ends[1]) / (2 * step)
+        # Differences err by 1e-10 / 1e-4 of the solutions and by step**2.
+        np.testing.assert_allclose(by[: sum(rows), k], difference, atol=1e-5)
+
+
+def test_failures_have_names():
+    plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
+    model = system("end_stop")
+    few = periodic_answer(model, plan, {"stop_stiffness": 2500.0}, tolerance=1e-9, max_steps=100)
+    assert few.orbit.status is Status.TOLERANCE_NOT_MET
+    assert few.orbit.error > 1e-9
+    assert "tolerance" in few.orbit.status.message
+    stiff = periodic_answer(model, plan, {"stop_stiffness": 1e8})
+    assert stiff.orbit.status is Status.NO_CONVERGENCE
+    assert np.isnan(stiff.orbit.multipliers).all()
+    assert not stiff.orbit.stable
+    free = Model(
+        "free mass",
+        inputs={"force": "N"},
+        dofs={"q": "m"},
+        parameters={"mass": Parameter(1.0, sd=0.1)},
+        equations={"q": "mass*ddot(q) - force"},
+        outputs={"displacement": "q"},
+    )
+    adrift = periodic_answer(free, RunPlan("run", FREQUENCY, {"force": FORCE}))
+    assert adrift.orbit.status is Status.SINGULAR
+
+
+def test_wrong_names_are_told():
+    plan, model = RunPlan("run", FREQUENCY, {"force": FORCE}), duffing()
+    with pytest.raises(
+        InputError, match=r"key masss: no such parameter; parameters there are: mass"
+    ):
+        periodic_answer(model, plan, {"masss": 1.0})
+    with pytest.raises(InputError, match=r"key stiffness: no such parameter .got .stif.."):
+        periodic_answer(model, plan, stiffness="stif")
+    with pytest.raises(InputError, match=r"needs the input 'force'"):
+        periodic_answer(model, RunPlan("run", FREQUENCY, {}))
+    with pytest.raises(InputError, match=r"no such dof.*there are q"):
+        answer(model).dof("x", np.zeros(1))
+
+
+def test_crossings_are_found_wherever_they_are():
+    """Both zeros of a shifted cosine, of a function that touches zero none."""
+
+    def values(phase):
+        turn = 2 * np.pi * phase
+        return np.stack([np.cos(turn) - 0.5, 1.0 + np.cos(turn), np.sin(turn) + 2.0])
+
+    found = find_crossings(values, equidistant(10))
+    np.testing.assert_allclose(found.phases, [1 / 6, 5 / 6], atol=1e-14)
+    assert found.labels == (((0, False),), ((0, True),))
+    np.testing.assert_array_equal(
+        found.modes(np.array([0.0, 0.5, 0.9])), [[1, 0, 1], [1, 1, 1], [1, 1, 1]]
+    )
+
+
+def kinks(*phases):
+    return Crossings(
+        np.array(phases), tuple(((0, k % 2 == 1),) for k in range(len(phases))), (True,)
+    )
+
+
+def test_a_warp_moves_kinks_onto_kinks_and_back():
+    warp = warp_between(kinks(0.2, 0.4), kinks(0.3, 0.35))
+    np.testing.assert_allclose(
+        warp.forward(np.array([0.0, 0.2, 0.3, 0.4, 1.0])), [0, 0.3, 0.325, 0.35, 1]
+    )
+    phase = np.linspace(0, 1, 50)
+    np.testing.assert_allclose(warp.back(warp.forward(phase)), phase, atol=1e-15)
+    assert warp_between(kinks(0.2, 0.4), kinks(0.2)) is SAME
+
+
+def test_contacts_are_extrapolated_in_geometric_proportion():
+    """A contact between 0.5 and 0.5 + d shrinks from 0.04 to 0.02; next comes 0.01."""
+    next_ = extrapolate(kinks(0.5, 0.54), kinks(0.5, 0.52), 1.0)
+    contact = np.diff(next_.forward(np.array([0.5, 0.52])))[0]
+    assert contact == pytest.approx(0.01, rel=0.02)

@@ -1,0 +1,125 @@
+"""Adaptive meshes: the error asked for, kinks that cost no order, and ever stiffer end stops."""
+
+import numpy as np
+import pytest
+from periodic_problems import duffing, friction_oscillator, harmonics
+
+from bayesoleo.model.kernels import kernels
+from bayesoleo.prediction.orbit import adaptive_problem, periodic_answer
+from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.solvers.adaptive import solve_adaptive
+from bayesoleo.solvers.mesh import Mesh, equidistant
+from bayesoleo.solvers.moving_edges import solve_on
+from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.switched import PeriodicProblem
+from bayesoleo.solvers.tableau import tableau
+from bayesoleo.systems import system
+
+FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
+END_STOP = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
+#: Verbeek (1993), section 4.3.3: state at t = 0 from 60 periods of LSODA at rtol 1e-9.
+REFERENCE = {
+    0.0: (-0.1191663, 4.69243733),
+    100.0: (0.78113832, 3.26503319),
+    2500.0: (0.83680069, 0.77678702),
+    1e5: (0.82009573, 1.08562218),
+    1e8: (0.8157393, 1.211127),
+    1e11: (0.8155908, 1.2154198),
+}
+
+
+PLAN = RunPlan("run", 0.2, {"force": FORCE})
+
+
+def end_stop(theta, **options):
+    values = {"stop_stiffness": theta}
+    return periodic_answer(system("end_stop"), END_STOP, values, **options)
+
+
+@pytest.mark.parametrize("method", ["radau2", "radau3", "gauss2", "gauss3"])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
+@pytest.mark.parametrize(
+    "model", [duffing(quadratic=0.5), friction_oscillator()], ids=lambda m: m.name
+)
+def test_the_error_is_below_its_estimate_and_that_below_the_tolerance(model, method, tolerance):
+    exact = periodic_answer(model, PLAN, tolerance=1e-9, method="gauss3").solution
+    found = periodic_answer(model, PLAN, tolerance=tolerance, method=method)
+    assert found.orbit.status is Status.CONVERGED
+    phase = np.linspace(0.0, 1.0, 2000)
+    states = exact.motion(phase)[:2]
+    size = np.abs(states).max(axis=1, keepdims=True)
+    error = np.max(np.abs(found.solution.motion(phase)[:2] - states) / size)
+    assert error < found.orbit.error <= tolerance
+
+
+@pytest.mark.parametrize("theta", [0.0, 100.0, 2500.0])
+def test_end_stop_agrees_with_long_integration(theta):
+    answer = end_stop(theta)
+    assert answer.orbit.status is Status.CONVERGED
+    assert answer.orbit.stable
+    # The reference's own error, which shows where the mesh is refined: 4e-8.
+    np.testing.assert_allclose(answer.orbit.states[0], REFERENCE[theta], atol=1e-7)
+    assert answer.orbit.states.shape[0] < 250
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("theta", [1e5, 1e8, 1e11])
+def test_a_walk_along_the_stiffness_reaches_stiff_stops(theta):
+    """Beyond 2500 Verbeek (1993) had to shoot. Wanted: 1e-4 in position, 1e-3 in velocity."""
+    answer = end_stop(theta, stiffness="stop_stiffness")
+    assert answer.orbit.status is Status.CONVERGED
+    np.testing.assert_allclose(answer.orbit.states[0], REFERENCE[theta], atol=5e-7)
+    # The stop is hit once; edges stand on the contact's ends and on both reversals of velocity.
+    assert answer.solution.level.kinks.phases.size == 4
+    assert answer.orbit.states.shape[0] < 300
+
+
+@pytest.mark.slow
+def test_a_stiffer_contact_needs_no_more_steps():
+    """The contact shrinks ten times and its steps with it: their number stays."""
+    soft, stiff = (end_stop(theta, stiffness="stop_stiffness") for theta in (1e6, 1e8))
+    assert stiff.orbit.states.shape[0] < 1.3 * soft.orbit.states.shape[0]
+    shortest = [np.diff(item.solution.mesh.edges).min() for item in (soft, stiff)]
+    assert shortest[0] / shortest[1] == pytest.approx(10.0, rel=0.5)
+
+
+def at_the_start(method, n, exact, kinks):
+    """Error of the first state on ``n`` steps between kinks, or on as many equal steps."""
+    problem = adaptive_problem(system("end_stop"), END_STOP)[1]
+    mesh = equidistant(5 * n)
+    if kinks is not None:
+        ends = np.concatenate([[0.0], kinks.phases, [1.0]])
+        mesh = Mesh(np.interp(np.arange(5 * n + 1) / n, np.arange(ends.size), ends))
+    level = solve_on(problem, tableau(method), exact.p, mesh, exact.motion, kinks)
+    assert level.status is Status.CONVERGED
+    return np.abs(level.x[0, :2] - exact.motion(np.zeros(1))[:2, 0]).max()
+
+
+def test_edges_on_kinks_keep_the_order_of_the_method():
+    """Across a contact, which costs equal steps all of it."""
+    exact = end_stop(2500.0, tolerance=1e-10, method="gauss3").solution
+    kinks = exact.level.kinks
+    for method, order in {"radau2": 3, "radau3": 5, "gauss2": 4, "gauss3": 6}.items():
+        coarse, fine = (at_the_start(method, n, exact, kinks) for n in (24, 48))
+        assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
+    equal = at_the_start("gauss3", 48, exact, None)
+    assert equal > 1e4 * fine
+
+
+def test_kinks_that_are_not_declared_are_found_by_shorter_steps():
+    model = system("end_stop")
+    plain = kernels(model, backend="numpy")
+    force = END_STOP.inputs["force"]
+    problem = PeriodicProblem(
+        plain, plain.derived.orders, 1.0, lambda phase: force.evaluate(phase, 1.0)[None], 1, 1
+    )
+    nominal = {str(item): value for item, value in model.nominal().items()}
+    p = np.array([nominal[name] for name in plain.derived.constants])
+    found = solve_adaptive(problem, p, end_stop(0.0).solution.motion, tolerance=1e-5)
+    assert found.orbit.status is Status.CONVERGED
+    assert found.level.kinks is None
+    # Inside a step a kink makes the estimate optimistic: by less than ten here.
+    np.testing.assert_allclose(found.orbit.states[0], REFERENCE[100.0], atol=1e-4)
+    contact = found.mesh.locate(end_stop(100.0).solution.level.kinks.phases[[1, 3]])[0]
+    lengths = np.diff(found.mesh.edges)
+    assert lengths[contact].max() < 0.2 * lengths.max()
