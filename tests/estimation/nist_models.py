@@ -104,9 +104,8 @@ def read(path):
     first = max(i for i, line in enumerate(lines) if line.startswith("Data:")) + 1
     # Extended precision, where the machine has it: Lanczos1 fits to the 14th digit of its data, and
     # its residuals would be the rounding of the decimals to double.
-    table = [line.split() for line in lines[first:] if line.strip()]
-    rows = [[np.longdouble(word) for word in line] for line in table]
-    data = np.array(rows)
+    words = [line.split() for line in lines[first:] if line.strip()]
+    data = np.array([[np.longdouble(word) for word in line] for line in words])
     y, x = data[:, 0], data[:, 1:].T
     if path.stem == "Nelson":
         y = np.log(y)
