@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data_folder() -> Path:
-    """Folder of measured and simulated sets; without it a test skips, and fails in CI."""
-    folder = os.environ.get("BAYESOLEO_DATA")
-    if folder and Path(folder).is_dir():
-        return Path(folder)
-    if os.environ.get("CI") == "true":
-        pytest.fail("BAYESOLEO_DATA is not set to a folder")
-    pytest.skip("BAYESOLEO_DATA is not set to a folder")
+    """Folder of data sets that ``BAYESOLEO_DATA`` names; skips where it is unset."""
+    named = os.environ.get("BAYESOLEO_DATA")
+    if not named:
+        pytest.skip("needs data sets: BAYESOLEO_DATA names no folder")
+    return Path(named)
+
+
+@pytest.fixture(scope="session")
+def data_set(data_folder: Path) -> Callable[[str], Path]:
+    """Find one set below that folder; it fails, not skips, where a named folder lacks it."""
+
+    def find(name: str) -> Path:
+        folder = data_folder / name
+        if not folder.is_dir():
+            pytest.fail(f"BAYESOLEO_DATA names a folder without {name}: {folder}")
+        return folder
+
+    return find

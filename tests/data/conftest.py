@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,17 +26,6 @@ frequency = 1.0
 [runs.conditions]
 initial_pressure = { value = 4.9, unit = "bar", sd = 0.1 }
 """
-
-
-@pytest.fixture
-def data_folder() -> Path:
-    """Folder of measured and simulated sets; without it a test skips, and fails in CI."""
-    folder = os.environ.get("BAYESOLEO_DATA")
-    if folder and Path(folder).is_dir():
-        return Path(folder)
-    if os.environ.get("CI") == "true":
-        pytest.fail("BAYESOLEO_DATA is not set to a folder")
-    pytest.skip("BAYESOLEO_DATA is not set to a folder")
 
 
 def table(periods: float = 3.0, rate: int = 50, frequency: float = 1.0) -> np.ndarray:

@@ -19,8 +19,8 @@ def write(tmp_path):
     return write_toml
 
 
-def test_noise_of_all_runs_of_shaker_plain(data_folder):
-    reduced = reduce_campaign(load_campaign(data_folder / "campaigns/shaker-plain"))
+def test_noise_of_all_runs_of_shaker_plain(data_set):
+    reduced = reduce_campaign(load_campaign(data_set("campaigns/shaker-plain")))
     assert len(reduced.records) == 14
     for record in reduced.records:
         # 1500 degrees of freedom in the shortest run: standard error 1.8 %.
@@ -33,8 +33,8 @@ def test_noise_of_all_runs_of_shaker_plain(data_folder):
 
 
 @pytest.mark.parametrize("name", CAMPAIGNS)
-def test_stationary_shaker_runs_keep_all_periods(data_folder, name):
-    reduced = reduce_campaign(load_campaign(data_folder / f"campaigns/shaker-{name}"))
+def test_stationary_shaker_runs_keep_all_periods(data_set, name):
+    reduced = reduce_campaign(load_campaign(data_set(f"campaigns/shaker-{name}")))
     assert [record.dropped_periods for record in reduced.records] == [0] * 14
 
 
@@ -61,7 +61,7 @@ stop = {stop / 610.3515625}
 
 
 @pytest.mark.parametrize(("start", "last"), [(10592, 20831), (119375, 129614)])
-def test_silverbox(data_folder, write, start, last):
+def test_silverbox(data_set, write, start, last):
     record = write(silverbox(start, last)).records[0]
     # Ten periods from the start of the block, the first of them unsettled.
     assert (record.dropped_periods, record.periods) == (1, 9)
@@ -71,7 +71,7 @@ def test_silverbox(data_folder, write, start, last):
     assert set(range(1, 336, 2)) <= orders
 
 
-def test_mr_damper(data_folder, write):
+def test_mr_damper(data_set, write):
     text = """
 format = 1
 name = "mr_damper"
@@ -101,7 +101,7 @@ start = 5.0
         assert 2.0 < record.signal_noise["force"] < 5.0
 
 
-def test_mbari_gas_spring(data_folder, write):
+def test_mbari_gas_spring(data_set, write):
     record = write(
         """
 format = 1

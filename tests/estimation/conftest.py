@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -31,20 +28,3 @@ def gas_spring():
         return FunctionProblem(assumed, position, force, [prior], ["exponent"], start=start)
 
     return make
-
-
-@pytest.fixture(scope="session")
-def data_folder():
-    """Find a folder below ``BAYESOLEO_DATA``; without it skip, or fail where ``CI=true``."""
-
-    def find(name):
-        root = os.environ.get("BAYESOLEO_DATA")
-        folder = Path(root) / name if root else None
-        if folder is not None and folder.is_dir():
-            return folder
-        reason = f"needs the data set {name!r} below the folder that BAYESOLEO_DATA names"
-        if os.environ.get("CI", "").lower() == "true":
-            pytest.fail(reason)
-        pytest.skip(reason)
-
-    return find

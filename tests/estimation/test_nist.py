@@ -56,22 +56,22 @@ def check(point, certified, name):
 
 @pytest.mark.parametrize("derivatives", ["exact", "differences"])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_mbe_from_the_near_start(data_folder, name, derivatives):
-    point, certified = fit(data_folder("nist") / f"{name}.dat", 1, "mbe", derivatives)
+def test_mbe_from_the_near_start(data_set, name, derivatives):
+    point, certified = fit(data_set("nist") / f"{name}.dat", 1, "mbe", derivatives)
     check(point, certified, name)
 
 
 @pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - OTHER_OPTIMUM))
-def test_mbe_from_the_far_start(data_folder, name):
-    point, certified = fit(data_folder("nist") / f"{name}.dat", 0, "mbe")
+def test_mbe_from_the_far_start(data_set, name):
+    point, certified = fit(data_set("nist") / f"{name}.dat", 0, "mbe")
     check(point, certified, name)
 
 
 @pytest.mark.parametrize("start", [pytest.param(0, marks=pytest.mark.slow), 1])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_default_settings_from_both_starts(data_folder, name, start):
+def test_default_settings_from_both_starts(data_set, name, start):
     """Neither a method nor a tolerance nor derivatives are given."""
-    path = data_folder("nist") / f"{name}.dat"
+    path = data_set("nist") / f"{name}.dat"
     point, certified = fit(path, start, None, "differences")
     check(point, certified, name)
 
@@ -79,7 +79,7 @@ def test_default_settings_from_both_starts(data_folder, name, start):
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [0, 1])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_levenberg_marquardt_from_both_starts(data_folder, name, start):
-    path = data_folder("nist") / f"{name}.dat"
+def test_levenberg_marquardt_from_both_starts(data_set, name, start):
+    path = data_set("nist") / f"{name}.dat"
     point, certified = fit(path, start, "levenberg-marquardt")
     check(point, certified, name)

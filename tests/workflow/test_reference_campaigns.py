@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -35,18 +34,9 @@ def on_hold_out(summary: dict, key: str, when: int = -1) -> dict[tuple[str, str]
     }
 
 
-def present(folder: Path) -> Path:
-    """A set's folder; a test of an absent one skips, and fails in CI."""
-    if folder.is_dir():
-        return folder
-    if os.environ.get("CI") == "true":
-        pytest.fail(f"{folder} is absent")
-    pytest.skip(f"{folder} is absent")
-
-
 @pytest.mark.slow
-def test_a_complete_oleo_lacks_nothing(data_folder):
-    folder = present(data_folder / "campaigns" / "shaker-plain")
+def test_a_complete_oleo_lacks_nothing(data_set):
+    folder = data_set("campaigns/shaker-plain")
     summary = summary_of(folder, "f16n2d2")
     assert summary["verdict"] == schema.NOTHING_MISSING
     assert summary["effects"] == []
@@ -56,8 +46,8 @@ def test_a_complete_oleo_lacks_nothing(data_folder):
 
 
 @pytest.mark.slow
-def test_a_polytropic_oleo_lacks_heat_exchange_and_solubility(data_folder):
-    folder = present(data_folder / "campaigns" / "shaker-plain")
+def test_a_polytropic_oleo_lacks_heat_exchange_and_solubility(data_set):
+    folder = data_set("campaigns/shaker-plain")
     summary = summary_of(folder, "f16n1d2")
     found = set()
     for entry in summary["rounds"]:
@@ -70,8 +60,8 @@ def test_a_polytropic_oleo_lacks_heat_exchange_and_solubility(data_folder):
 
 
 @pytest.mark.slow
-def test_the_silverbox_lacks_a_cubic_spring_first(data_folder):
-    present(data_folder / "measured" / "silverbox")
+def test_the_silverbox_lacks_a_cubic_spring_first(data_set):
+    data_set("measured/silverbox")
     folder = STUDIES / "silverbox"
     summary = summary_of(folder, f"{folder / 'model.py'}:model")
     assert summary["effects"][0] == "cubic_stiffness"
@@ -81,8 +71,8 @@ def test_the_silverbox_lacks_a_cubic_spring_first(data_folder):
 
 
 @pytest.mark.slow
-def test_the_mr_damper_lacks_friction_with_memory_then_stiffness(data_folder):
-    present(data_folder / "measured" / "mr_damper")
+def test_the_mr_damper_lacks_friction_with_memory_then_stiffness(data_set):
+    data_set("measured/mr_damper")
     folder = STUDIES / "mr_damper"
     summary = summary_of(folder, f"{folder / 'model.py'}:model")
     memory = {"dahl_friction", "bouc_wen_friction", "lugre_friction"}
