@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from bayesoleo.data.harmonics import FALSE_DISCOVERY_RATE, coefficient_variances, significant_orders
-from bayesoleo.data.transforms import HarmonicBasis
+from bayesoleo.data.transforms import HarmonicBasis, highest_order
 from bayesoleo.errors import CampaignError
 
 Array = NDArray[np.float64]
@@ -262,7 +262,8 @@ class _State:
     def __init__(self, values: Array, step: float, highest: int, limit: float) -> None:
         samples = values.shape[1]
         self.step, self.highest, self.limit = step, highest, limit
-        basis = HarmonicBasis(samples, step, highest)
+        # At a shorter period its samples determine fewer harmonics than where the search began.
+        basis = HarmonicBasis(samples, step, min(highest, highest_order(step)))
         coefficients = basis.coefficients(values)
         residual = values - basis.evaluate(coefficients)
         rms = np.sqrt(np.mean(values**2, axis=1))

@@ -15,6 +15,9 @@ from scipy import fft
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+# Part of the largest curvature below which a direction's own is rounding.
+_UNSEEN = 1e-9
+
 
 class ChirpTransform:
     """Sums ``X_k = sum_n x_n exp(-2 pi i k step n)`` (Rabiner, Schafer and Rader 1969).
@@ -111,10 +114,12 @@ class HarmonicBasis:
             if np.all(power <= target):
                 break
             image = self._multiply(direction)
-            curvature = np.maximum(
-                np.sum((direction.conj() * image).real, -1, keepdims=True), 1e-300
-            )
-            length = np.where(power > target, power / curvature, 0.0)
+            curvature = np.sum((direction.conj() * image).real, -1, keepdims=True)
+            # A direction that the samples do not see, for lack of them, is left alone: dividing by
+            # its curvature, which is rounding, would run away.
+            seen = curvature > _UNSEEN * self.samples * _power(direction)
+            going = seen & (power > target)
+            length = np.where(going, power / np.where(going, curvature, 1.0), 0.0)
             solution = solution + length * direction
             residual = residual - length * image
             previous, power = power, _power(residual)
@@ -140,10 +145,13 @@ def _power(vector: ComplexArray) -> Array:
 
 def _toeplitz_spectrum(samples: int, step: float, highest: int) -> Array:
     """Spectrum of the circulant that holds ``sin(pi N step m) / sin(pi step m)``, m = j - k."""
-    difference = np.arange(1, 2 * highest + 1)
-    column = np.sin(np.pi * ((samples * step * difference) % 2.0)) / np.sin(
-        np.pi * step * difference
-    )
+    turns = step * np.arange(1, 2 * highest + 1)
+    whole = np.round(turns)
+    part = turns - whole
+    # Two orders a whole number of cycles per sample apart cannot be told apart: the quotient of the
+    # sines is 0/0 there, that of their sincs is not.
+    sign = np.where((samples - 1) * whole % 2 == 0, 1.0, -1.0)
+    column = sign * samples * np.sinc(samples * part) / np.sinc(part)
     length = fft.next_fast_len(4 * highest + 1)
     circulant = np.zeros(length)
     circulant[0] = samples

@@ -41,3 +41,14 @@ def test_projection_is_idempotent_and_keeps_harmonics():
 
 def test_highest_order_of_whole_and_fractional_periods():
     assert [highest_order(1 / period) for period in (1024, 1025, 1025.7, 8)] == [511, 512, 512, 3]
+
+
+@pytest.mark.parametrize("off", [0.0, 2e-16, -1e-15, 1e-12])
+@pytest.mark.parametrize(("period", "samples"), [(422, 2954), (1012, 6354), (96, 480), (704, 4518)])
+def test_harmonics_that_a_whole_period_cannot_tell_apart_do_no_harm(period, samples, off):
+    # Orders k and period - k are the same at the samples, so that there are many solutions; all
+    # have the same fit, and that of a signal without noise is the signal.
+    one = np.random.default_rng(4).normal(size=period)
+    values = one[np.arange(samples) % period]
+    basis = HarmonicBasis(samples, (1 + off) / period, period // 2 + 1)
+    np.testing.assert_allclose(basis.fit(values), values, atol=1e-6)
