@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers import unrolled
+from bayesoleo.solvers import sparse, unrolled
 from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 
 Array = NDArray[np.float64]
@@ -118,11 +118,23 @@ class BackwardDifferences:
         """Solve ``G dx = -right`` as ``Collocation.linear``; the monodromy is the recursion's."""
         count, d, n = gz.shape[0], len(self.orders), gz.shape[3]
         dx = np.zeros((count, n, d, right.shape[2]))
-        monodromy = np.zeros((count, 3 * d, 3 * d))
+        monodromy = np.full((count, 3 * d, 3 * d), np.nan)
         ok = np.ones(count, dtype=np.bool_)
         orders = np.array(self.orders, dtype=np.int64)
         _linear(gz, right, lanes, step, orders, FIRST, SECOND, initial, dx, monodromy, ok)
+        for lane in lanes if not initial else ():
+            if sparse.needs_factorisation(bool(ok[lane]), monodromy[lane]):
+                found = sparse.difference_step(gz[lane], right[lane], self._stencils(step))
+                ok[lane] = found is not None
+                dx[lane] = 0.0 if found is None else found
         return dx, monodromy, ok
+
+    def _stencils(self, step: float) -> list[sparse.Stencil]:
+        """How values and differences follow from the nodes, in the order of the rows."""
+        value: sparse.Stencil = {0: 1.0}
+        first = {past: float(weight) / step for past, weight in enumerate(FIRST[:3])}
+        second = {past: float(weight) / step**2 for past, weight in enumerate(SECOND)}
+        return [item for order in self.orders for item in (value, first, second)[: order + 1]]
 
 
 @jit

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import collocation_kernels as kernels
-from bayesoleo.solvers import unrolled
+from bayesoleo.solvers import sparse, unrolled
 from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.tableau import Tableau
 
@@ -221,7 +221,7 @@ class Collocation:
         """
         count, n = gz.shape[0], gz.shape[3] // self.method.stages
         dx = np.zeros((count, n, self.width, right.shape[2]))
-        monodromy = np.zeros((count, self.state_size, self.state_size))
+        monodromy = np.full((count, self.state_size, self.state_size), np.nan)
         ok = np.ones(count, dtype=np.bool_)
         present = np.zeros((1, 1, 1)) if x is None else x
         added = np.zeros((1, 1, 1, 0)) if jumps is None else jumps
@@ -231,7 +231,23 @@ class Collocation:
             gz, right, present, x is not None, added, lanes, h, method.a, method.a @ method.a,
             method.b, method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
         )  # fmt: skip
+        for lane in lanes if not initial else ():
+            if sparse.needs_factorisation(bool(ok[lane]), monodromy[lane]):
+                ends = np.zeros((self.state_size, right.shape[2], n))
+                if x is not None:
+                    ends += self._jumps(x[lane], h)[:, None]
+                if jumps is not None:
+                    ends += jumps[lane]
+                found = sparse.collocation_step(gz[lane], right[lane], ends, method, self.orders, h)
+                ok[lane] = found is not None
+                dx[lane] = 0.0 if found is None else found
         return dx, monodromy, ok
+
+    def _jumps(self, x: Array, h: Array) -> Array:
+        """From each step's end to the next node, shape (D, n), of unknowns ``x (n, w)``."""
+        _, end = sparse.step_maps(self.method, self.orders, h)
+        following = np.roll(x[:, : self.state_size], -1, axis=0)
+        return np.asarray((np.einsum("mdw,mw->md", end, x) - following).T)
 
     @property
     def _orders(self) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.backward import BackwardDifferences
+from bayesoleo.solvers.central import COMBINATIONS, Differences
 from bayesoleo.solvers.collocation import Collocation
 from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.periodic import Scheme
@@ -21,8 +22,9 @@ def scheme(name: str, orders: tuple[int, ...], mesh: Mesh | None = None) -> Sche
     ----------
     name : str
         ``radau2``, ``radau3``, ``gauss2``, ``gauss3``, or ``thesis`` for second-order backward
-        differences. Gauss points do not damp what is infinitely stiff: not for a dof ruled by an
-        algebraic equation (a drive through a compliance of zero).
+        differences; ``central`` and its combinations (:mod:`bayesoleo.solvers.central`) to see why
+        they were not chosen. Gauss points do not damp what is infinitely stiff: not for a dof ruled
+        by an algebraic equation (a drive through a compliance of zero).
     orders : tuple of int
         Order of each dof.
     mesh : Mesh, optional
@@ -33,8 +35,8 @@ def scheme(name: str, orders: tuple[int, ...], mesh: Mesh | None = None) -> Sche
     InputError
         If there is no such scheme, or if it cannot have steps of different lengths.
     """
-    if name != "thesis":
+    if name != "thesis" and name not in COMBINATIONS:
         return Collocation(tableau(name), orders, mesh)
     if mesh is not None:
         raise InputError("differences need equal steps", value=name, hint="use radau3 or gauss3")
-    return BackwardDifferences(orders)
+    return BackwardDifferences(orders) if name == "thesis" else Differences(orders, name)
