@@ -1,13 +1,13 @@
 """Central differences, and their combinations with backward ones, which Verbeek (1993), section
 4.3.1, tried before choosing backward differences for both derivatives.
 
-A motion that alternates from node to node has no central first difference, and a central second
-difference of the wrong sign for what follows it. Against such a motion equations put up
-``-4 m/h**2 + k`` with both differences central, where backward ones put up ``12 m/h**2 + 4 c/h + k``.
-So damping and friction do not hold it, odd and even nodes of a first-order equation are not tied
-together at all, and with a velocity that looks back the equations are singular where a friction's
-slope times the step comes to the mass. What depends on nodes before and behind cannot be solved in
-one sweep either, only by the slower sparse factorisation. For comparison, not for use.
+A motion that alternates from node to node has no central first difference. Against it an
+oscillator puts up ``-4 m/h**2 + k`` with both differences central, where backward ones put up
+``12 m/h**2 + 4 c/h + k``. So damping and friction do not hold it, odd and even nodes of a
+first-order equation are not tied together at all, and with a velocity that looks back the equations
+are singular where a friction's slope times the step comes to the mass. What depends on nodes before
+and behind cannot be solved in one sweep either, only by the slower sparse factorisation. For
+comparison, not for use.
 """
 
 from __future__ import annotations

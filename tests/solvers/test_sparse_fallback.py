@@ -1,4 +1,4 @@
-"""Where a sweep through the period loses its digits, a factorisation of the whole period answers."""
+"""Where a sweep through the period loses its digits, a factorisation of all of it answers."""
 
 import numpy as np
 import pytest
