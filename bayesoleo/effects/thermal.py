@@ -64,6 +64,11 @@ def _conduction_grid(model: Model, target: str, scales: Scales) -> tuple[float, 
     return geometric(capacity / slow, capacity / fast)
 
 
+def _swept_grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+    """From a wall that hardly shrinks to one that shrinks with the gas."""
+    return (0.25, 0.5, 1.0)
+
+
 def _exchange_heat(model: Model, target: str, names: Names) -> Model:
     """Write p = p0 (T/T0) v^-n, and heat the gas by a fraction kappa of the work done on it.
 
@@ -74,7 +79,9 @@ def _exchange_heat(model: Model, target: str, names: Names) -> Model:
     pressure = symbol("gas_pressure")
     if is_quantity(model, "ambient_pressure"):
         pressure = pressure - symbol("ambient_pressure")  # as in eq. 6.4
-    loss = names["conduction"] * symbol("volume_ratio") * (temperature - ambient)
+    # Of the wall that conducts, the piston sweeps a part; the rest stays in the gas.
+    exposed = 1 - names["swept"] * (1 - symbol("volume_ratio"))
+    loss = names["conduction"] * exposed * (temperature - ambient)
     extended = model.with_dof(
         "temperature",
         Dof("K", ambient, "gas temperature"),
@@ -100,13 +107,16 @@ HEAT_EXCHANGE = Effect(
     family="thermal",
     title="Gas that warms when compressed and loses heat",
     formula=r"p = p_0 \frac{T}{T_0} v^{-n}, \quad"
-    r" C \dot T + G v (T - T_0) = \kappa (p - p_a) A_p \dot q",
+    r" C \dot T + G (1 - s (1 - v)) (T - T_0) = \kappa (p - p_a) A_p \dot q",
     amplitudes=(
         Amplitude("heat_exchange", "", r"\kappa", "fraction of the work that heats the gas", 1),
     ),
     places=_polytropic,
     change=_exchange_heat,
-    shapes=(Shape("conduction", "W/K", "G", "heat conduction to the ambient", _conduction_grid),),
+    shapes=(
+        Shape("conduction", "W/K", "G", "heat conduction to the ambient", _conduction_grid),
+        Shape("swept", "", "s", "part of the conducting wall that the piston sweeps", _swept_grid),
+    ),
     constants=(
         Constant(
             "specific_heat",
@@ -121,7 +131,9 @@ HEAT_EXCHANGE = Effect(
             lambda model, target, scales: GAS_CONSTANT_NITROGEN,
         ),
     ),
-    source="Verbeek (1993), eq. 6.4",
+    source="Verbeek (1993), eq. 6.4, where the piston sweeps all of the wall (s = 1); a time"
+    " constant of the gas's own (s = 0) as of accumulators: Pourmovahed and Otis (1990), J. Dyn."
+    " Sys. Meas. Control 112(1), 116-121",
     applies_to="gas springs at constant temperature ratio",
 )
 

@@ -18,6 +18,8 @@ time series analysis. Biometrika 89(3), 603-616.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import perm
 
 import numba
 import numpy as np
@@ -80,14 +82,26 @@ class Smoothed:
         """The same at times in s since the first sample, shape (M,)."""
         scaled = np.asarray(time, dtype=float) / self.step
         index = np.clip(scaled.astype(np.int64), 0, len(self.states) - 2)
-        inside = scaled - index
-        unit = self.step ** np.arange(3)
-        left, right = self.states[index] * unit, self.states[index + 1] * unit
-        coefficients = _quintic(left, right)
+        inside, coefficients = scaled - index, self.pieces[index]
         total = np.zeros(inside.shape)
         for power in range(5, derivative - 1, -1):
-            falling = float(np.prod(np.arange(power - derivative + 1, power + 1)))
-            total = total * inside + falling * coefficients[:, power]
+            total = total * inside + perm(power, derivative) * coefficients[:, power]
+        return total / self.step**derivative
+
+    @cached_property
+    def pieces(self) -> Array:
+        """Coefficients ``(N - 1, 6)`` by rising power over each sampling interval, made one."""
+        scaled = self.states * self.step ** np.arange(3)
+        return _quintic(scaled[:-1], scaled[1:])
+
+    def at_once(self, time: float, derivative: int = 0) -> float:
+        """One value, as :meth:`at`, without the cost of arrays: integrators ask for many."""
+        scaled = time / self.step
+        index = min(max(int(scaled), 0), len(self.states) - 2)
+        inside, total = scaled - index, 0.0
+        piece = self.pieces[index]
+        for power in range(5, derivative - 1, -1):
+            total = total * inside + perm(power, derivative) * float(piece[power])
         return total / self.step**derivative
 
     def part(self, samples: slice) -> Smoothed:

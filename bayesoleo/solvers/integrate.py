@@ -105,7 +105,7 @@ def integrate(
 def _radau(
     space: StateSpace, p: Array, start: Array, duration: float, rtol: float, atol: Array
 ) -> Any:
-    rates, left = space.right_side(p), MOST_EVALUATIONS
+    rates, left = _right_side(space, p), MOST_EVALUATIONS
 
     def counted(t: float, s: Array) -> Array:
         nonlocal left
@@ -127,6 +127,42 @@ def _radau(
         np.linalg.LinAlgError,
     ):  # SciPy raises where a Jacobian is NaN
         return None
+
+
+#: A Newton step this small, over the derivative's size, leaves round-off only.
+SMALL_STEP = 1e-12
+
+
+def _right_side(space: StateSpace, p: Array) -> Callable[[float, Array], Array]:
+    """``f(t, s)`` of one lane, as :meth:`StateSpace.right_side`, with arrays allocated once.
+
+    An integrator asks for one point at a time, thousands of times.
+    """
+    d, rows, highest = len(space.orders), space.state_rows(), space.highest_rows()
+    lanes, constants = np.zeros(1, dtype=np.int64), p[None]
+    z, g = np.zeros((1, space.size + d, 1)), np.zeros((1, d, 1))
+    gz, now = np.zeros((1, d, space.size + d, 1)), np.zeros(1)
+
+    def f(t: float, s: Array) -> Array:
+        now[0] = t
+        u = space.inputs(now)
+        z[0, rows, 0], z[0, highest, 0] = s, 0.0
+        for _ in range(30):
+            space.equations.jacobian(z, u, constants, lanes, g, gz)
+            try:
+                step = np.linalg.solve(gz[0, :, highest, 0].T, -g[0, :, 0])
+            except np.linalg.LinAlgError:
+                break
+            z[0, highest, 0] += step
+            size = np.abs(z[0, highest, 0]).max()
+            # Terms that cancel to a derivative of zero leave the round-off of their own size.
+            terms = np.abs(gz[0, :, :, 0] * z[0, :, 0]).sum(axis=1)
+            slope = np.abs(gz[0, :, highest, 0]).max(axis=0)
+            if not np.abs(step).max() > SMALL_STEP * (size + (terms / slope).max()):
+                return z[0, rows + 1, 0].copy()
+        return np.full(s.size, np.nan)
+
+    return f
 
 
 def _inside(space: StateSpace, p: Array, t: Array, s: Array, otherwise: Status) -> Status:

@@ -13,7 +13,7 @@ from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
-from bayesoleo.tracing.score import Base, Score
+from bayesoleo.tracing.score import Base, Score, replicate
 from bayesoleo.tracing.significance import SAME
 
 Array = NDArray[np.float64]
@@ -45,6 +45,10 @@ class Refit:
         What it changes in the prediction, thinned, in noise units.
     remaining : float
         Sum of squares that it leaves beyond the noise's, and what of that noise alone could feign.
+    inflation : float
+        Variance of the new amplitudes over what white noise gives, where noise is coloured.
+    freedom : int
+        Degrees of freedom that it was measured with; zero where it is the score's.
     """
 
     score: Score
@@ -53,6 +57,8 @@ class Refit:
     share: float
     contribution: Array
     remaining: float
+    inflation: float
+    freedom: int
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot tell two estimated effects apart."""
@@ -79,12 +85,15 @@ class Refit:
         value = self.fit.point.theta[index]
         # Coloured noise, measured by its scatter between periods, widens the white covariance.
         white = self.fit.point.covariance[np.ix_(index, index)]
-        covariance = white * self.score.inflation
+        covariance = white * self.inflation
         if not np.isfinite(covariance).all():
             return False
+        free = self.freedom or np.inf
         if len(index) == 1:
-            return bool(stats.norm.cdf(abs(value[0]) / np.sqrt(covariance[0, 0])) >= level)
+            return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
         distance = float(value @ np.linalg.lstsq(covariance, value, rcond=1e-12)[0])
+        if self.freedom:
+            return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
         return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
 
 
@@ -120,7 +129,39 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         share = -np.inf  # what cannot be solved at its estimate explains nothing
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
-    return Refit(score, grown, fit, share, contribution, remaining)
+    inflation, freedom = _inflation(fit, score)
+    return Refit(score, grown, fit, share, contribution, remaining, inflation, freedom)
+
+
+def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
+    """Variance of the new amplitudes between stretches of the runs over white noise's, and its
+    degrees of freedom.
+
+    Periodic runs: as scored. What a model leaves of a transient is seldom white, and at the null,
+    where effects are scored, it is mostly the effect itself; so it is measured on what the estimate
+    leaves. An unknown moves by the sum of its influence times the residual (Huber 1967): its
+    variance is that of the stretches' sums.
+    """
+    if all(record.periodic for record in fit.records):
+        return score.inflation, 0
+    free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
+    own = [k for k, name in enumerate(fit.problem.names) if name in score.names]
+    unit = np.sqrt(fit.point.variance)[:, None]
+    total, count = np.zeros(len(own)), 0
+    for run, predicted, record in zip(
+        fit.predictor.runs, fit.predictions, fit.records, strict=True
+    ):
+        columns = predicted.sensitivity[:, free] / unit[:, None]
+        influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
+        pulls = np.einsum("kyn,yn->kn", influence, (run.measured - predicted.y) / unit)
+        stretch = replicate(record)
+        sums = np.stack([np.bincount(stretch, row) for row in pulls])
+        total += np.sum(sums**2, axis=1)
+        count += sums.shape[1]
+    white = np.diag(fit.point.covariance)[own]
+    if count < 2 or not np.isfinite(total).all():
+        return score.inflation, 0
+    return max(1.0, float(np.max(total / white)) * count / (count - 1)), count - 1
 
 
 def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:

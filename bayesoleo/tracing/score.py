@@ -183,7 +183,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
             (run.measured - fit.predictions[r].y).ravel(),
             _flat(columns),
             _flat(input_columns(run, _present(fit, r))),
-            np.tile(_replicate(record), len(sigma)),
+            np.tile(replicate(record), len(sigma)),
         )
         cross, _, _ = present.products(present.sensitivity)
         gram += cross
@@ -196,7 +196,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
     return Base(fit, runs, gram, gradient, noise, excess)
 
 
-def _replicate(record: Record) -> NDArray[np.int64]:
+def replicate(record: Record) -> NDArray[np.int64]:
     """Number of the period that each sample lies in; of a transient, of the stretch."""
     if record.periodic:
         return np.floor(record.phase + 1e-9).astype(np.int64)

@@ -22,6 +22,7 @@ MEASURED = Path(__file__).parents[2] / "studies" / "measured"
 JOBS: dict[str, tuple[str | None, str | None]] = {
     "silverbox": (None, None),
     "mr_damper": (None, None),
+    "mbari_gas_spring": (None, None),
     "shaker-plain f16n2d2": ("f16n2d2", "displacement"),
     "shaker-plain f16n1d2": ("f16n1d2", "displacement"),
     "shaker-plain f16n2d1 by force": ("f16n2d1", "model"),

@@ -25,6 +25,7 @@ def test_solubility_and_heat_exchange_make_the_thermomechanical_gas_law(scales):
         symbol("heat_exchange"): sp.Integer(1),
         symbol("gas_solubility"): -solubility * constant * ambient / volume,
         symbol("heat_exchange_conduction"): symbol("heat_conduction"),
+        symbol("heat_exchange_swept"): sp.Integer(1),
         symbol("heat_exchange_specific_heat"): symbol("specific_heat"),
         symbol("heat_exchange_gas_constant"): symbol("specific_gas_constant"),
     }

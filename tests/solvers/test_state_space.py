@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model.kernels import kernels
+from bayesoleo.solvers.integrate import _right_side
 from bayesoleo.solvers.state_space import StateSpace
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
@@ -126,6 +127,17 @@ def test_the_variational_form_integrates_to_differences_of_solutions():
         move, moved = step * np.eye(2)[k], step * s_theta[:, k]
         ends = [end(start + sign * moved, p[0] + sign * move) for sign in (1, -1)]
         np.testing.assert_allclose(table[:, 4 + k], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
+
+
+@pytest.mark.parametrize("model", [duffing(), coupled(), implicit(), friction_oscillator()])
+def test_one_point_at_a_time_as_many_together(model):
+    space, p = state_space(model)
+    one, many = _right_side(space, p[0]), space.right_side(p[0])
+    rng = np.random.default_rng(1)
+    for t in (0.0, 0.7, 2.9):
+        # Near the origin, where every one of the models is defined.
+        s = 0.1 * rng.standard_normal(sum(space.orders))
+        np.testing.assert_allclose(one(t, s), many(t, s), rtol=1e-9, atol=1e-12)
 
 
 def test_where_there_are_no_rates():

@@ -82,3 +82,20 @@ def test_the_mr_damper_lacks_friction_with_memory_then_stiffness(data_set):
     before, after = (on_hold_out(summary, "rms", k) for k in (0, -1))
     assert all(value > 25.0 for value in before.values())
     assert all(value <= 9.0 for value in after.values())
+
+
+@pytest.mark.slow
+def test_the_mbari_gas_spring_lacks_heat_exchange(data_set):
+    data_set("measured/mbari_gas_spring")
+    folder = STUDIES / "mbari_gas_spring"
+    summary = summary_of(folder, f"{folder / 'model.py'}:model")
+    assert summary["effects"] == ["heat_exchange"]
+    # The state at 205 s is estimated on the run that was not used; nothing else is.
+    assert summary["re_estimated"] == 1
+    psi, (first, last) = 6894.757, (summary["rounds"][k]["error"]["pressure"] for k in (0, -1))
+    before = {run: entry["rms"] / psi for run, entry in first.items()}
+    after = {run: entry["rms"] / psi for run, entry in last.items()}
+    assert min(before.values()) > 4.0
+    # A quick fit of a gas with one time constant reached 0.43 and 0.74 psi.
+    assert after["before 205 s"] <= 0.5
+    assert after["after 205 s"] <= 0.75
