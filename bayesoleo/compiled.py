@@ -25,6 +25,7 @@ from typing import Any
 import numba
 import numpy as np
 import platformdirs
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -62,6 +63,11 @@ class BlockKernel:
         with COMPILING:
             return numba.cfunc(SIGNATURE, cache=True, error_model="numpy")(self.function)
 
+    @property
+    def address(self) -> int:
+        """Of the compiled function, for :func:`caller`."""
+        return int(self.pointer.address)
+
     def __call__(
         self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *results: Array
     ) -> None:
@@ -69,7 +75,7 @@ class BlockKernel:
         of shape (L, …, N)."""
         if self.rows:
             first, second = (*results, results[0][:, :0])[:2]
-            _fill(self.pointer, z, u, p, lanes, _flat(first), _flat(second))
+            _fill(self.address, z, u, p, lanes, _flat(first), _flat(second))
 
 
 class ArrayKernel:
@@ -100,6 +106,11 @@ class ArrayKernel:
     def pointer(self) -> Any:
         """A callback into Python that compiled code takes for a compiled kernel."""
         return _Callback(self._block)
+
+    @property
+    def address(self) -> int:
+        """Of that callback."""
+        return int(self.pointer.__wrapper_address__())
 
     def _block(self, z: int, u: int, p: int, out: int, count: int) -> None:
         nz, nu, constants = self.sizes
@@ -161,6 +172,32 @@ def _pointer(typing_context, array, offset):
 pointer: Any = intrinsic(_pointer)
 
 
+def caller(signature: Any) -> Any:
+    """How compiled code calls a compiled function at an address: ``call(address, arguments)``.
+
+    An address is a number. Passing the function itself costs the interpreter ten microseconds, more
+    than many a block takes.
+    """
+
+    def call(typing_context, address, arguments):
+        def generate(context, builder, types_, values):
+            kinds = [context.get_value_type(kind) for kind in signature.args]
+            returned = signature.return_type
+            result = ir.VoidType() if returned == types.void else context.get_value_type(returned)
+            function = ir.FunctionType(result, kinds).as_pointer()
+            parts = [builder.extract_value(values[1], k) for k in range(len(kinds))]
+            outcome = builder.call(builder.inttoptr(values[0], function), parts)
+            return context.get_dummy_value() if returned == types.void else outcome
+
+        given = types.Tuple(signature.args)
+        return signature.return_type(types.intp, given), generate
+
+    return intrinsic(call)
+
+
+call_kernel: Any = caller(SIGNATURE)
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _fill(kernel, z, u, p, lanes, first, second):
     nz, nu, points = z.shape[1], u.shape[0], first.shape[2]
@@ -179,9 +216,8 @@ def _fill(kernel, z, u, p, lanes, first, second):
             for k in range(nz):
                 for i in range(count):
                     z_block[k, i] = z[lane, k, begin + i]
-            kernel(
-                pointer(z_block, 0), pointer(u_block, 0), pointer(p_lane, 0), pointer(out, 0), count
-            )
+            to = pointer(z_block, 0), pointer(u_block, 0), pointer(p_lane, 0), pointer(out, 0)
+            call_kernel(kernel, (*to, count))
             for k in range(rows):
                 for i in range(count):
                     first[lane, k, begin + i] = out[k, i]

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.compiled import BLOCK, pointer
+from bayesoleo.compiled import BLOCK, call_kernel, caller, pointer
 from bayesoleo.solvers.measures import total
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.sweep import ROUND_OFF, eliminate, jit
-from bayesoleo.solvers.unrolled import REACH, WIDTH, Program, chunks
+from bayesoleo.solvers.unrolled import REACH, SIGNATURES, WIDTH, Program, chunks
 
 Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
@@ -44,6 +44,9 @@ LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
+#: At least one more than a state has components.
+COLUMNS = 8
+WITHOUT_SIGN = np.int64(2**63 - 1)
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH
 
@@ -104,15 +107,20 @@ class Layout:
 
 
 class Pieces(NamedTuple):
-    """Compiled functions of a model and of a scheme."""
+    """Addresses of the compiled functions of a model and of a scheme."""
 
-    jacobian: Any
-    admissible: Any
-    rows: Any
-    measure: Any
-    eliminate: Any
-    chain: Any
-    update: Any
+    jacobian: int
+    admissible: int
+    rows: int
+    measure: int
+    eliminate: int
+    chain: int
+    update: int
+
+
+_call_rows, _call_measure = caller(SIGNATURES["rows"]), caller(SIGNATURES["measure"])
+_call_eliminate, _call_chain = caller(SIGNATURES["eliminate"]), caller(SIGNATURES["chain"])
+_call_update = caller(SIGNATURES["update"])
 
 
 class Sweep(NamedTuple):
@@ -137,10 +145,11 @@ class Work(NamedTuple):
     z: Any
     out: Any
     sums: Any
-    peaks: Any
+    scratch: Any
     transfer: Any
     history: Any
     start: Any
+    products: Any
     measures: Any
     before: Any
     constants: Any
@@ -163,10 +172,11 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
         z=np.zeros((sizes.nz, BLOCK)),
         out=np.zeros((rows, BLOCK)),
         sums=np.zeros((2 * d, BLOCK)),
-        peaks=np.empty((3, BLOCK)),
+        scratch=np.zeros(1),
         transfer=np.zeros((blocks if sizes.keep else 1, sizes.transfer * sizes.block)),
         history=history,
         start=np.zeros((D, WIDTH)),
+        products=np.zeros((2, D, COLUMNS)),
         measures=np.zeros(2 * d),
         before=np.zeros(2 * d),
         constants=np.zeros(max(sizes.constants, 1)),
@@ -209,13 +219,12 @@ def _iterate(pieces, sizes, sweep, work, options):
         outcome = _step(pieces, sizes, sweep, work, options.initial)
         if outcome != CONVERGED:
             return outcome, iteration
-        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.peaks)
+        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
         if not size < np.inf:
             return SINGULAR, iteration
         ratio = size / last if last < np.inf else 1.0
         if size < SMALL_STEP or (ratio < 0.1 and size < LAST_STEP):
-            _keep(work.now, work.base)
-            _take(work, 1.0)
+            _take(work.now, work.dx, 1.0, work.now)
             return CONVERGED, iteration
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
         if outcome != CONVERGED:
@@ -235,7 +244,7 @@ def _advance(pieces, sizes, sweep, work, monotone, size):
     _keep(work.measures, work.before)
     fraction, outcome = 1.0, CONVERGED
     for _ in range(MAXIMUM_HALVINGS):
-        _take(work, fraction)
+        _take(work.base, work.dx, fraction, work.now)
         outcome = _evaluate(pieces, sizes, sweep, work)
         if outcome == NEEDS_EXCHANGE:
             return outcome, fraction, np.inf
@@ -252,15 +261,17 @@ def _advance(pieces, sizes, sweep, work, monotone, size):
 
 @jit
 def _keep(source, target):
-    from_, to = source.reshape(source.size), target.reshape(target.size)
-    for i in range(from_.size):
-        to[i] = from_[i]
+    """Copy. Rows are cut out beforehand: where an index may be negative, so that the compiler has
+    to wrap it around, there are no vector instructions."""
+    source, target = source.reshape(source.size), target.reshape(target.size)
+    for i in range(source.size):
+        target[i] = source[i]
 
 
 @jit
-def _take(work, fraction):
-    size = work.now.size
-    base, dx, now = work.base.reshape(size), work.dx.reshape(size), work.now.reshape(size)
+def _take(base, dx, fraction, now):
+    """``now = base + fraction dx``; they may be the same."""
+    base, dx, now = base.reshape(base.size), dx.reshape(dx.size), now.reshape(now.size)
     for i in range(now.size):
         now[i] = base[i] + fraction * dx[i]
 
@@ -268,7 +279,7 @@ def _take(work, fraction):
 @jit
 def _step(pieces, sizes, sweep, work, initial):
     """The Newton step at all positions, from the recursion of the last evaluation."""
-    outcome = _close(sizes, sweep, work.history, work.start, initial)
+    outcome = _close(sizes, sweep, work, initial)
     if outcome == CONVERGED:
         _update(pieces.update, sizes, sweep, work)
     return outcome
@@ -286,21 +297,21 @@ def _evaluate(pieces, sizes, sweep, work):
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         for k in range(sizes.unknowns):
-            for i in range(steps + (sizes.front + 1) * WIDTH):
-                work.x_block[k, i] = work.now[k, b * steps + i]
+            begin, reach = b * steps, steps + (sizes.front + 1) * WIDTH
+            _keep(work.now[k, begin : begin + reach], work.x_block[k, :reach])
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        pieces.rows(x, length, z, steps)
+        _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
-            pieces.admissible(z, inputs, p, out, points)
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
             outside += _outside(work.out, sizes, count)
-        pieces.jacobian(z, inputs, p, out, points)
+        call_kernel(pieces.jacobian, (z, inputs, p, out, points))
         if b == u.shape[0] - 1:
             _silence(sizes, sweep.lengths, b, count, work.z, work.out)
-        pieces.measure(z, out, sums, points)
+        _call_measure(pieces.measure, (z, out, sums, points))
         transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
-        bad += pieces.eliminate(out, x, length, transfer, count)
+        bad += _call_eliminate(pieces.eliminate, (out, x, length, transfer, count))
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        pieces.chain(transfer, history, count // WIDTH, WIDTH)
+        _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
     if outside > 0:
         return INADMISSIBLE
     finite = True
@@ -318,8 +329,9 @@ def _outside(a, sizes, count):
     outside = 0
     for k in range(sizes.conditions):
         for stage in range(sizes.stages):
-            for i in range(stage * sizes.block, stage * sizes.block + count):
-                outside += a[k, i] <= 0.0
+            values = a[k, stage * sizes.block :]
+            for i in range(count):
+                outside += values[i] <= 0.0
     return outside
 
 
@@ -342,22 +354,13 @@ def _silence(sizes, lengths, b, count, z, out):
 
 
 @jit
-def _close(sizes, sweep, history, start, initial):
+def _close(sizes, sweep, work, initial):
     """First state of every chunk from the closure of the period, or from zero."""
-    D, lengths, order = sizes.state, sweep.lengths, sweep.order
-    product, following = np.zeros((D, D + 1)), np.zeros((D, D + 1))
-    if not initial:
-        for i in range(D):
-            product[i, i] = 1.0
-        for c in range(WIDTH):
-            first = lengths[c] * sizes.new
-            for i in range(D):
-                for k in range(D + 1):
-                    value = history[first + order[i], D, c] if k == D else 0.0
-                    for o in range(D):
-                        value += history[first + order[i], o, c] * product[o, k]
-                    following[i, k] = value
-            product, following = following, product
+    D, start = sizes.state, work.start
+    if initial:
+        start[:, 0] = 0.0
+    else:
+        product = _product(D, sizes.new, sweep, work)
         closure, right = np.empty((D, D)), np.empty((D, 1))
         growth = 0.0
         for i in range(D):
@@ -376,16 +379,40 @@ def _close(sizes, sweep, history, start, initial):
             return SINGULAR
         for i in range(D):
             start[i, 0] = right[i, 0]
-    else:
-        start[:, 0] = 0.0
     for c in range(WIDTH - 1):
-        first = lengths[c] * sizes.new
+        first = sweep.lengths[c] * sizes.new
         for i in range(D):
-            value = history[first + order[i], D, c]
+            row = work.history[first + sweep.order[i]]
+            value = row[D, c]
             for o in range(D):
-                value += history[first + order[i], o, c] * start[o, c]
+                value += row[o, c] * start[o, c]
             start[i, c + 1] = value
     return CONVERGED
+
+
+@jit
+def _product(D, new, sweep, work):
+    """The recursion from the period's start to its end: matrix and, in column ``D``, the constant.
+
+    All :data:`COLUMNS` are computed, needed or not: a loop of known length becomes one instruction.
+    """
+    product, following = work.products[0], work.products[1]
+    for i in range(D):
+        for k in range(COLUMNS):
+            product[i, k] = 1.0 if i == k else 0.0
+    for c in range(WIDTH):
+        first = sweep.lengths[c] * new
+        for i in range(D):
+            row, target = work.history[first + sweep.order[i]], following[i]
+            for k in range(COLUMNS):
+                target[k] = 0.0
+            for o in range(D):
+                factor, old = row[o, c], product[o]
+                for k in range(COLUMNS):
+                    target[k] += factor * old[k]
+            target[D] += row[D, c]
+        product, following = following, product
+    return product
 
 
 @jit
@@ -398,11 +425,10 @@ def _update(update, sizes, sweep, work):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        update(transfer, history, start, to, count // WIDTH, WIDTH)
+        _call_update(update, (transfer, history, start, to, count // WIDTH, WIDTH))
         begin = sizes.front * WIDTH + b * steps
         for k in range(sizes.unknowns):
-            for i in range(count):
-                dx[k, begin + i] = work.dx_block[k, i]
+            _keep(work.dx_block[k, :count], dx[k, begin : begin + count])
     for k in range(sizes.unknowns):
         for i in range(sizes.front * WIDTH):
             dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
@@ -411,25 +437,31 @@ def _update(update, sizes, sweep, work):
 
 
 @jit
-def _size(x, dx, begin, measured, peaks):
-    """Largest change of a state over its largest value; not finite where one is not.
-
-    Maxima of 64 interleaved parts: what waits for nothing becomes vector instructions.
-    """
+def _size(x, dx, begin, measured, scratch):
+    """Largest change of a state over its largest value; not finite where one is not."""
     size = 0.0
-    spoilt, change, largest = peaks[0], peaks[1], peaks[2]
-    spoilt[:] = 0.0
     for k in range(x.shape[0]):
-        change[:], largest[:] = 0.0, 1e-300
-        for first in range(begin, x.shape[1], BLOCK):
-            for i in range(min(BLOCK, x.shape[1] - first)):
-                step, value = abs(dx[k, first + i]), abs(x[k, first + i])
-                spoilt[i] += step * 0.0
-                change[i] = step if step > change[i] else change[i]
-                largest[i] = value if value > largest[i] else largest[i]
+        change = _largest(dx[k, begin:], scratch)
+        if not change < np.inf:
+            return np.inf
         if k < measured:
-            size = max(size, change.max() / largest.max())
-    return size if total(spoilt) == 0.0 else np.inf
+            size = max(size, change / max(_largest(x[k, begin:], scratch), 1e-300))
+    return size
+
+
+@jit
+def _largest(values, scratch):
+    """Largest magnitude, not a number where one is not.
+
+    Without their sign, floating-point numbers are ordered as the integers with their bits, and what
+    is not finite comes last: integers, which have no exceptions, are compared in vectors.
+    """
+    bits, largest = values.view(np.int64), np.int64(0)
+    for i in range(bits.size):
+        magnitude = bits[i] & WITHOUT_SIGN
+        largest = magnitude if magnitude > largest else largest
+    scratch.view(np.int64)[0] = largest
+    return scratch[0]
 
 
 @jit

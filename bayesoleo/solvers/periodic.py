@@ -189,7 +189,7 @@ def _compiled(
     iterations = np.zeros(x.shape[0], dtype=np.int64)
     sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
     pieces = newton.Pieces(
-        equations.jacobian.pointer, equations.admissible.pointer, program.rows, program.measure,
+        equations.jacobian.address, equations.admissible.address, program.rows, program.measure,
         program.eliminate, program.chain, program.update,
     )  # fmt: skip
     sweep = arranged.sweep

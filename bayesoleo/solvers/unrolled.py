@@ -42,20 +42,20 @@ SIGNATURES = {
 
 @dataclass(frozen=True)
 class Program:
-    """Compiled pieces of a Newton step, for one block of steps each.
+    """Compiled pieces of a Newton step, for one block of steps each, by their addresses.
 
     Parameters
     ----------
-    rows : compiled function
+    rows : int
         ``(x, h, z, count)``: values and derivatives of the dofs at the points.
-    measure : compiled function
+    measure : int
         ``(z, out, sums, count)``: adds squares of residuals, and of all terms, to ``sums``.
-    eliminate : compiled function
+    eliminate : int
         ``(out, x, h, transfer, count)``: solves for a step's own unknowns; returns how many pivots
         were too small.
-    chain : compiled function
+    chain : int
         ``(transfer, history, rows, width)``: runs the recursion of all chunks through the block.
-    update : compiled function
+    update : int
         ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
         states.
     orders : tuple of int
@@ -69,11 +69,11 @@ class Program:
         Rows of a block's transfer.
     """
 
-    rows: Any
-    measure: Any
-    eliminate: Any
-    chain: Any
-    update: Any
+    rows: int
+    measure: int
+    eliminate: int
+    chain: int
+    update: int
     orders: tuple[int, ...]
     stages: int
     unknowns: int
@@ -431,15 +431,21 @@ def _collocation_update(orders: Sequence[int], stages: int, steps: int) -> str:
     return "\n".join(source.lines)
 
 
-def _compile(parts: Sequence[str]) -> dict[str, Any]:
+def _compile(parts: Sequence[str]) -> dict[str, int]:
     source = "import numba\n\n\n" + "\n\n\n".join(parts) + "\n"
     module = load(source)
-    return {
+    functions = {
         name: numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})(
             getattr(module, name)
         )
         for name, signature in SIGNATURES.items()
     }
+    _ALIVE.append(functions)
+    return {name: int(function.address) for name, function in functions.items()}
+
+
+#: An address does not keep what stands there.
+_ALIVE: list[dict[str, Any]] = []
 
 
 def differences(
