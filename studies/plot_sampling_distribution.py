@@ -60,6 +60,21 @@ print(wide)
 figure_wide = plots.sampling_distribution(wide.data)
 
 # %%
+# **A thousand runs of an oleo.** The same with all seven parameters of the thermo-mechanical oleo,
+# from a single run of a simulated shaker campaign, with new noise on force, pressure and on the
+# displacement that drives it. The friction slope alone is not what linearisation says: it stands in
+# an arctan. The command is ``python tests/benchmarks/replications.py oleo``; a thousand estimates
+# take seconds, and with ``--out`` a calculation that is stopped goes on where it was.
+
+from replications import repeat_oleo
+from stored import Study
+
+study = Study("sampling_distribution", data="campaigns/shaker-plain", slow=True)
+oleo = study.run(lambda: repeat_oleo().found)
+study.text("oleo", lambda: print(oleo))
+figure_oleo = study.figure("oleo", lambda: plots.sampling_distribution(oleo.data))
+
+# %%
 # All of this holds if the model is right. If it is not, repetition of the *same* experiment gives
 # narrow intervals round a wrong value. Here the data have the undeclared factor 0.95 of the thesis.
 # Runs over different strokes then disagree by many of their standard deviations. That is why the

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+from replication_target import run
 from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.errors import InputError, ResultsError
@@ -121,6 +126,31 @@ def test_stopped_calculation_goes_on_to_the_same_result(line, tmp_path, monkeypa
     np.testing.assert_array_equal(stopped["replicate"], whole["replicate"][:25])
     with pytest.raises(ResultsError, match="another calculation"):
         sampling_distribution(problem, TRUTH, out=tmp_path, seed=1, **options)
+
+
+def kill_amid_blocks(folder: Path) -> int:
+    """Start the calculation in another process and kill it after a few more blocks."""
+    before = len(list(folder.glob("slot-*.npz")))
+    child = subprocess.Popen(
+        [sys.executable, Path(__file__).with_name("replication_target.py"), folder]
+    )
+    deadline = time.monotonic() + 60
+    while len(list(folder.glob("slot-*.npz"))) < before + 3 and child.poll() is None:
+        assert time.monotonic() < deadline, "the process makes no blocks"
+        time.sleep(0.005)
+    child.kill()
+    child.wait()
+    return len(list(folder.glob("slot-*.npz")))
+
+
+@pytest.mark.slow
+def test_a_killed_calculation_goes_on_to_the_same_result(tmp_path):
+    for _ in range(2):
+        assert kill_amid_blocks(tmp_path) < 20, "it ended before it could be killed"
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("slot-*.npz")}
+    again = run(str(tmp_path))
+    np.testing.assert_array_equal(again["replicate"], run(None)["replicate"])
+    assert all(path.stat().st_mtime_ns == moment for path, moment in kept.items())
 
 
 def test_result_does_not_depend_on_block_or_threads(line):
