@@ -15,6 +15,8 @@ what repetition cannot show.
 import time
 
 import numpy as np
+from replications import repeat_oleo
+from stored import Study
 
 from bayesoleo import Normal, plots
 from bayesoleo.assessment import assess
@@ -65,9 +67,6 @@ figure_wide = plots.sampling_distribution(wide.data)
 # displacement that drives it. The friction slope alone is not what linearisation says: it stands in
 # an arctan. The command is ``python tests/benchmarks/replications.py oleo``; a thousand estimates
 # take seconds, and with ``--out`` a calculation that is stopped goes on where it was.
-
-from replications import repeat_oleo
-from stored import Study
 
 study = Study("sampling_distribution", data="campaigns/shaker-plain", slow=True)
 oleo = study.run(lambda: repeat_oleo().found)

@@ -2,8 +2,8 @@
 
 Run as ``python tests/benchmarks/replications.py [--json] [--out DIR] [gas-spring] [oleo]``: 10 000
 experiments on the gas spring and 1 000 on an oleo run of the campaign ``shaker-plain``, which is
-found through ``BAYESOLEO_DATA``. With ``--out`` finished blocks are kept there, and the same command
-goes on where it was stopped.
+found through ``BAYESOLEO_DATA``. With ``--out`` finished blocks are kept there, and the same
+command goes on where it was stopped.
 """
 
 from __future__ import annotations
