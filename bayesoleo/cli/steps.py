@@ -187,7 +187,8 @@ def estimate(
     names = ("unit", "start", "mbe", "estimate", "sd")
     rows = [[name, *(row[key] for key in names)] for name, row in _point(tree).items()]
     console.print(tables.table(["parameter", *names], rows, words=2))
-    console.print(_status(tree)["status_message"], style="dim", markup=False)
+    for line in _how_it_went(_status(tree)):
+        console.print(line, style="dim", markup=False, highlight=False)
     _print_written(out, console)
 
 
@@ -203,6 +204,22 @@ def _point(tree: xr.DataTree) -> dict[str, dict[str, Any]]:
 
 def _status(tree: xr.DataTree) -> dict[str, Any]:
     return dict(tree[schema.POINT].attrs)
+
+
+def _how_it_went(status: dict[str, Any]) -> list[str]:
+    """How the estimate ended, which trials failed on the way, and how fine the mesh was."""
+    from bayesoleo.solvers.status import counted
+
+    lines = [status["status_message"]]
+    failures = counted(json.loads(status["failures"]))
+    if failures:
+        lines.append(f"trials that failed: {failures}")
+    if "steps" in status:
+        lines.append(
+            f"{status['scheme']} with {status['steps']} steps in a period: half as long, they would"
+            f" move no parameter by more than {status['mesh_shift']:.2g} sd"
+        )
+    return lines
 
 
 def sample(

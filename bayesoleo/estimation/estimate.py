@@ -19,6 +19,7 @@ from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.steps import Step
 from bayesoleo.estimation.summarise import summarise
+from bayesoleo.solvers.status import added
 
 Progress = Callable[[Iteration], None]
 Method = str | Step[Any]
@@ -103,7 +104,11 @@ def estimate(
         if outcome.status.ok:
             break
     best = found[-1] if found[-1].status.ok else max(found, key=_height)
-    return replace(best, evaluations=sum(point.evaluations for point in found))
+    return replace(
+        best,
+        evaluations=sum(point.evaluations for point in found),
+        failures=added(point.failures for point in found),
+    )
 
 
 @dataclass(frozen=True)

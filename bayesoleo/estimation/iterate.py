@@ -7,8 +7,9 @@ Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rar
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,8 @@ class Outcome:
     evaluations : int
     distance : float
         To the method's fixed point by the last linearisation, in standard deviations.
+    failures : mapping of str to int
+        Evaluations that came to nothing, by the lower-case name of their status.
     """
 
     theta: Array
@@ -94,6 +97,7 @@ class Outcome:
     history: tuple[Iteration, ...]
     evaluations: int
     distance: float
+    failures: Mapping[str, int] = field(default_factory=dict)
 
 
 def iterate(
@@ -152,6 +156,7 @@ def iterate(
         history=tuple(loop.history),
         evaluations=loop.evaluations,
         distance=loop.distance,
+        failures=dict(loop.failures),
     )
 
 
@@ -186,15 +191,19 @@ class _Loop:
         self.state = step.begin(self.scale.root)
         self.history: list[Iteration] = []
         self.evaluations, self.distance = 0, np.nan
+        self.failures: Counter[str] = Counter()
         self.point: _Point
 
     def look(self, theta: Array) -> _Point:
         self.evaluations += 1
         evaluation = self.problem.evaluate(theta)
-        if not evaluation.status.ok:
-            return _Point(theta, evaluation, np.array([np.nan]))
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
-            return _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        point = _Point(theta, evaluation, np.array([np.nan]))
+        if evaluation.status.ok:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+                point = _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        if not point.status.ok:
+            self.failures[point.status.name.lower()] += 1
+        return point
 
     def move(self, point: _Point, halvings: int) -> None:
         """Make a point the current one, and a line of the history."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,9 @@ class PointEstimate:
         What was maximised, one of :data:`bayesoleo.estimation.OBJECTIVES`.
     error_covariance : ndarray, shape (s, s), optional
         Of the outputs' errors; diagonal unless the objective is of correlated ones.
+    failures : mapping of str to int
+        Trials on the way that could not be evaluated, by the lower-case name of their
+        :class:`~bayesoleo.solvers.status.Status`: steps towards them were halved.
     """
 
     names: tuple[str, ...]
@@ -80,6 +84,7 @@ class PointEstimate:
     on_limit: tuple[str, ...] = ()
     objective_name: str = "diagonal"
     error_covariance: Array | None = field(default=None, repr=False)
+    failures: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def sd(self) -> Array:

@@ -8,6 +8,7 @@ Where the objective has a prior they maximise with it, as BE does.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,7 @@ class _Search:
         self.counts, self.start = output_counts(problem.counts), start
         self.bias_corrected = bias_corrected
         self.evaluations, self.status = 0, Status.CONVERGED
+        self.failures: Counter[str] = Counter()
         self.history: list[Iteration] = []
         self.at = np.full(start.size, np.nan)
         self.here: Evaluation | None = None
@@ -118,6 +120,8 @@ class _Search:
         if self.here is None or not np.array_equal(z, self.at):
             self.at, self.evaluations = np.array(z), self.evaluations + 1
             self.here = self.problem.evaluate(self.scale.moved(self.start, z))
+            if not self.here.status.ok:
+                self.failures[self.here.status.name.lower()] += 1
             self.keep(self.here, self.scale.moved(self.start, z))
         return self.here
 
@@ -233,5 +237,6 @@ class _Search:
         assert self.here is not None
         evaluation = self.here if self.best is None else self.best
         return Outcome(
-            self.theta, evaluation, status, tuple(self.history), self.evaluations, np.nan
-        )
+            self.theta, evaluation, status, tuple(self.history), self.evaluations, np.nan,
+            dict(self.failures),
+        )  # fmt: skip

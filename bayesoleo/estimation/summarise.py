@@ -46,6 +46,7 @@ def summarise(
         evaluations=outcome.evaluations,
         objective=history[-1].objective if history else np.nan,
         distance=outcome.distance,
+        failures=dict(outcome.failures),
         start=start,
         history=np.array([line.theta for line in history]).reshape(len(history), unknowns),
         history_variance=np.array([_diagonal(line.variance) for line in history]).reshape(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,6 +11,7 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.point import PointEstimate
+from bayesoleo.solvers.status import added, counted
 
 _MIXED = "unit of each parameter"
 
@@ -64,6 +66,7 @@ def to_dataset(
         "iterations": sum(stage.iterations for stage in stages),
         "halvings": sum(stage.halvings for stage in stages),
         "evaluations": sum(stage.evaluations for stage in stages),
+        "failures": json.dumps(added(stage.failures for stage in stages)),
         "on_limit": ", ".join(point.on_limit),
     }
     return dataset.assign_coords(method=(schema.ITERATION, _methods(stages)))
@@ -128,6 +131,8 @@ def as_text(point: PointEstimate) -> str:
         lines.append(f"{output}: residual standard deviation {np.sqrt(variance):.4g}")
     steps = f"{point.iterations} iterations, {point.halvings} halvings"
     lines.append(f"{point.method}: {point.status.message}; {steps}")
+    if any(point.failures.values()):
+        lines.append(f"trials that failed: {counted(point.failures)}")
     if point.on_limit:
         lines.append(f"on a limit of their prior: {', '.join(point.on_limit)}")
     return "\n".join(lines)

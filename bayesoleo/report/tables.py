@@ -14,6 +14,7 @@ from bayesoleo import schema
 from bayesoleo.plots import reading
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale, engineering, format_number, format_value
+from bayesoleo.solvers.status import counted
 
 KNOWN_CONSTANTS = (
     schema.FREQUENCY,
@@ -234,10 +235,7 @@ def diagnostics(tree: xr.DataTree) -> Table | None:
             continue
         text = _yes_or_no(value) if key == "reached" else _plain(value)
         rows.append([DIAGNOSTICS.get(str(key), str(key).replace("_", " ")), text])
-    failures = _decoded(attributes.get("failures"))
-    if failures is not None:
-        counted = [f"{count} {reason}" for reason, count in failures.items() if count]
-        rows.append(["failed evaluations", ", ".join(counted) or "none"])
+    rows += _failures(attributes)
     return Table(["sampler", ""], [row for row in rows if row[1]])
 
 
@@ -269,8 +267,16 @@ def point_status(tree: xr.DataTree) -> Table | None:
     attributes = dict(tree[schema.POINT].attrs)
     if attributes.get("status_message") == attributes.get("status"):
         attributes.pop("status_message", None)
-    rows = [[str(key).replace("_", " "), _plain(value)] for key, value in attributes.items()]
+    plain = {key: value for key, value in attributes.items() if key != "failures"}
+    rows = [[str(key).replace("_", " "), _plain(value)] for key, value in plain.items()]
+    rows += _failures(attributes)
     return Table(["point estimate", ""], [row for row in rows if row[1]])
+
+
+def _failures(attributes: Mapping[Any, Any]) -> list[list[str]]:
+    """A row with the evaluations that came to nothing, by reason; none where they are not kept."""
+    failures = _decoded(attributes.get("failures"))
+    return [] if failures is None else [["failed evaluations", counted(failures) or "none"]]
 
 
 def provenance(tree: xr.DataTree) -> Table:

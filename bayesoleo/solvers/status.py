@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
 import numpy as np
@@ -57,3 +58,13 @@ def count(statuses: Iterable[int] | ArrayLike) -> dict[str, int]:
     """
     values, numbers = np.unique(np.asarray(statuses, dtype=int), return_counts=True)
     return {Status(v).name.lower(): int(n) for v, n in zip(values, numbers, strict=True)}
+
+
+def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Sum of several counts by name."""
+    return dict(sum((Counter(dict(item)) for item in counts), start=Counter()))
+
+
+def counted(failures: Mapping[str, int]) -> str:
+    """Counts for a person, as ``3 inadmissible, 1 no convergence``; empty where there are none."""
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in failures.items() if n)

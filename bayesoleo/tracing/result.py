@@ -73,8 +73,12 @@ def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.
 
 
 def point_group(fit: Fit) -> xr.Dataset:
-    """The group ``point``."""
-    return to_dataset(fit.point, mbe=fit.mbe, units=_units(fit))
+    """The group ``point``, with the mesh on which it was found and what that may have moved."""
+    point = to_dataset(fit.point, mbe=fit.mbe, units=_units(fit))
+    if fit.model.dofs:
+        scheme = fit.numerics.scheme
+        point.attrs |= {"scheme": scheme, "steps": fit.steps, "mesh_shift": fit.shift}
+    return point
 
 
 def _units(fit: Fit) -> list[str]:
