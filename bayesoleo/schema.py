@@ -162,6 +162,56 @@ def log_variance(output: str) -> str:
     return f"log_variance_{output}"
 
 
+def spread(name: str) -> str:
+    """Name of a scatter between runs: ``spread_gas_exponent``."""
+    return f"spread_{name}"
+
+
+def population_mean(name: str) -> str:
+    """Name of what a parameter that varies by run varies about: ``mean_gas_exponent``."""
+    return f"mean_{name}"
+
+
+def correlation(first: str, second: str) -> str:
+    """Name of the correlation of two outputs' errors."""
+    return f"correlation_{first}_{second}"
+
+
+def correlated_share(output: str) -> str:
+    """Name of the share of an output's error variance that is correlated in time."""
+    return f"correlated_share_{output}"
+
+
+def correlation_time(output: str) -> str:
+    """Name of the time over which an output's error is correlated."""
+    return f"correlation_time_{output}"
+
+
+def discrepancy_share(output: str) -> str:
+    """Name of the share of an output's error variance that repeats itself every period."""
+    return f"discrepancy_share_{output}"
+
+
+def discrepancy_length(output: str) -> str:
+    """Name of the length in cycles over which an output's discrepancy is alike."""
+    return f"discrepancy_length_{output}"
+
+
+_ERROR_QUANTITIES: Final = (
+    log_variance(""),
+    spread(log_variance("")),
+    "correlation_",
+    correlated_share(""),
+    discrepancy_share(""),
+    discrepancy_length(""),
+)
+
+
+def of_errors(name: str) -> bool:
+    """Whether a quantity of the posterior belongs to the error model, not to the model."""
+    return name.startswith(_ERROR_QUANTITIES)
+
+
 def by_run(parameter: str, run: str) -> str:
     """Name of a parameter that varies by run: ``offset[run 3]``."""
     return f"{parameter}[{run}]"

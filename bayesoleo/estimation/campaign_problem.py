@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.problem import Evaluation, Misfit
+from bayesoleo.estimation.residuals import RunSamples
 from bayesoleo.model import Prior
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.predictor import Predictor
@@ -108,6 +109,19 @@ class CampaignProblem:
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors, shape (L, l), from the frozen anchor."""
         return Misfit(*self.predictor.sum_of_squares(self.full(theta)))
+
+    @property
+    def samples(self) -> tuple[RunSamples, ...]:
+        """When the samples of each run were taken, s."""
+        return tuple(
+            RunSamples(record.time, record.frequency if record.periodic else None)
+            for record in self.predictor.records
+        )
+
+    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals (L, s, n) of one run at vectors (L, l) and statuses (L,), from the anchor."""
+        samples = self.predictor.simulate(self.full(theta), run)
+        return self.predictor.runs[run].measured - samples.y, samples.status
 
     def freeze(self, theta: Array) -> Status:
         """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""

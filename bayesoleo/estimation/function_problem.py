@@ -13,6 +13,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.broadcast import Broadcast
 from bayesoleo.estimation.problem import Array, Evaluation, Misfit
+from bayesoleo.estimation.residuals import RunSamples
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
 
@@ -191,6 +192,22 @@ class FunctionProblem:
         failed = ~np.isfinite(sums[:, 0, 0])
         sums[failed] = np.nan
         return Misfit(sums, np.where(failed, Status.NOT_FINITE, Status.CONVERGED).astype(np.int64))
+
+    @property
+    def samples(self) -> tuple[RunSamples, ...]:
+        """Where the samples lie: along ``x`` if it is one ascending column, else one after the
+        other."""
+        x = np.asarray(self._x) if isinstance(self._x, np.ndarray | list | tuple) else np.empty(0)
+        usable = x.shape == self._y.shape and x.dtype.kind in "iuf" and bool((np.diff(x) > 0).all())
+        place = x.astype(float) if usable else np.arange(self._y.size, dtype=float)
+        return (RunSamples(place, None),)
+
+    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals (L, 1, n) at vectors (L, l), and statuses (L,)."""
+        rows = np.stack([self._residual(vector) for vector in np.asarray(theta, dtype=float)])
+        failed = ~np.isfinite(rows).all(axis=1)
+        status = np.where(failed, Status.NOT_FINITE, Status.CONVERGED).astype(np.int64)
+        return rows[:, None], status
 
     def _residual(self, theta: Array) -> Array:
         with np.errstate(invalid="ignore", over="ignore"):

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo import schema
+from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Misfit, Problem
-from bayesoleo.model.correlated import log_density_of
+from bayesoleo.estimation.residuals import ResidualProblem
 from bayesoleo.parallel import thread_map
-from bayesoleo.posterior.likelihood import log_likelihood_by_run
+from bayesoleo.posterior.error_models import ErrorModel, error_model
 from bayesoleo.posterior.transforms import Transforms
+from bayesoleo.posterior.unknowns import PlainUnknowns, Unknowns
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
 #: Prefix of the names of the error variances' coordinates.
-LOG_VARIANCE = "log_variance_"
+LOG_VARIANCE = schema.log_variance("")
+#: Parameter vectors whose residuals are held at once: what they take stays in the cache.
+LANES = 8
 
 
 class Density(Protocol):
@@ -43,7 +48,7 @@ class Density(Protocol):
 
 
 class LogDensity:
-    """Log posterior of ``phi = (theta in coordinates without bounds, ln v of each output)``.
+    """Log posterior of ``phi = (unknowns in coordinates without bounds, those of the errors)``.
 
     Parameters
     ----------
@@ -52,6 +57,12 @@ class LogDensity:
     jobs : int, optional
         Threads over which the rows are spread. By default the problem's ``misfit`` is called once
         for all rows and spreads its own work. The result does not depend on it.
+    errors : ErrorModel or str, optional
+        What the errors have in common, ``m`` quantities; see
+        :mod:`bayesoleo.posterior.error_models`. By default one variance for each output.
+    unknowns : Unknowns, optional
+        How the problem's unknowns follow from ``p`` coordinates, and their prior; by default each
+        is one, with the problem's prior. See :mod:`bayesoleo.posterior.hierarchy`.
 
     Attributes
     ----------
@@ -61,26 +72,47 @@ class LogDensity:
         Rows of density zero so far, by the lower-case name of their
         :class:`~bayesoleo.solvers.status.Status`.
 
+    Raises
+    ------
+    InputError
+        If the error model does not suit the problem, or two quantities have one name.
+
     Notes
     -----
-    The prior is uniform in ``ln v``. Each row's value depends on that row alone, bit for bit.
+    Each row's value depends on that row alone, bit for bit.
 
     References
     ----------
     Verbeek (1993), eq. 2.29.
     """
 
-    def __init__(self, problem: Problem, jobs: int | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        jobs: int | None = None,
+        *,
+        errors: ErrorModel | str = "independent",
+        unknowns: Unknowns | None = None,
+    ) -> None:
         self.problem, self.jobs = problem, jobs
+        self.errors = error_model(errors, problem) if isinstance(errors, str) else errors
+        self.unknowns = unknowns or PlainUnknowns(tuple(problem.names), tuple(problem.priors))
         self.transforms = Transforms.of(problem.priors)
         self.evaluations = 0
         self.failures: Counter[str] = Counter()
-        self._counts = np.asarray(problem.counts)
+        self._size = len(self.unknowns.names)
+        for name in self.unknowns.names:
+            if schema.of_errors(name) or name in self.errors.names:
+                raise InputError(
+                    "a parameter has the name of an error model's quantity",
+                    key=name,
+                    hint="give it another name in the model",
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the ``l + s`` quantities: the problem's, then ``log_variance_<output>``."""
-        return (*self.problem.names, *(LOG_VARIANCE + output for output in self.problem.outputs))
+        """Names of the ``p + m`` quantities: the unknowns', then the error model's."""
+        return (*self.unknowns.names, *self.errors.names)
 
     @property
     def runs(self) -> tuple[str, ...]:
@@ -89,29 +121,34 @@ class LogDensity:
 
     @property
     def dimension(self) -> int:
-        """Number of coordinates, ``l + s``."""
+        """Number of coordinates, ``p + m``."""
         return len(self.names)
 
+    def split(self, phi: Array) -> tuple[Array, Array]:
+        """Coordinates of the unknowns, (W, p), and of the errors, (W, m)."""
+        return (
+            np.ascontiguousarray(phi[:, : self._size]),
+            np.ascontiguousarray(phi[:, self._size :]),
+        )
+
     def natural(self, phi: Array) -> Array:
-        """Parameters in their units and ``ln v``, from coordinates, both of shape (W, l + s)."""
-        phi = np.asarray(phi, dtype=float)
-        unknowns = len(self.problem.names)
-        theta = self.transforms.natural(phi[:, :unknowns])
-        return np.concatenate([theta, phi[:, unknowns:]], axis=1)
+        """All quantities in their units, from coordinates, both of shape (W, p + m)."""
+        block, eta = self.split(np.asarray(phi, dtype=float))
+        return np.concatenate([self.unknowns.natural(block), self.errors.natural(eta)], axis=1)
 
     def coordinates(self, natural: Array) -> Array:
-        """Coordinates of parameters in their units and ``ln v``, both of shape (W, l + s)."""
-        natural = np.asarray(natural, dtype=float)
-        unknowns = len(self.problem.names)
-        u = self.transforms.unbounded(natural[:, :unknowns])
-        return np.concatenate([u, natural[:, unknowns:]], axis=1)
+        """Coordinates of quantities in their units, both of shape (W, p + m)."""
+        block, eta = self.split(np.asarray(natural, dtype=float))
+        return np.concatenate(
+            [self.unknowns.coordinates(block), self.errors.coordinates(eta)], axis=1
+        )
 
     def __call__(self, phi: Array) -> tuple[Array, Array]:
         """Evaluate all rows.
 
         Parameters
         ----------
-        phi : ndarray, shape (W, l + s)
+        phi : ndarray, shape (W, p + m)
             Coordinates.
 
         Returns
@@ -123,32 +160,35 @@ class LogDensity:
             Normalised log-likelihood of every run; minus infinity likewise.
         """
         phi = np.ascontiguousarray(phi, dtype=float)
-        unknowns = len(self.problem.names)
-        theta, log_variance = self.natural(phi)[:, :unknowns], phi[:, unknowns:]
-        prior = self._log_prior(phi[:, :unknowns], theta)
+        block, eta = self.split(phi)
+        prior = self.log_prior(phi)
         status = np.full(len(phi), int(Status.CONVERGED))
         status[~np.isfinite(prior)] = Status.OUT_OF_BOUNDS
         status[~np.all(np.isfinite(phi), axis=1)] = Status.NOT_FINITE
 
-        by_run = np.full((len(phi), len(self._counts)), -np.inf)
+        by_run = np.full((len(phi), len(self.runs)), -np.inf)
         inside = np.flatnonzero(status == Status.CONVERGED)
         if inside.size:
-            misfit = self._misfit(theta[inside])
-            status[inside] = misfit.status
+            theta = self.unknowns.theta(block[inside])
             # Infinite or overflowing terms are told apart below by their status.
-            with np.errstate(over="ignore", invalid="ignore"):
-                by_run[inside] = log_likelihood_by_run(
-                    misfit.sum_of_squares, self._counts, log_variance[inside]
-                )
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                likelihood = self._of_sums if self.errors.by_sums else self._of_residuals
+                by_run[inside], status[inside] = likelihood(theta, eta[inside])
         total = prior.copy()
         with np.errstate(invalid="ignore"):
             for run in by_run.T:
                 total += run
         return self._mark_failures(total, by_run, status)
 
-    def _log_prior(self, u: Array, theta: Array) -> Array:
-        with np.errstate(invalid="ignore"):
-            return self.transforms.log_jacobian(u) + log_density_of(self.problem.priors, theta)
+    def log_prior(self, phi: Array) -> Array:
+        """Log prior density of the coordinates, shape (W,), Jacobian included."""
+        block, eta = self.split(phi)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            return self.unknowns.log_prior(block) + self.errors.log_prior(eta)
+
+    def _of_sums(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        misfit = self._misfit(theta)
+        return self.errors.of_sums(misfit.sum_of_squares, eta), misfit.status
 
     def _misfit(self, theta: Array) -> Misfit:
         if self.jobs is None or self.jobs <= 1 or len(theta) < 2:
@@ -159,6 +199,26 @@ class LogDensity:
             np.concatenate([part.sum_of_squares for part in parts]),
             np.concatenate([part.status for part in parts]),
         )
+
+    def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Log-likelihood by run (W, N) and statuses (W,), in blocks of runs and rows."""
+        problem, count = cast(ResidualProblem, self.problem), len(theta)
+        by_run = np.full((count, len(self.runs)), np.nan)
+        status = np.zeros(by_run.shape, dtype=np.int64)
+        blocks = [
+            (run, slice(k, min(k + LANES, count)))
+            for run in range(len(self.runs))
+            for k in range(0, count, LANES)
+        ]
+
+        def work(task: tuple[int, slice]) -> None:
+            run, rows = task
+            residual, status[rows, run] = problem.residuals(theta[rows], run)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                by_run[rows, run] = self.errors.of_run(run, residual, eta[rows])
+
+        thread_map(work, blocks, self.jobs)
+        return by_run, status.max(axis=1)
 
     def _mark_failures(
         self, total: Array, by_run: Array, status: NDArray[np.int64]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
+from bayesoleo.estimation.residuals import ResidualProblem
 from bayesoleo.posterior.density import LogDensity
 from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM, Mixture
 from bayesoleo.solvers.status import Status
@@ -58,54 +60,41 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
     Parameters
     ----------
     log_density : LogDensity
-        Over ``l + s`` coordinates.
-    phi : ndarray, shape (l + s,)
+        Over ``p + m`` coordinates.
+    phi : ndarray, shape (p + m,)
         The point.
 
     Returns
     -------
-    ndarray, shape (l + s, l + s)
-        Inverse of ``A + w^-1`` at fixed ``v`` for the parameters (in coordinates without bounds,
-        ``w`` the curvature of prior and Jacobian there) and ``2 / n_b`` for ``ln v_b``. Where the
-        sensitivities cannot be computed, ``A`` is left out.
+    ndarray, shape (p + m, p + m)
+        Inverse of ``A + w^-1`` at fixed ``v`` for the unknowns (in coordinates without bounds,
+        ``w`` the curvature of prior and Jacobian there), and rough variances for the quantities of
+        the error model: ``2 / n_b`` for ``ln v_b``. Where the sensitivities cannot be computed,
+        ``A`` is left out.
 
     References
     ----------
     Verbeek (1993), eq. 3.19 (the matrix) and Appendix A (``H_vv`` at ``v = M / n``).
     """
-    problem, unknowns = log_density.problem, len(log_density.problem.names)
-    u, log_variance = phi[:unknowns], phi[unknowns:]
-    precision = np.diag(_prior_precision(log_density, u))
-    theta = log_density.transforms.natural(u[None])[0]
-    evaluation = problem.evaluate(theta)
+    problem, unknowns, errors = log_density.problem, log_density.unknowns, log_density.errors
+    block, eta = (part[0] for part in log_density.split(phi[None]))
+    precision = unknowns.precision(block)
+    evaluation = problem.evaluate(unknowns.theta(block[None])[0])
     if evaluation.status.ok:
-        chain = log_density.transforms.derivative(u[None])[0]
-        for jacobian, log_v in zip(evaluation.sensitivity, log_variance, strict=True):
-            scaled = jacobian * chain
-            precision += scaled.T @ scaled * np.exp(-log_v)
+        chain = unknowns.jacobian(block)
+        ends = np.cumsum(np.asarray(problem.counts), axis=0)
+        starts = ends - np.asarray(problem.counts)
+        for run in range(len(ends)):
+            rows = [
+                jacobian[starts[run, b] : ends[run, b]].T
+                for b, jacobian in enumerate(evaluation.sensitivity)
+            ]
+            precision += chain.T @ errors.products(run, rows, eta) @ chain
+    size = len(block)
     covariance = np.zeros((len(phi), len(phi)))
-    covariance[:unknowns, :unknowns] = np.linalg.inv(precision)
-    counts = np.asarray(problem.counts).sum(axis=0)
-    covariance[unknowns:, unknowns:] = np.diag(2.0 / counts)
+    covariance[:size, :size] = np.linalg.inv(precision)
+    covariance[size:, size:] = np.diag(errors.spread() ** 2)
     return covariance
-
-
-def _prior_precision(log_density: LogDensity, u: Array) -> Array:
-    """Negative second derivatives of log prior plus log Jacobian, one for each parameter."""
-    precision = np.empty(len(u))
-    for a, (prior, transform) in enumerate(
-        zip(log_density.problem.priors, log_density.transforms.each, strict=True)
-    ):
-        step = STEP * prior.sd / abs(float(transform.derivative(u[a : a + 1])[0]))
-        # A quarter of the prior's width in u; at most 1/4 where u is a logarithm, whose unit is a
-        # factor e.
-        step = step if transform.low == -np.inf and transform.high == np.inf else min(step, STEP)
-        points = u[a] + step * np.array([-1.0, 0.0, 1.0])
-        values = prior.log_density(transform.natural(points)) + transform.log_jacobian(points)
-        curvature = -(values[0] - 2 * values[1] + values[2]) / step**2
-        floor = 1e-3 / step**2  # flat or convex: wide, but not improper
-        precision[a] = max(curvature, floor) if np.isfinite(curvature) else floor
-    return precision
 
 
 def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) -> Mode:
@@ -215,18 +204,18 @@ def _covariance(factor: Array, hessian: Array) -> tuple[Array, bool]:
 
 
 def start_coordinates(log_density: LogDensity, theta: Array) -> Array:
-    """Coordinates of a parameter vector with every variance at its most likely value.
+    """Coordinates of a parameter vector with the errors' quantities at likely values.
 
     Parameters
     ----------
     log_density : LogDensity
-        Over ``l + s`` coordinates.
+        Over ``p + m`` coordinates.
     theta : ndarray, shape (l,)
         Parameters in their units, inside their supports.
 
     Returns
     -------
-    ndarray, shape (l + s,)
+    ndarray, shape (p + m,)
 
     Raises
     ------
@@ -237,18 +226,32 @@ def start_coordinates(log_density: LogDensity, theta: Array) -> Array:
     ----------
     Verbeek (1993), eq. 3.17.
     """
-    problem = log_density.problem
-    misfit = problem.misfit(np.asarray(theta, dtype=float)[None])
-    status = Status(int(misfit.status[0]))
+    theta = np.asarray(theta, dtype=float)
+    eta = log_density.errors.start(_residuals(log_density, theta))
+    return np.concatenate([log_density.unknowns.start(theta), eta])
+
+
+def _residuals(log_density: LogDensity, theta: Array) -> list[Array]:
+    """Residuals (s, n) of every run; of a problem that has sums only, columns of equal squares."""
+    problem, parts = log_density.problem, []
+    status = Status.CONVERGED
+    if log_density.errors.by_sums:
+        misfit = problem.misfit(theta[None])
+        status = Status(int(misfit.status[0]))
+        if status.ok:
+            counts = np.asarray(problem.counts)
+            size = np.sqrt(misfit.sum_of_squares[0] / counts)
+            parts = [
+                np.repeat(row[:, None], n[0], axis=1) for row, n in zip(size, counts, strict=True)
+            ]
+    else:
+        for run in range(len(problem.runs)):
+            residual, found = cast(ResidualProblem, problem).residuals(theta[None], run)
+            status = max(status, Status(int(found[0])))
+            parts.append(residual[0])
     if not status.ok:
-        raise InputError(
-            f"a start cannot be evaluated: {status.message}", value=np.asarray(theta).tolist()
-        )
-    counts = np.asarray(problem.counts).sum(axis=0)
-    variance = misfit.sum_of_squares[0].sum(axis=0) / counts
-    tiny = np.finfo(float).tiny
-    log_variance = np.log(np.maximum(variance, tiny))
-    return log_density.coordinates(np.concatenate([theta, log_variance])[None])[0]
+        raise InputError(f"a start cannot be evaluated: {status.message}", value=theta.tolist())
+    return parts
 
 
 def laplace_mixture(

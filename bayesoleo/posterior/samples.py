@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo import schema
 from bayesoleo.posterior.density import LOG_VARIANCE
 from bayesoleo.posterior.mixture import Mixture
 
@@ -20,7 +21,8 @@ class Samples:
     Parameters
     ----------
     names : tuple of str
-        Names of the ``d`` quantities: parameters, then ``log_variance_<output>``.
+        Names of the ``d`` quantities: parameters, then those of the error model, the first of which
+        are ``log_variance_<output>``.
     runs : tuple of str
         Labels of the ``N`` runs.
     draws : ndarray, shape (chains, draws, d)
@@ -69,8 +71,8 @@ class Samples:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the ``l`` model parameters."""
-        return tuple(name for name in self.names if not name.startswith(LOG_VARIANCE))
+        """Names of the model's parameters, with mean and spread of those that scatter."""
+        return tuple(name for name in self.names if not schema.of_errors(name))
 
     @property
     def theta(self) -> Array:
@@ -78,6 +80,13 @@ class Samples:
         return self.draws[:, :, : len(self.parameters)]
 
     @property
-    def log_variance(self) -> Array:
-        """Draws of the logarithms of the error variances, shape (chains, draws, s)."""
+    def of_errors(self) -> Array:
+        """Draws of the error model's ``m`` quantities, shape (chains, draws, m)."""
         return self.draws[:, :, len(self.parameters) :]
+
+    @property
+    def log_variance(self) -> Array:
+        """Draws of the logarithms of the outputs' variances, shape (chains, draws, s)."""
+        names = self.names[len(self.parameters) :]
+        count = sum(name.startswith(LOG_VARIANCE) and not name.endswith("]") for name in names)
+        return self.of_errors[:, :, :count]
