@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.compiled import BLOCK
+from bayesoleo.compiled import BLOCK as POINTS
 from bayesoleo.solvers.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
 
 
@@ -55,7 +55,7 @@ def sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
 @jit
 def sample_block(x, lane, block, index, position, w0, w1, w2, h, orders, needed, z):
     """The same for one lane and one block of samples, with plans cut into blocks: ``index (blocks,
-    BLOCK)`` and weights ``(blocks, s, BLOCK)``. Fills the rows of ``z (nz, BLOCK)`` that are
+    POINTS)`` and weights ``(blocks, s, POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are
     ``needed``; without a view of any array, which would cost more than what it is for."""
     d, s = orders.size, w0.shape[1]
     D = orders.sum()
@@ -64,32 +64,32 @@ def sample_block(x, lane, block, index, position, w0, w1, w2, h, orders, needed,
         order = orders[j]
         last, top = state + order - 1, row + order
         if needed[row]:
-            for i in range(BLOCK):
+            for i in range(POINTS):
                 z[row, i] = x[lane, index[block, i], state]
             for stage in range(s if order == 1 else 0):
                 own = D + stage * d + j
-                for i in range(BLOCK):
+                for i in range(POINTS):
                     z[row, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
         if order == 2 and needed[row]:
-            for i in range(BLOCK):
+            for i in range(POINTS):
                 z[row, i] += h * position[block, i] * x[lane, index[block, i], last]
             for stage in range(s):
                 own = D + stage * d + j
-                for i in range(BLOCK):
+                for i in range(POINTS):
                     z[row, i] += h * h * w2[block, stage, i] * x[lane, index[block, i], own]
         if order == 2 and needed[row + 1]:
-            for i in range(BLOCK):
+            for i in range(POINTS):
                 z[row + 1, i] = x[lane, index[block, i], last]
             for stage in range(s):
                 own = D + stage * d + j
-                for i in range(BLOCK):
+                for i in range(POINTS):
                     z[row + 1, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
         if needed[top]:
-            for i in range(BLOCK):
+            for i in range(POINTS):
                 z[top, i] = 0.0
             for stage in range(s):
                 own = D + stage * d + j
-                for i in range(BLOCK):
+                for i in range(POINTS):
                     z[top, i] += w0[block, stage, i] * x[lane, index[block, i], own]
         row, state = top + 1, state + order
 
