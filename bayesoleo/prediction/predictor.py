@@ -35,11 +35,17 @@ class RunPrediction:
     sensitivity : ndarray, shape (ny, l, N)
         Derivatives with respect to all unknowns.
     status : Status
+    jumped : bool
+        Whether the periodic solution left the branch of the one it was started from.
+    monodromy : ndarray, shape (D, D), or None
+        Of the periodic solution; its eigenvalues are the Floquet multipliers.
     """
 
     y: Array
     sensitivity: Array
     status: Status
+    jumped: bool = False
+    monodromy: Array | None = None
 
 
 class Predictor:
@@ -134,7 +140,13 @@ class Predictor:
         _, ny, _, count = samples.y_p.shape
         sensitivity = np.zeros((ny, len(self.layout.names), count))
         sensitivity[:, self.layout.columns[r]] = samples.y_p[0]
-        return RunPrediction(samples.y[0], sensitivity, Status(int(samples.status[0])))
+        return RunPrediction(
+            samples.y[0],
+            sensitivity,
+            Status(int(samples.status[0])),
+            samples.jumped is not None and bool(samples.jumped[0]),
+            None if samples.monodromy is None else samples.monodromy[0],
+        )
 
     def simulate(self, theta: Array, r: int) -> Samples:
         """Outputs of run number ``r`` for many vectors, shape (L, l)."""

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
+from bayesoleo.prediction.anchor import PATH_PIECES, Anchor
 from bayesoleo.prediction.guess import Motion, guess_rows
 from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.squares import FusedSquares, squared_distances
+from bayesoleo.prediction.stability import unstable_of
 from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.measures import positive, total
 from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities, solve_periodic
 from bayesoleo.solvers.schemes import scheme
 from bayesoleo.solvers.status import Status
@@ -25,57 +28,8 @@ Array = NDArray[np.float64]
 
 #: Parameter vectors whose samples are evaluated together.
 CHUNK = 8
-#: A start extrapolated too far is retried along a path of this many pieces.
-PATH_PIECES = (4, 16)
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """A solution with derivatives, from which others start: ``x + x_p (p - p0)``.
-
-    Frozen before sampling, it makes a solution a function of its own parameters alone. ``x (n, w)``
-    are the scheme's unknowns, ``x_p (na, n, w)`` their derivatives with respect to the active
-    parameters.
-    """
-
-    p: Array
-    x: Array
-    x_p: Array
-
-    def predict(self, change: Array) -> Array:
-        """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
-        start = np.empty((change.shape[0], *self.x.shape))
-        _extrapolate(
-            self.x.ravel(),
-            self.x_p.reshape(self.x_p.shape[0], -1),
-            change,
-            start.reshape(change.shape[0], -1),
-        )
-        return start
-
-
-@numba.njit(nogil=True, cache=True)
-def _extrapolate(x, x_p, change, start):
-    """Lane by lane: the order of summation of a matrix product would vary with the batch."""
-    for lane in range(change.shape[0]):
-        for i in range(x.size):
-            start[lane, i] = x[i]
-        for k in range(change.shape[1]):
-            for i in range(x.size):
-                start[lane, i] += change[lane, k] * x_p[k, i]
-
-
-@numba.njit(nogil=True, cache=True)
-def _compare(measured, y, a, lanes, squares, inside):
-    """Sums of squared residuals ``(L, ny)``, and whether no condition ``a`` is broken, by lane."""
-    defined = np.ones(inside.size, dtype=np.bool_)
-    positive(a, lanes, inside, defined)
-    for lane in lanes:
-        for output in range(y.shape[1]):
-            row = measured[output] - y[lane, output]
-            for i in range(row.size):
-                row[i] *= row[i]
-            squares[lane, output] = total(row) if defined[lane] else np.nan
+#: Threads share a run.
+_COUNTING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -90,11 +44,19 @@ class Samples:
         Derivatives with respect to the active parameters.
     status : ndarray of int, shape (L,)
         Values of :class:`~bayesoleo.solvers.status.Status`.
+    jumped : ndarray of bool, shape (L,), or None
+        Whether a periodic solution left the branch of the anchor from which it was started, or
+        changed the number of its unstable multipliers; None where there is no such thing.
+    monodromy : ndarray, shape (L, D, D), or None
+        Of the periodic solutions, where derivatives were asked for; its eigenvalues are the Floquet
+        multipliers.
     """
 
     y: Array
     y_p: Array | None
     status: NDArray[np.int64]
+    jumped: NDArray[np.bool_] | None = None
+    monodromy: Array | None = None
 
 
 class RunPredictor:
@@ -115,6 +77,11 @@ class RunPredictor:
     known_rows : dict, optional
         Input rows that another model of the same run has computed; this one adds to it.
     """
+
+    _fused: tuple[Any, FusedSquares | None] | None = None
+
+    #: Solutions so far that left the branch of the anchor from which they were started.
+    jumps = 0
 
     def __init__(
         self,
@@ -221,11 +188,12 @@ class RunPredictor:
         if solution is None or solution.status[0] != Status.CONVERGED.value:
             solution = solve_from_guess(self.boundary, p[None], self.guess(p))
         if solution.status[0] == Status.CONVERGED.value:
-            solution, x_p, _ = sensitivities(self.boundary, p[None], solution)
+            solution, x_p, monodromy = sensitivities(self.boundary, p[None], solution)
             if solution.status[0] == Status.CONVERGED.value:
-                self.anchor = Anchor(
-                    p.copy(), solution.x[0], np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
-                )
+                moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+                anchor = Anchor(p.copy(), solution.x[0], moved, monodromy[0])
+                self.anchor = anchor.after(self.anchor, self.boundary, self.active)
+                self.jumps += self.anchor.jumped
         return Status(int(solution.status[0]))
 
     def _from_anchor(self, p: Array) -> Solution:
@@ -271,9 +239,30 @@ class RunPredictor:
             return self._at_samples(p, None, None, status, derivatives)
         solution = self.solve(p)
         x_p: Array | None = None
+        monodromy: Array | None = None
         if derivatives:
-            solution, x_p, _ = sensitivities(self.boundary, p, solution)
-        return self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+            solution, x_p, monodromy = sensitivities(self.boundary, p, solution)
+        samples = self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+        jumped = self._left(p, solution.x, samples.status, monodromy)
+        return replace(samples, jumped=jumped, monodromy=monodromy)
+
+    def _left(
+        self, p: Array, x: Array, status: NDArray[np.int64], monodromy: Array | None = None
+    ) -> NDArray[np.bool_]:
+        """Whether solutions that converged left the anchor's branch, which is counted."""
+        anchor = self.anchor
+        if anchor is None or anchor.monodromy is None:  # of a transient
+            return np.zeros(p.shape[0], dtype=np.bool_)
+        good = status == Status.CONVERGED.value
+        left = anchor.left_by(p[:, self.active] - anchor.p[self.active], x) & good
+        for lane in np.flatnonzero(left):  # few: those that the prediction misses by far
+            left[lane] = not anchor.leads_to(p[lane], x[lane], self.boundary, self.active)
+        if monodromy is not None:
+            left |= good & (unstable_of(monodromy) != anchor.unstable)
+        if left.any():
+            with _COUNTING:
+                self.jumps += int(left.sum())
+        return left
 
     def evaluate(self, p: Array) -> Samples:
         """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it.
@@ -287,7 +276,9 @@ class RunPredictor:
             shape = (1, len(self.kernels.derived.outputs), len(self.active), self.record.time.size)
             return Samples(np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan), status)
         x_p = np.moveaxis(self.anchor.x_p, 0, 2)[None]
-        return self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
+        samples = self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
+        monodromy = None if self.anchor.monodromy is None else self.anchor.monodromy[None]
+        return replace(samples, jumped=np.array([self.anchor.jumped]), monodromy=monodromy)
 
     def _at_samples(
         self,
@@ -320,39 +311,35 @@ class RunPredictor:
         """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums
         of failed lanes mean nothing.
 
-        The same as comparing :meth:`predict` with the measurement, through arrays small enough to
-        stay in the processor's cache.
+        The same as comparing :meth:`predict` with the measurement, but fused where there is
+        compiled code for it (:mod:`bayesoleo.prediction.squares`).
         """
-        count, samples, ny = p.shape[0], self.record.time.size, len(self.kernels.derived.outputs)
-        squares, status = np.full((count, ny), np.nan), np.zeros(count, dtype=np.int64)
-        solution = self.solve(p) if self.kernels.derived.dofs else None
-        if solution is not None:
-            status = solution.status.copy()
-        y, a = np.empty((CHUNK, ny, samples)), np.empty((CHUNK, self.boundary.conditions, samples))
-        inside = np.ones(CHUNK, dtype=np.bool_)
-        sums = np.empty((CHUNK, ny))
-        for first in range(0, count, CHUNK):
-            part = slice(first, min(first + CHUNK, count))
-            lanes = np.flatnonzero(status[part] == Status.CONVERGED.value)
-            z = self._rows_at_samples(
-                None if solution is None else solution.x[part, :, :, None], p[part]
-            )[:, :, 0]
-            with np.errstate(all="ignore"):
-                self.kernels.output(z, self.sample_inputs, p[part], lanes, y)
-                if self.boundary.conditions:
-                    self.kernels.admissible(z, self.sample_inputs, p[part], lanes, a)
-            _compare(self.measured, y, a, lanes, sums, inside)
-            squares[first + lanes] = sums[lanes]
-            status[first + lanes] = np.where(
-                inside[lanes],
-                np.where(
-                    np.isfinite(sums[lanes]).all(axis=1),
-                    Status.CONVERGED.value,
-                    Status.NOT_FINITE.value,
-                ),
-                Status.INADMISSIBLE.value,
-            )
-        return squares, status
+        fused = self._fused_squares()
+        if fused is None:
+            return self._squares_of_predictions(p)
+        solution = self.solve(p)
+        status = solution.status.copy()
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        step = self.boundary.step(self.steps)
+        sums, inside, defined = fused.sums(self.measured, solution.x, p, step, lanes)
+        finite = defined[lanes] & np.isfinite(sums[lanes]).all(axis=1)
+        status[lanes[~finite]] = Status.NOT_FINITE.value
+        status[lanes[~inside[lanes]]] = Status.INADMISSIBLE.value
+        self._left(p, solution.x, status)
+        return sums, status
+
+    def _fused_squares(self) -> FusedSquares | None:
+        """Of the present plan: a transient's changes with its mesh."""
+        if self._fused is None or self._fused[0] is not self.plan:
+            made = FusedSquares.of(self.kernels, self.scheme, self.plan, self.sample_inputs)
+            self._fused = (self.plan, made)
+        return self._fused[1]
+
+    def _squares_of_predictions(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Through predictions of a few vectors at a time."""
+        parts = [self.predict(p[first : first + CHUNK]) for first in range(0, len(p), CHUNK)]
+        squares = [squared_distances(self.measured, part.y) for part in parts]
+        return np.concatenate(squares), np.concatenate([part.status for part in parts])
 
     def _rows_at_samples(self, x: Array | None, p: Array) -> Array:
         """Values and derivatives of the dofs at the raw samples, shape (L, nz, C, N)."""

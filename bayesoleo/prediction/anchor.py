@@ -1,0 +1,141 @@
+"""A solution with its derivatives, from which solutions at other parameters start.
+
+Frozen before sampling, it makes a solution a function of its own parameters alone. It also knows
+when a solution is none of its own branch: the linear prediction that a solve starts from is wrong
+by more than it moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.prediction.stability import compared, count_unstable, is_jump, jumps, swings
+from bayesoleo.solvers.orbit import floquet_multipliers
+from bayesoleo.solvers.periodic import Boundary, solve_periodic
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: A start extrapolated too far is retried along a path of this many pieces.
+PATH_PIECES = (4, 16)
+#: Longest and shortest step, in parts of the way, of a walk that looks for a jump: the shortest
+#: passes a resonance of a few hundred times the static answer, not a fold.
+LONGEST, SHORTEST = 0.25, 1 / 512
+#: Two solutions of the same equations are one if they differ by less of the swing: Newton's method
+#: leaves far less, other branches far more.
+SAME = 1e-3
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A solution with derivatives: others start at ``x + x_p (p - p0)``.
+
+    Parameters
+    ----------
+    p : ndarray, shape (np,)
+        Constants.
+    x : ndarray, shape (n, w)
+        The scheme's unknowns.
+    x_p : ndarray, shape (na, n, w)
+        Their derivatives by the active parameters.
+    monodromy : ndarray, shape (D, D), or None
+        Of a periodic solution; None for a transient.
+    jumped : bool
+        Whether it left the branch of the anchor before it, or changed its stability.
+    """
+
+    p: Array
+    x: Array
+    x_p: Array
+    monodromy: Array | None = None
+    jumped: bool = False
+
+    def predict(self, change: Array) -> Array:
+        """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
+        start = np.empty((change.shape[0], *self.x.shape))
+        _extrapolate(
+            self.x.ravel(),
+            self.x_p.reshape(self.x_p.shape[0], -1),
+            change,
+            start.reshape(change.shape[0], -1),
+        )
+        return start
+
+    @cached_property
+    def unstable(self) -> int:
+        """Number of Floquet multipliers outside the unit circle, -1 where they are not known."""
+        if self.monodromy is None:
+            return -1
+        return int(count_unstable(floquet_multipliers(self.monodromy)))
+
+    def left_by(self, change: Array, x: Array) -> NDArray[np.bool_]:
+        """Whether solutions ``x (L, n, w)`` at changes ``(L, na)`` of the active parameters lie
+        farther from their prediction than that moved, and than a tenth of the swing.
+        """
+        found = np.zeros(x.shape[0], dtype=np.bool_)
+        swing, nodes = self.scale
+        jumps(self.x, self.x_p, swing, nodes, change, x, found)
+        return found
+
+    @cached_property
+    def scale(self) -> tuple[Array, NDArray[np.int64]]:
+        """Swing of each state, shape (D,), and the nodes at which motions are compared."""
+        states = self.x.shape[1] if self.monodromy is None else len(self.monodromy)
+        return swings(self.x, min(states, self.x.shape[1])), compared(len(self.x))
+
+    def after(self, old: Anchor | None, boundary: Boundary, active: NDArray[np.int64]) -> Anchor:
+        """The same, knowing whether it is on the branch of the anchor before it."""
+        if old is None:
+            return self
+        far = old.left_by((self.p - old.p)[active][None], self.x[None])[0]
+        left = far and not old.leads_to(self.p, self.x, boundary, active)
+        return replace(self, jumped=bool(left or old.unstable != self.unstable))
+
+    def leads_to(self, p: Array, x: Array, boundary: Boundary, active: NDArray[np.int64]) -> bool:
+        """Whether small steps from here to constants ``p (np,)`` arrive at a solution ``x (n, w)``.
+
+        A linear prediction fails over a long way too; another branch is where no path leads.
+        """
+        end = self._walked(p, boundary, active)
+        if end is None:
+            return False
+        swing = self.scale[0]
+        return bool(np.all(np.abs(end - x)[:, : swing.size] <= SAME * swing))
+
+    def _walked(self, p: Array, boundary: Boundary, active: NDArray[np.int64]) -> Array | None:
+        """Where a path of steps, each predicted by the last, ends; None where it has an end of its
+        own.
+        """
+        nodes, states = self.scale[1], self.scale[0].size
+        here, slope = self.x, np.tensordot((p - self.p)[active], self.x_p, 1)
+        place, step = 0.0, LONGEST
+        while place < 1.0:
+            length = min(step, 1.0 - place)
+            ahead = here + length * slope
+            now = (self.p + (place + length) * (p - self.p))[None]
+            trial = solve_periodic(boundary, now, ahead[None], max_iterations=15)
+            lost = trial.status[0] != Status.CONVERGED.value
+            if lost or is_jump(here, ahead, trial.x[0], swings(here, states), nodes):
+                step = length / 2
+                if step < SHORTEST:
+                    return None
+                continue
+            here, slope = trial.x[0], (trial.x[0] - here) / length
+            place, step = place + length, min(2 * length, LONGEST)
+        return here
+
+
+@numba.njit(nogil=True, cache=True)
+def _extrapolate(x, x_p, change, start):
+    """Lane by lane: the order of summation of a matrix product would vary with the batch."""
+    for lane in range(change.shape[0]):
+        for i in range(x.size):
+            start[lane, i] = x[i]
+        for k in range(change.shape[1]):
+            for i in range(x.size):
+                start[lane, i] += change[lane, k] * x_p[k, i]

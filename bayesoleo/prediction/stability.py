@@ -1,0 +1,186 @@
+"""Which of a model's periodic answers were found: whether they can last, and whether they jumped.
+
+A nonlinear model may answer one input in several ways. Newton's method finds one of them and says
+nothing of the others: a small change of the parameters can take it to another branch, and a motion
+that no rig could stay on is found as readily as one that lasts. Both are seen from what a solve
+returns anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.orbit import floquet_multipliers
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+#: Nodes of a period at which two motions are compared: another branch differs at most of them.
+COMPARED = 16
+#: A correction of a linear prediction is taken for a jump if it exceeds the predicted move, and
+#: this part of the swing.
+LARGE = 0.1
+#: A component whose swing is below this part of its size stands still; it only has round-off.
+STILL = 1e-9
+#: How far outside the unit circle a multiplier must lie to count: an undamped motion's lie on it
+#: but for the errors of the mesh.
+MARGIN = 1e-6
+
+
+@numba.njit(nogil=True, cache=True)
+def jumps(x0, x_p, swing, nodes, change, x, found):
+    """Lane by lane, whether solutions ``x (L, n, w)`` are off their prediction by more than it
+    moved and more than a part of the swing ``(D,)``; ``x0 (n, w)`` and ``x_p (na, n, w)`` predict.
+    """
+    for lane in range(x.shape[0]):
+        found[lane] = False
+        for j in range(swing.size):
+            moved, corrected = 0.0, 0.0
+            for m in nodes:
+                step = 0.0
+                for k in range(x_p.shape[0]):
+                    step += change[lane, k] * x_p[k, m, j]
+                moved = max(moved, abs(step))
+                corrected = max(corrected, abs(x[lane, m, j] - x0[m, j] - step))
+            if corrected > moved and corrected > LARGE * swing[j]:
+                found[lane] = True
+
+
+def is_jump(here: Array, ahead: Array, x: Array, swing: Array, nodes: NDArray[np.int64]) -> bool:
+    """The same for one solution ``x (n, w)``, predicted as ``ahead`` from ``here``."""
+    columns = (nodes, slice(0, swing.size))
+    moved = np.abs(ahead - here)[columns].max(axis=0)
+    corrected = np.abs(x - ahead)[columns].max(axis=0)
+    return bool(np.any((corrected > moved) & (corrected > LARGE * swing)))
+
+
+def swings(x: Array, states: int) -> Array:
+    """Largest less least value of a motion's states ``(n, D)``, infinite where one stands still."""
+    columns = x[:, :states]
+    swing = np.ptp(columns, axis=0)
+    return np.where(swing > STILL * np.abs(columns).max(axis=0), swing, np.inf)
+
+
+def compared(n: int) -> NDArray[np.int64]:
+    """Nodes of a mesh of ``n`` steps that are looked at."""
+    return np.unique(np.arange(COMPARED) * n // COMPARED)
+
+
+def count_unstable(multipliers: Complex) -> NDArray[np.int64]:
+    """Number of multipliers ``(..., D)`` outside the unit circle, -1 where they are not known."""
+    known = np.isfinite(multipliers).all(axis=-1) & (multipliers.shape[-1] > 0)
+    return np.where(known, np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1), -1)
+
+
+def unstable_of(monodromy: Array) -> NDArray[np.int64]:
+    """The same from monodromy matrices ``(L, D, D)``."""
+    known = np.isfinite(monodromy).all(axis=(1, 2))
+    values = np.linalg.eigvals(np.where(known[:, None, None], monodromy, 0.0))
+    return np.where(known, count_unstable(values.astype(np.complex128)), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """The periodic solutions of an estimate's runs.
+
+    Parameters
+    ----------
+    runs : tuple of str
+        Labels of the ``N`` runs.
+    multipliers : ndarray of complex, shape (N, D)
+        Floquet multipliers of each run's solution, largest first: by how much a small disturbance
+        grows in a period. NaN for a transient; ``D`` is zero for a model without dofs.
+    jumps : ndarray of int, shape (N,)
+        How often a run's solution left its branch, or changed the number of multipliers outside the
+        unit circle, between parameters that followed each other.
+    """
+
+    runs: tuple[str, ...]
+    multipliers: Complex
+    jumps: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, runs: Sequence[str], monodromies: Sequence[Array | None], jumps: NDArray[np.int64]
+    ) -> Stability:
+        """From the monodromy matrix ``(D, D)`` of each run, where there is one."""
+        size = max((m.shape[0] for m in monodromies if m is not None), default=0)
+        table = np.full((len(runs), size), complex(np.nan, np.nan))
+        for row, matrix in zip(table, monodromies, strict=True):
+            if matrix is not None:
+                row[:] = floquet_multipliers(matrix)
+        return cls(tuple(runs), table, jumps)
+
+    @property
+    def unstable(self) -> NDArray[np.int64]:
+        """Number of multipliers outside the unit circle by run, -1 where they are not known."""
+        return count_unstable(self.multipliers)
+
+    @property
+    def branch_jumps(self) -> int:
+        """Jumps of all runs."""
+        return int(self.jumps.sum())
+
+    def with_jumps(self, jumps: NDArray[np.int64]) -> Stability:
+        """The same solutions after so many jumps."""
+        return replace(self, jumps=jumps)
+
+    def together(self, other: Stability) -> Stability:
+        """These runs and others, of one model."""
+        return Stability(
+            self.runs + other.runs,
+            np.concatenate([self.multipliers, other.multipliers]),
+            np.concatenate([self.jumps, other.jumps]),
+        )
+
+    def notes(self) -> list[str]:
+        """What a reader should know, a sentence each; nothing where all runs are stable."""
+        return [*self._unstable_notes(), *self._jump_notes()]
+
+    def _unstable_notes(self) -> list[str]:
+        found: dict[str, list[str]] = {}
+        for run, row, count in zip(self.runs, self.multipliers, self.unstable, strict=True):
+            if count > 0:
+                found.setdefault(_consequence(row[0]), []).append(f"{run} ({_spelled(row[0])})")
+        return [
+            f"unstable periodic solution in {_runs(runs)}, largest multiplier in brackets:"
+            f" {consequence}"
+            for consequence, runs in found.items()
+        ]
+
+    def _jump_notes(self) -> list[str]:
+        if not self.branch_jumps:
+            return []
+        runs = [f"{run} ({n})" for run, n in zip(self.runs, self.jumps, strict=True) if n]
+        return [
+            f"branch jumps: the periodic solution of {_runs(runs)} jumped to another branch, or"
+            " changed its stability, between neighbouring parameters, so often as the brackets say:"
+            " the model has several answers to this input, and the estimate may be on the wrong one"
+        ]
+
+
+def _consequence(multiplier: complex) -> str:
+    """What a rig would do instead."""
+    if multiplier.imag:
+        return "a second frequency would arise beside the input's"
+    if multiplier.real < 0:
+        return (
+            "the period doubles (multiplier below -1): a rig would answer in twice the period, so"
+            " declare half the frequency for the run if its record does"
+        )
+    return "a rig would leave it for another answer to the same input"
+
+
+def _spelled(multiplier: complex) -> str:
+    if multiplier.imag:
+        return f"{multiplier.real:.3g} ± {abs(multiplier.imag):.3g}i"
+    return f"{multiplier.real:.4g}"
+
+
+def _runs(labels: Sequence[str]) -> str:
+    return f"{'run' if len(labels) == 1 else 'runs'} {', '.join(labels)}"
