@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo.assessment import residual_tests as tests
+from bayesoleo.assessment.means import ACROSS, between_means
 from bayesoleo.assessment.series import Array, Series, series_of_problem, series_of_tree
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.point import PointEstimate
@@ -52,7 +52,7 @@ _IN_UNIT = ("rms", "mean")
 
 
 def assess(
-    subject: Problem | xr.DataTree,
+    subject: Problem | xr.DataTree | Sequence[Series],
     point: PointEstimate | ArrayLike | None = None,
     *,
     stage: str | None = None,
@@ -61,10 +61,10 @@ def assess(
 
     Parameters
     ----------
-    subject : Problem or DataTree
-        What was fitted, or the result of ``close`` or ``trace``.
+    subject : Problem, DataTree or sequence of Series
+        What was fitted, the result of ``close`` or ``trace``, or residuals from elsewhere.
     point : PointEstimate or array_like, shape (l,), optional
-        The estimate; not needed for a result.
+        The estimate; only of a problem.
     stage : {"before", "after"}, optional
         Of a result: the model as declared or as extended; by default the latter.
 
@@ -88,6 +88,8 @@ def assess(
     """
     if isinstance(subject, xr.DataTree):
         series = series_of_tree(subject, stage)
+    elif isinstance(subject, Sequence):
+        series = list(subject)
     elif point is None:
         raise InputError("the estimate is missing", key="point", hint="pass assess(problem, point)")
     else:
@@ -96,19 +98,9 @@ def assess(
     return Shown(data, assessment_text(data))
 
 
-def noise_of(series: Series) -> Array:
-    """What does not repeat of a residual: all of it where nothing can, shape (n,)."""
-    average = series.average()
-    if average is None:
-        return series.residual
-    # The average takes a share of the noise with it.
-    loss = 1 - average.number / average.samples
-    return (series.residual - average.values) / np.sqrt(loss)
-
-
 def _numbers(series: Series) -> dict[str, float]:
     """All single numbers of one series."""
-    noise, average = noise_of(series), series.average()
+    noise, average = series.noise(), series.average()
     signs = tests.runs_of_signs(series.residual)
     skewness, kurtosis, normal = tests.normality(series.residual)
     places, _, limit = outliers_of(series)
@@ -131,7 +123,7 @@ def _numbers(series: Series) -> dict[str, float]:
     if average is None:
         return found | missing
     size = average.repeating, average.sigma, average.samples, average.number
-    fit = tests.lack_of_fit(*size, series.input_noise)
+    fit = tests.lack_of_fit(*size, series.input_noise, tests.memory(noise, 2))
     return found | {
         "same_phase": tests.same_phase(*size),
         "lack_of_fit": fit.statistic,
@@ -158,7 +150,7 @@ def _dataset(series: Sequence[Series]) -> xr.Dataset:
         share[at], share_p[at] = _shares(one, names)
         far_time[at], far_score[at] = _farthest(one)
         whole[at], noise[at] = correlograms(one)
-    across = [_between(series, output) for output in outputs]
+    across = [between_means([one for one in series if one.output == o]) for o in outputs]
     data = xr.Dataset(
         {
             **{
@@ -179,7 +171,7 @@ def _dataset(series: Sequence[Series]) -> xr.Dataset:
             ),
             **{
                 key: _variable((schema.OUTPUT,), np.array([row[key] for row in across]), text, "1")
-                for key, text in _ACROSS.items()
+                for key, text in ACROSS.items()
             },
             schema.UNIT: ((schema.OUTPUT,), np.array([units[o] for o in outputs], dtype=object)),
         },
@@ -195,14 +187,6 @@ def _dataset(series: Sequence[Series]) -> xr.Dataset:
     return data
 
 
-_ACROSS = {
-    "share_of_runs": "part of the variance that differs from run to run",
-    "share_of_runs_p": "its probability",
-    "share_of_groups": "part of the variance of run means that differs from group to group",
-    "share_of_groups_p": "its probability",
-}
-
-
 def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
     return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
@@ -211,7 +195,7 @@ def _shares(series: Series, names: Sequence[str]) -> tuple[Array, Array]:
     """How much each variable explains, and its probability."""
     # Where nothing repeats, noise and the model's error cannot be told apart: noise is then taken
     # as white.
-    effective = tests.memory(noise_of(series)) if series.periodic else 1.0
+    effective = tests.memory(series.noise()) if series.periodic else 1.0
     share, p_value = np.full((2, len(names)), np.nan)
     for k, name in enumerate(names):
         if name in series.variables:
@@ -232,7 +216,7 @@ def outliers_of(series: Series) -> tuple[NDArray[np.int64], Array, float]:
     found: dict[int, float] = {}
     cleaned, limit = series, np.nan
     for _ in range(_MOST_ROUNDS):
-        noise, average = noise_of(cleaned), cleaned.average()
+        noise, average = cleaned.noise(), cleaned.average()
         scores, places, limit = tests.outliers(noise)
         if places.size == 0:
             break
@@ -267,40 +251,9 @@ def correlograms(series: Series) -> tuple[Array, Array]:
     lags = np.round(steps * unit).astype(int)
     lags = lags[lags < series.residual.size - 2]
     found = np.full((2, steps.size), np.nan)
-    for row, values in zip(found, (series.residual, noise_of(series)), strict=True):
+    for row, values in zip(found, (series.residual, series.noise()), strict=True):
         row[: lags.size] = tests.autocorrelation(values, int(lags[-1]))[lags]
     return found[0], found[1]
-
-
-def _between(series: Sequence[Series], output: str) -> dict[str, float]:
-    """Do mean residuals differ from run to run, and run means from group to group."""
-    chosen = [one for one in series if one.output == output]
-    found = dict.fromkeys(_ACROSS, np.nan)
-    if len(chosen) < 2:
-        return found
-    means = np.array([one.residual.mean() for one in chosen])
-    effective = np.array([one.residual.size / tests.memory(noise_of(one)) for one in chosen])
-    noise = np.array([float(np.var(noise_of(one))) for one in chosen])
-    whole = np.concatenate([one.residual for one in chosen])
-    sizes = np.array([one.residual.size for one in chosen])
-    found["share_of_runs"] = float(
-        np.sum(sizes * (means - whole.mean()) ** 2) / np.sum((whole - whole.mean()) ** 2)
-    )
-    # Means with errors of their own: chi-square about their weighted mean.
-    weight = effective / np.maximum(noise, np.finfo(float).tiny)
-    centre = float(np.sum(weight * means) / weight.sum())
-    chi_square = float(np.sum(weight * (means - centre) ** 2))
-    found["share_of_runs_p"] = float(stats.chi2.sf(chi_square, len(chosen) - 1))
-    groups = [[m for m, one in zip(means, chosen, strict=True) if one.group == g] for g in
-              dict.fromkeys(one.group for one in chosen)]  # fmt: skip
-    if len(groups) > 1 and len(chosen) > len(groups):
-        total = float(np.sum((means - means.mean()) ** 2))
-        inside = float(sum(np.sum((np.array(g) - np.mean(g)) ** 2) for g in groups))
-        found["share_of_groups"] = 1 - inside / total
-        free = len(chosen) - len(groups)
-        ratio = (total - inside) / (len(groups) - 1) / max(inside / free, np.finfo(float).tiny)
-        found["share_of_groups_p"] = float(stats.f.sf(ratio, len(groups) - 1, free))
-    return found
 
 
 def assessment_text(data: xr.Dataset) -> str:

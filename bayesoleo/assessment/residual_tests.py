@@ -81,10 +81,16 @@ def autocorrelation(values: Array, lags: int) -> Array:
     return sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny)
 
 
-def memory(values: Array) -> float:
+def memory(values: Array, power: int = 1) -> float:
     """Samples that hold the information of one: the integrated autocorrelation time, at least one.
 
     Summed over a window of five times itself (Sokal 1997).
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+    power : {1, 2}, optional
+        Information on the mean, or on the variance, which the square of the autocorrelation tells.
     """
     if values.size < 20:
         return 1.0
@@ -92,7 +98,7 @@ def memory(values: Array) -> float:
     total = 1.0 + 2.0 * np.cumsum(rho[1:])
     window = np.arange(1, rho.size) >= 5.0 * np.maximum(total, 1.0)
     end = int(np.argmax(window)) if window.any() else total.size - 1
-    return float(max(total[end], 1.0))
+    return float(max(1.0 + 2.0 * np.sum(rho[1 : end + 2] ** power), 1.0))
 
 
 def normality(residual: Array) -> tuple[float, float, Outcome]:
@@ -142,7 +148,12 @@ def same_phase(repeating: float, sigma: float, samples: int, number: int) -> flo
 
 
 def lack_of_fit(
-    repeating: float, sigma: float, samples: int, number: int, input_noise: float = 0.0
+    repeating: float,
+    sigma: float,
+    samples: int,
+    number: int,
+    input_noise: float = 0.0,
+    effective: float = 1.0,
 ) -> Outcome:
     """What repeats of a residual against the noise of that average: pure error between periods.
 
@@ -152,18 +163,22 @@ def lack_of_fit(
         As in :func:`same_phase`.
     input_noise : float, optional
         Noise of the inputs in the average; it repeats, and is not the model's.
+    effective : float, optional
+        Samples of the noise that tell of its variance what one does, ``memory(noise, 2)``: of
+        coloured noise some harmonics hold most, so that fewer count.
 
     Returns
     -------
     Outcome
         Ratio of mean squares, F-distributed with ``number`` and ``samples - number`` degrees of
-        freedom; the root of it is the loop's ratio to the noise.
+        freedom, each over ``effective``; the root of it is the loop's ratio to the noise.
     """
     noise = sigma**2 * number / samples + input_noise**2
     if noise <= 0:
         return NOTHING
     ratio = repeating**2 / noise
-    return Outcome(float(ratio), float(stats.f.sf(ratio, number, samples - number)))
+    free = number / effective, (samples - number) / effective
+    return Outcome(float(ratio), float(stats.f.sf(ratio, *free)))
 
 
 def outliers(values: Array, level: float = 0.05) -> tuple[Array, NDArray[np.int64], float]:

@@ -71,6 +71,27 @@ class Series:
             return None
         return periodic_average(self.residual, self.time_step, self.frequency)
 
+    def noise(self) -> Array:
+        """What does not repeat of the residual: all of it where nothing can, shape (n,)."""
+        average = self.average()
+        if average is None:
+            return self.residual
+        # The average takes a share of the noise with it.
+        loss = 1 - average.number / average.samples
+        return (self.residual - average.values) / np.sqrt(loss)
+
+    def period_means(self) -> Array:
+        """Mean residual of each whole period, shape (periods,); of all where nothing repeats."""
+        if not self.periodic:
+            return self.residual.mean()[None]
+        samples = 1 / (self.frequency * self.time_step)
+        # A record of whole periods may end a sample short of them.
+        count = int((self.residual.size + 1) / samples)
+        starts = np.round(np.arange(count) * samples).astype(int)
+        end = min(self.residual.size, round(count * samples))
+        sums = np.add.reduceat(self.residual[:end], starts)
+        return sums / np.diff([*starts, end])
+
 
 def series_of_problem(problem: Problem, point: PointEstimate | ArrayLike) -> list[Series]:
     """Residuals of a problem at an estimate.
