@@ -1,32 +1,51 @@
-"""Compliance in series: the frame gives, so what is measured is not what moves."""
+"""Compliance in series: the frame gives, so what is measured is not what moves.
+
+Where a force drives the model, the measured position shows what the frame gives as well. Where the
+position drives it, the position behind the frame is what is measured less compliance times the
+force *as measured*. Solving for that position with the predicted force instead would need harmonics
+of the position that are below its noise: dry friction jumps, and so does what the frame gives.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
+from bayesoleo.effects.effect import Amplitude, Effect, Names
 from bayesoleo.effects.places import force_places, substitute
-from bayesoleo.model import Coordinate, Dof, Model
+from bayesoleo.model import Coordinate, Model
+from bayesoleo.model.drive import MAXIMUM_DERIVATIVE
 from bayesoleo.model.expressions import (
+    WITHIN,
     derivative_symbol,
     partial,
     split_derivative,
     symbol,
+    within,
 )
-
-#: Inputs have exact derivatives; laws use at most this many.
-_DERIVATIVES = 5
 
 
 def _places(model: Model) -> Sequence[str]:
     found = force_places(model)
-    return tuple(
+    laws = {
+        name: place
+        for name, place in found.items()
+        if place.kind == "output" and WITHIN not in place.name
+    }
+    # A force resists motion; a pressure that is measured beside it is no second one.
+    resisting = [
+        name
+        for name, place in laws.items()
+        if place.velocity is not None and model.output(place.target).has(place.velocity)
+    ]
+    moved = [
         name
         for name, place in found.items()
-        if place.kind == "output" or (_shown_at(model, place) and _external(model, place) != 0)
-    )
+        if place.kind == "equation" and _shown_at(model, place) and _external(model, place) != 0
+    ]
+    return (*moved, *(resisting or laws))
 
 
 def _shown_at(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
@@ -58,21 +77,15 @@ def _yield(model: Model, target: str, names: Names) -> Model:
 
 
 def _yield_in_law(model: Model, place: Coordinate, compliance: sp.Symbol) -> Model:
-    """A force law behind a spring: it feels z with z + c F(z, dz/dt) = x, regular at c = 0."""
-    inner = free_name(f"{place.name}_inside", model)
+    """A force law behind a spring: it feels x - c F, with F as measured."""
+    measured = within(place.target, place.name)
     table = {
-        derivative_symbol(place.name, n): derivative_symbol(inner, n) for n in range(_DERIVATIVES)
+        derivative_symbol(place.name, n): derivative_symbol(place.name, n)
+        - compliance * derivative_symbol(measured, n)
+        for n in range(MAXIMUM_DERIVATIVE)
     }
-    # Sum of the named terms: definitions keep their names.
-    swapped = substitute(model, table)
-    force = sp.Add(*swapped.output_terms(place.target).values())
-    dof = Dof(model.inputs[place.name], symbol(place.name), f"{place.name} behind the frame")
-    equation = {
-        "inside": symbol(inner),
-        "frame": compliance * force,
-        "outside": -symbol(place.name),
-    }
-    return swapped.with_dof(inner, dof, equation)
+    unit = model.outputs[place.target].unit
+    return replace(substitute(model, table), inputs={**model.inputs, measured: unit})
 
 
 FRAME = Effect(

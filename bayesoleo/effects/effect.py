@@ -226,6 +226,11 @@ class Effect:
             raise InputError(f"effect {self.id}: no parameters", hint="state at least one")
 
     @property
+    def on_channels(self) -> bool:
+        """Whether it sits between the system and its channels, and so depends on the drive."""
+        return self.family in ("sensor", "compliance")
+
+    @property
     def _parts(self) -> tuple[Amplitude | Shape | Constant, ...]:
         return (*self.amplitudes, *self.shapes, *self.constants)
 

@@ -15,6 +15,7 @@ from bayesoleo.effects.places import substitute
 from bayesoleo.model import Model, possible_drives
 from bayesoleo.model.expressions import (
     TIME,
+    WITHIN,
     derivative_symbol,
     split_derivative,
     total_derivative,
@@ -24,7 +25,7 @@ _DERIVATIVES = 4
 
 
 def _channels(model: Model) -> Sequence[str]:
-    return (*model.inputs, *model.outputs)
+    return (*(name for name in model.inputs if WITHIN not in name), *model.outputs)
 
 
 def _correct_input(

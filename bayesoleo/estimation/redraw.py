@@ -278,7 +278,8 @@ class CampaignSource:
         harmonics = dict(record.harmonics)
         if self.input_noise:
             for name in self.problem.predictor.model.inputs:
-                harmonics[name] = _noisy(record.harmonics[name], rng)
+                if name in record.harmonics:
+                    harmonics[name] = _noisy(record.harmonics[name], rng)
         return replace(record, samples={**record.samples, **drawn}, harmonics=harmonics)
 
     def blocks(self) -> list[NoiseBlock]:

@@ -48,6 +48,19 @@ def symbol(name: str) -> sp.Symbol:
     return sp.Symbol(name, real=True)
 
 
+#: Between the names of two channels: the first one's measured signal at the second one's harmonics.
+WITHIN = "_within_"
+
+
+def within(channel: str, other: str) -> str:
+    """Name of an input that is a measured channel, at those harmonics that another one has.
+
+    What is measured of two channels together, such as the motion behind a frame that gives, must be
+    cut off alike in both.
+    """
+    return f"{channel}{WITHIN}{other}"
+
+
 def derivative_symbol(name: str, order: int) -> sp.Symbol:
     """The symbol of a time derivative: ``dot(q)``, ``ddot(q)``, ``dddot(q)`` …"""
     return symbol(name) if order == 0 else symbol(f"{'d' * order}ot({name})")

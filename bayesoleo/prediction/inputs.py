@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
+from bayesoleo.model.expressions import WITHIN
 from bayesoleo.prediction.records import Harmonics, Record, Signal
 
 Array = NDArray[np.float64]
@@ -20,6 +23,9 @@ def harmonics_of(record: Record, channel: str) -> Harmonics:
         If the record lacks the channel.
     """
     if channel not in record.harmonics:
+        restricted = _restricted(record, channel)
+        if isinstance(restricted, Harmonics):
+            return restricted
         raise CampaignError(
             f"the model needs channel {channel!r}",
             run=record.label,
@@ -37,12 +43,33 @@ def signal_of(record: Record, channel: str) -> Signal:
         If the record lacks the channel.
     """
     if channel not in record.signals:
+        restricted = _restricted(record, channel)
+        if restricted is not None:
+            return restricted
         raise CampaignError(
             f"the model needs channel {channel!r}",
             run=record.label,
             hint=f"channels there are: {', '.join(record.signals) or 'none'}",
         )
     return record.signals[channel]
+
+
+def _restricted(record: Record, name: str) -> Signal | None:
+    """One channel at the harmonics of another, as :func:`~bayesoleo.model.expressions.within`
+    names it; of a transient, the channel itself."""
+    channel, _, other = name.partition(WITHIN)
+    if channel not in record.signals or other not in record.signals:
+        return None
+    if not record.periodic:
+        return record.signals[channel]
+    item = record.harmonics[channel]
+    kept = np.isin(item.orders, record.harmonics[other].orders)
+    return replace(
+        item,
+        orders=item.orders[kept],
+        coefficients=item.coefficients[kept],
+        variances=item.variances[kept],
+    )
 
 
 #: Rows computed before, by grid, channel and derivative; models of the same run share them.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
+from bayesoleo.model.expressions import WITHIN
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.anchor import PATH_PIECES, Anchor
 from bayesoleo.prediction.guess import Motion, guess_rows
@@ -120,9 +121,9 @@ class RunPredictor:
         )
 
     def _check(self, record: Record) -> None:
-        missing = [
-            name for name in (*self.model.inputs, *self.model.outputs) if name not in record.samples
-        ]
+        # An input may be one measured channel at the harmonics of another.
+        needed = [part for name in self.model.inputs for part in name.split(WITHIN)]
+        missing = [name for name in (*needed, *self.model.outputs) if name not in record.samples]
         if missing:
             raise CampaignError(
                 f"model {self.model.name!r} needs channel {missing[0]!r}, which the campaign lacks",

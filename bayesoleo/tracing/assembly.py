@@ -147,7 +147,7 @@ class Assembly:
         """
         found, driven = [], self.model()
         for effect in catalogue() if effects is None else effects:
-            base = driven if effect.family == "sensor" else self.native
+            base = driven if effect.on_channels else self.native
             for place in candidates(base, scales, (effect,)):
                 try:
                     candidate, assembly = self._with_step(effect, place.target, scales)
@@ -157,9 +157,8 @@ class Assembly:
         return found
 
     def _with_step(self, effect: Effect, target: str, scales: Scales) -> tuple[Candidate, Assembly]:
-        """Add an effect: to the driven model's channels if it is a sensor's, else to the
-        equations."""
-        sensor = effect.family == "sensor"
+        """Add an effect: to the driven model if it sits on channels, else to the equations."""
+        sensor = effect.on_channels
         base = self.model() if sensor else self.native
         candidate = effect.extend(base, target, scales)
         step = Step(effect, target, scales, candidate.parameters)

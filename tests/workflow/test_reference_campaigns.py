@@ -99,3 +99,13 @@ def test_the_mbari_gas_spring_lacks_heat_exchange(data_set):
     # A quick fit of a gas with one time constant reached 0.43 and 0.74 psi.
     assert after["before 205 s"] <= 0.5
     assert after["after 205 s"] <= 0.75
+
+
+@pytest.mark.slow
+def test_an_oleo_in_a_compliant_frame_lacks_that_and_nothing_else(data_set):
+    summary = summary_of(data_set("campaigns/shaker-compliance"), "f16n2d2")
+    assert summary["effects"] == ["frame_compliance"]
+    # Its size in the simulation is 1.5e-7 m/N.
+    found = summary["parameters"]["frame_compliance"]["estimate"]
+    assert found == pytest.approx(1.5e-7, rel=0.03)
+    assert max(on_hold_out(summary, "ratio_to_noise").values()) <= 1.15
