@@ -1,4 +1,4 @@
-"""How often each test cries wolf over noise alone, and whether it sees the fault it is meant for."""
+"""How often each test cries wolf over noise alone, and whether it sees the fault that it is for."""
 
 from __future__ import annotations
 
