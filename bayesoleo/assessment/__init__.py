@@ -1,6 +1,12 @@
 """How good an estimate is, by what it leaves and by what it foresees."""
 
-from bayesoleo.assessment.assess import assess, assessment_text
+from bayesoleo.assessment.assess import (
+    assess,
+    assessment_text,
+    correlograms,
+    dependence_on,
+    outliers_of,
+)
 from bayesoleo.assessment.residual_tests import (
     autocorrelation,
     dependence,
@@ -20,11 +26,14 @@ __all__ = [
     "assess",
     "assessment_text",
     "autocorrelation",
+    "correlograms",
     "dependence",
+    "dependence_on",
     "lack_of_fit",
     "memory",
     "normality",
     "outliers",
+    "outliers_of",
     "runs_of_signs",
     "same_phase",
     "score_draws",

@@ -193,18 +193,34 @@ def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.
 
 def _shares(series: Series, names: Sequence[str]) -> tuple[Array, Array]:
     """How much each variable explains, and its probability."""
-    # Where nothing repeats, noise and the model's error cannot be told apart: noise is then taken
-    # as white.
-    effective = tests.memory(series.noise()) if series.periodic else 1.0
     share, p_value = np.full((2, len(names)), np.nan)
     for k, name in enumerate(names):
         if name in series.variables:
-            # Bins of time shorter than a period would show the dependence on phase.
-            whole = name == schema.TIME and series.periodic
-            bins = max(2, series.residual.size // series.period) if whole else tests.BINS
-            found = tests.dependence(series.residual, series.variables[name], effective, bins)
+            found = dependence_on(series, name)
             share[k], p_value[k] = found.share, found.outcome.p_value
     return share, p_value
+
+
+def dependence_on(series: Series, name: str) -> tests.Dependence:
+    """How a residual depends on one of its variables.
+
+    Parameters
+    ----------
+    series : Series
+    name : str
+        One of ``series.variables``.
+
+    Returns
+    -------
+    Dependence
+        Where nothing repeats, noise and the model's error cannot be told apart; noise is then
+        taken as white.
+    """
+    effective = tests.memory(series.noise()) if series.periodic else 1.0
+    # Bins of time shorter than a period would show the dependence on phase.
+    whole = name == schema.TIME and series.periodic
+    bins = max(2, series.residual.size // series.period) if whole else tests.BINS
+    return tests.dependence(series.residual, series.variables[name], effective, bins)
 
 
 def outliers_of(series: Series) -> tuple[NDArray[np.int64], Array, float]:
@@ -245,7 +261,10 @@ def _farthest(series: Series) -> tuple[Array, Array]:
 
 
 def correlograms(series: Series) -> tuple[Array, Array]:
-    """Autocorrelation of the residual and of what does not repeat, at ``LAGS`` lags a period."""
+    """Autocorrelation of the residual and of what does not repeat, at ``LAGS`` lags a period.
+
+    Where nothing repeats, an eighth of the record stands for a period.
+    """
     steps = np.arange(CYCLES * LAGS + 1) / LAGS
     unit = series.period if series.periodic else max(series.residual.size // (4 * CYCLES), 1)
     lags = np.round(steps * unit).astype(int)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bayesoleo import schema
 from bayesoleo.cli import options, shell, tables
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from bayesoleo.assessment import Series
 
 PANEL = "How good an estimate is"
 
@@ -43,6 +48,16 @@ def assess(
             help="Draw the assessment; one file an output, its name added.",
         ),
     ] = None,
+    run: Annotated[
+        str | None,
+        typer.Option(
+            "--run",
+            metavar="LABEL",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw the tests of this run instead, with the residual against every variable.",
+        ),
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Test the residuals of a result: signs, normality, phase, variables, outliers, lack of fit.
@@ -56,23 +71,52 @@ def assess(
     Examples:
       bayesoleo assess bayesoleo-shaker/results.nc
       bayesoleo assess results.nc --stage before --figure before.png
+      bayesoleo assess results.nc --figure tests.png --run a
     """
-    from bayesoleo import plots
     from bayesoleo.assessment import assess as test_residuals
+    from bayesoleo.assessment import series_of_tree
     from bayesoleo.storage import read_tree
 
     if figure is not None:
         shell.check_writable(figure.parent)
-    found = test_residuals(read_tree(results), stage=stage)
+    series = series_of_tree(read_tree(results), stage)
+    drawn = _drawn(series, figure, run)
+    found = test_residuals(series)
     if as_json:
         numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
         shell.print_json(tables.plain(numbers.to_dict()))
     else:
         shell.console().print(str(found), markup=False, soft_wrap=True)
     if figure is not None:
-        for output in found.data[schema.OUTPUT].values:
-            path = figure.with_stem(f"{figure.stem}-{output}")
-            plots.assessment(found.data, str(output)).savefig(path)
+        _draw(found.data, drawn, figure)
+
+
+def _drawn(series: list[Series], figure: Path | None, run: str | None) -> list[Series]:
+    """The series whose tests are to be drawn one by one; none for all runs together."""
+    from bayesoleo.errors import ResultsError
+
+    if run is None:
+        return []
+    labels = list(dict.fromkeys(one.run for one in series))
+    if run not in labels:
+        raise ResultsError(
+            "there is no such run", key="--run", value=run, hint=f"there are {', '.join(labels)}"
+        )
+    if figure is None:
+        raise ResultsError("nothing to draw it to", key="--run", hint="give --figure FILE.png")
+    return [one for one in series if one.run == run]
+
+
+def _draw(data: xr.Dataset, drawn: list[Series], figure: Path) -> None:
+    """One file an output."""
+    from bayesoleo import plots
+
+    figures = {one.output: plots.residual_tests(one) for one in drawn}
+    if not figures:
+        outputs = [str(output) for output in data[schema.OUTPUT].values]
+        figures = {output: plots.assessment(data, output) for output in outputs}
+    for output, made in figures.items():
+        made.savefig(figure.with_stem(f"{figure.stem}-{output}"))
 
 
 def replicate(

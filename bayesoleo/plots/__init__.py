@@ -15,6 +15,7 @@ from bayesoleo.plots.rankings import ranking
 from bayesoleo.plots.records import records
 from bayesoleo.plots.regions import indifference, profile
 from bayesoleo.plots.replications import sampling_distribution
+from bayesoleo.plots.residual_tests import residual_tests
 from bayesoleo.plots.residuals import residual
 from bayesoleo.plots.sensitivities import sensitivity
 from bayesoleo.plots.traces import trace
@@ -37,6 +38,7 @@ __all__ = [
     "ranking",
     "records",
     "residual",
+    "residual_tests",
     "sampling_distribution",
     "sensitivity",
     "trace",

@@ -23,6 +23,11 @@ def test_result_is_assessed_in_words_numbers_and_pictures(run, traced, tmp_path)
     assert (tmp_path / "look-displacement.png").stat().st_size > 10_000
     numbers = json.loads(run("assess", traced, "--json").stdout)
     assert numbers["data_vars"]["runs_z"]["dims"] == ["output", "run"]
+    one = run("assess", traced, "--figure", tmp_path / "one.png", "--run", "slow")
+    assert one.stdout == result.stdout
+    assert (tmp_path / "one-displacement.png").stat().st_size > 20_000
+    assert "there are" in run("assess", traced, "--run", "slaw").stderr
+    assert "give --figure" in run("assess", traced, "--run", "slow").stderr
     result = run("assess", traced, "--stage", "later")
     assert result.exit_code == 2
     assert "use 'before' or 'after'" in result.stderr

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign, with_friction
 
 from bayesoleo import plots
-from bayesoleo.assessment import assess
+from bayesoleo.assessment import assess, series_of_problem
+from bayesoleo.errors import InputError
 from bayesoleo.estimation import (
     estimate,
     indifference,
@@ -71,3 +74,27 @@ def test_assessment_shows_runs_and_variables(fitted):
     np.testing.assert_allclose(ratios.lines[0].get_ydata(), found["ratio_to_noise"][0])
     labels = [label.get_text() for label in shares.get_xticklabels()]
     assert labels == list(found["variable"].values)
+
+
+def test_tests_of_one_residual_show_their_numbers(fitted):
+    series = series_of_problem(*fitted)[0]
+    found = assess([series]).data.isel(output=0, run=0)
+    figure = plots.residual_tests(series)
+    assert len(figure.axes) == 4 + len(series.variables)
+    titles = [axes.get_title("left") + axes.get_title("right") for axes in figure.axes]
+    assert f"z = {float(found['runs_z']):.1f}" in titles[1]
+    assert f"kurtosis {float(found['kurtosis']):.2f}" in titles[2]
+    share = found["share"].sel(variable="rate of displacement").item()
+    last = plots.residual_tests(series, ["rate of displacement"]).axes[-1]
+    assert last.get_title("left") == f"explains {100 * share:.2g} %"
+    with pytest.raises(InputError, match="no such variable"):
+        plots.residual_tests(series, ["velocity"])
+
+
+def test_outliers_are_ringed(fitted):
+    series = series_of_problem(*fitted)[0]
+    residual = series.residual.copy()
+    residual[50] += 40.0
+    axes = plots.residual_tests(replace(series, residual=residual)).axes[0]
+    # the farthest first; the jump of the friction makes some of its own
+    assert axes.lines[-1].get_xdata()[0] == 50 * series.time_step
