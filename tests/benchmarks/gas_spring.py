@@ -1,8 +1,8 @@
 """Iterations of the thesis's estimators on the gas spring, over many seeds.
 
-Run as ``python tests/benchmarks/gas_spring.py [--seeds 200]``. Start at 1.0, relative step tolerance
-1e-4 (Verbeek 1993, section 3.4.2, who has 4-5 iterations at 0.1; at 0.01 MVE 12, MMVE 6, MBE 9).
-Levenberg-Marquardt and Newton's method are beside them for comparison.
+Run as ``python tests/benchmarks/gas_spring.py [--seeds 200]``. Start at 1.0, relative step
+tolerance 1e-4. Verbeek (1993), section 3.4.2, has 4-5 iterations at a prior sd of 0.1, and at 0.01
+MVE 12, MMVE 6, MBE 9. Levenberg-Marquardt and Newton's method stand beside them for comparison.
 """
 
 from __future__ import annotations
