@@ -74,6 +74,11 @@ class CampaignProblem:
         """Nominal values of the unknowns, shape (l,)."""
         return self._full[self._free]
 
+    @property
+    def branch_jumps(self) -> NDArray[np.int64]:
+        """Solutions so far, by run, that left the branch of the one they started from, (N,)."""
+        return np.array([run.jumps for run in self.predictor.runs], dtype=np.int64)
+
     def full(self, theta: Array) -> Array:
         """All unknowns of the predictor, shape (L, all), from the free ones, shape (L, l)."""
         vectors = np.repeat(self._full[None], theta.shape[0], axis=0)
@@ -104,6 +109,7 @@ class CampaignProblem:
                 np.concatenate([run.sensitivity[b][self._free].T for run in runs]) for b in outputs
             ),
             status=max((run.status for run in runs), default=Status.CONVERGED),
+            monodromy=tuple(run.monodromy for run in runs),
         )
 
     def misfit(self, theta: Array) -> Misfit:

@@ -14,7 +14,7 @@ from bayesoleo.estimation.iterate import Iteration, Outcome, iterate
 from bayesoleo.estimation.methods import method as find_method
 from bayesoleo.estimation.objective import Objective, objective_of
 from bayesoleo.estimation.point import PointEstimate
-from bayesoleo.estimation.problem import Array, Problem
+from bayesoleo.estimation.problem import Array, Problem, jumps_of
 from bayesoleo.estimation.scaling import PriorScale
 from bayesoleo.estimation.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.steps import Step
@@ -98,6 +98,7 @@ def estimate(
     wanted = objective_of(problem, objective, error_covariance)
     limits = _Limits(tolerance, max_iterations, resolution, bias_corrected, progress)
     found: list[PointEstimate] = []
+    jumps = jumps_of(problem)
     for each in [method] if isinstance(method, str | Step) else method:
         name, outcome = limits.run(problem, each, begin, wanted)
         found.append(summarise(problem, scale, name, begin, outcome, wanted, bias_corrected))
@@ -108,6 +109,7 @@ def estimate(
         best,
         evaluations=sum(point.evaluations for point in found),
         failures=added(point.failures for point in found),
+        stability=best.stability and best.stability.with_jumps(jumps_of(problem) - jumps),
     )
 
 

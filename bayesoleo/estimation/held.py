@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problem import Array, Evaluation, Misfit, Problem
+from bayesoleo.estimation.problem import Array, Evaluation, Misfit, Problem, jumps_of
 from bayesoleo.model.correlated import Correlated, JointNormal, joint_groups
 from bayesoleo.model.priors import Prior
 
@@ -84,9 +85,12 @@ class Held:
     def evaluate(self, theta: Array) -> Evaluation:
         """Residuals and sensitivities at one vector of the free unknowns."""
         found = self.problem.evaluate(self.full(np.asarray(theta, dtype=float)))
-        return Evaluation(
-            found.residual, tuple(s[:, self.free] for s in found.sensitivity), found.status
-        )
+        return replace(found, sensitivity=tuple(s[:, self.free] for s in found.sensitivity))
+
+    @property
+    def branch_jumps(self) -> NDArray[np.int64]:
+        """Solutions so far that left their branch, by run, shape (N,)."""
+        return jumps_of(self.problem)
 
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors of the free unknowns."""

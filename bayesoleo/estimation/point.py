@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.problem import Array
+from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.status import Status
 
 if TYPE_CHECKING:
@@ -61,6 +62,9 @@ class PointEstimate:
     failures : mapping of str to int
         Trials on the way that could not be evaluated, by the lower-case name of their
         :class:`~bayesoleo.solvers.status.Status`: steps towards them were halved.
+    stability : Stability, optional
+        Floquet multipliers of each run's periodic solution at the estimate, and how often one
+        jumped to another branch on the way; None where there are no periodic solutions.
     """
 
     names: tuple[str, ...]
@@ -85,11 +89,22 @@ class PointEstimate:
     objective_name: str = "diagonal"
     error_covariance: Array | None = field(default=None, repr=False)
     failures: Mapping[str, int] = field(default_factory=dict)
+    stability: Stability | None = field(default=None, repr=False)
 
     @property
     def sd(self) -> Array:
         """Linearised standard deviations, shape (l,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def branch_jumps(self) -> int:
+        """How often a periodic solution jumped to another branch between neighbouring trials."""
+        return 0 if self.stability is None else self.stability.branch_jumps
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know of the solutions behind the estimate, such as that one is unstable."""
+        return [] if self.stability is None else self.stability.notes()
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])

@@ -32,11 +32,15 @@ class Evaluation:
         are its negative).
     status : Status
         Unless it is ``CONVERGED`` the arrays hold NaN.
+    monodromy : tuple of ndarray or None
+        Of each run's periodic solution, where there are such; its eigenvalues are the Floquet
+        multipliers.
     """
 
     residual: tuple[Array, ...]
     sensitivity: tuple[Array, ...]
     status: Status
+    monodromy: tuple[Array | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,11 @@ class Misfit:
 
     sum_of_squares: Array
     status: NDArray[np.int64]
+
+
+def jumps_of(problem: Problem) -> NDArray[np.int64]:
+    """Solutions so far that left their branch, by run, shape (N,); zeros where none are counted."""
+    return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
 
 
 class Problem(Protocol):

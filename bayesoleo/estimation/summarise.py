@@ -13,6 +13,7 @@ from bayesoleo.estimation.objectives import output_counts, staged_variance, sums
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array, Problem
 from bayesoleo.estimation.scaling import PriorScale
+from bayesoleo.prediction.stability import Stability
 
 
 def summarise(
@@ -47,6 +48,7 @@ def summarise(
         objective=history[-1].objective if history else np.nan,
         distance=outcome.distance,
         failures=dict(outcome.failures),
+        stability=_stability(problem, outcome),
         start=start,
         history=np.array([line.theta for line in history]).reshape(len(history), unknowns),
         history_variance=np.array([_diagonal(line.variance) for line in history]).reshape(
@@ -58,6 +60,14 @@ def summarise(
         objective_name=objective.name,
         error_covariance=error,
     )
+
+
+def _stability(problem: Problem, outcome: Outcome) -> Stability | None:
+    """Of the runs' periodic solutions at the estimate; None where there are none."""
+    matrices = outcome.evaluation.monodromy
+    if not any(matrix is not None for matrix in matrices):
+        return None
+    return Stability.of(problem.runs, matrices, np.zeros(len(matrices), dtype=np.int64))
 
 
 def _diagonal(covariance: Array) -> Array:

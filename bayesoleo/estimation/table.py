@@ -11,6 +11,7 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.point import PointEstimate
+from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.status import added, counted
 
 _MIXED = "unit of each parameter"
@@ -39,7 +40,9 @@ def to_dataset(
     xarray.Dataset
         ``start``, ``mbe``, ``estimate``, ``sd``, ``unit`` (parameter); ``covariance`` (parameter,
         parameter_column); ``variance`` (output); ``history`` (iteration, parameter) and
-        ``objective`` (iteration) with the coordinate ``method`` (iteration).
+        ``objective`` (iteration) with the coordinate ``method`` (iteration). Where there are
+        periodic solutions: ``floquet`` (run, multiplier, part), ``stable`` and ``branch_jumps``
+        (run).
 
     Raises
     ------
@@ -51,8 +54,9 @@ def to_dataset(
     if units is not None and len(units) != len(point.names):
         raise InputError("units must have one entry per parameter", key="units", value=list(units))
     stages = [point] if mbe is None else [mbe, point]
+    answers = {} if point.stability is None else _stability(point.stability)
     dataset = xr.Dataset(
-        {**_parameters(point, mbe, units), **_spread(point), **_history(stages)},
+        {**_parameters(point, mbe, units), **_spread(point), **_history(stages), **answers},
         coords={
             schema.PARAMETER: list(point.names),
             schema.PARAMETER_COLUMN: list(point.names),
@@ -68,7 +72,12 @@ def to_dataset(
         "evaluations": sum(stage.evaluations for stage in stages),
         "failures": json.dumps(added(stage.failures for stage in stages)),
         "on_limit": ", ".join(point.on_limit),
+        "branch_jumps": sum(stage.branch_jumps for stage in stages),
     }
+    if point.stability is not None:
+        dataset = dataset.assign_coords(
+            {schema.RUN: list(point.stability.runs), schema.PART: ["real", "imaginary"]}
+        )
     return dataset.assign_coords(method=(schema.ITERATION, _methods(stages)))
 
 
@@ -104,6 +113,23 @@ def _spread(point: PointEstimate) -> dict[str, xr.Variable]:
     return {schema.COVARIANCE: covariance, schema.VARIANCE: variance}
 
 
+def _stability(found: Stability) -> dict[str, xr.Variable]:
+    """Multipliers of each run's periodic solution; netCDF has no complex numbers."""
+    parts = np.stack([found.multipliers.real, found.multipliers.imag], axis=-1)
+    dims = (schema.RUN, schema.MULTIPLIER, schema.PART)
+    stable = np.where(found.unstable < 0, -1, found.unstable == 0).astype(np.int8)
+    meaning = {"flag_values": [-1, 0, 1], "flag_meanings": "unknown unstable stable"}
+    variables = {
+        schema.FLOQUET: _variable(dims, parts, "Floquet multipliers, largest first", "1"),
+        schema.STABLE: _variable((schema.RUN,), stable, "whether the solution is stable", "1"),
+        schema.BRANCH_JUMPS: _variable(
+            (schema.RUN,), found.jumps, "jumps of the solution to another branch", "1"
+        ),
+    }
+    variables[schema.STABLE].attrs |= meaning
+    return variables
+
+
 def _history(stages: Sequence[PointEstimate]) -> dict[str, xr.Variable]:
     theta = np.concatenate([stage.history for stage in stages])
     objective = np.concatenate([stage.history_objective for stage in stages])
@@ -135,4 +161,5 @@ def as_text(point: PointEstimate) -> str:
         lines.append(f"trials that failed: {counted(point.failures)}")
     if point.on_limit:
         lines.append(f"on a limit of their prior: {', '.join(point.on_limit)}")
+    lines += point.notes
     return "\n".join(lines)

@@ -30,6 +30,8 @@ STILL = 1e-9
 #: How far outside the unit circle a multiplier must lie to count: an undamped motion's lie on it
 #: but for the errors of the mesh.
 MARGIN = 1e-6
+#: Real multipliers below this are called close to a doubling of the period.
+NEAR = -0.9
 
 
 @numba.njit(nogil=True, cache=True)
@@ -140,40 +142,60 @@ class Stability:
 
     def notes(self) -> list[str]:
         """What a reader should know, a sentence each; nothing where all runs are stable."""
-        return [*self._unstable_notes(), *self._jump_notes()]
-
-    def _unstable_notes(self) -> list[str]:
         found: dict[str, list[str]] = {}
         for run, row, count in zip(self.runs, self.multipliers, self.unstable, strict=True):
-            if count > 0:
-                found.setdefault(_consequence(row[0]), []).append(f"{run} ({_spelled(row[0])})")
-        return [
-            f"unstable periodic solution in {_runs(runs)}, largest multiplier in brackets:"
-            f" {consequence}"
-            for consequence, runs in found.items()
-        ]
-
-    def _jump_notes(self) -> list[str]:
-        if not self.branch_jumps:
-            return []
-        runs = [f"{run} ({n})" for run, n in zip(self.runs, self.jumps, strict=True) if n]
-        return [
-            f"branch jumps: the periodic solution of {_runs(runs)} jumped to another branch, or"
-            " changed its stability, between neighbouring parameters, so often as the brackets say:"
-            " the model has several answers to this input, and the estimate may be on the wrong one"
-        ]
+            what = _finding(row, int(count))
+            if what:
+                found.setdefault(what, []).append(f"{run} ({_spelled(_telling(row))})")
+        notes = [what.format(_runs(runs)) for what, runs in found.items()]
+        if self.branch_jumps:
+            counts = zip(self.runs, self.jumps, strict=True)
+            runs = [f"{run} ({number})" for run, number in counts if number]
+            notes.append(JUMPED.format(_runs(runs)))
+        return notes
 
 
-def _consequence(multiplier: complex) -> str:
-    """What a rig would do instead."""
-    if multiplier.imag:
-        return "a second frequency would arise beside the input's"
-    if multiplier.real < 0:
-        return (
-            "the period doubles (multiplier below -1): a rig would answer in twice the period, so"
-            " declare half the frequency for the run if its record does"
-        )
-    return "a rig would leave it for another answer to the same input"
+#: Findings, with a place for the runs and the multiplier of each.
+DOUBLED = (
+    "the periodic solution of {} is unstable and its period doubles (multiplier below -1): a rig"
+    " answers in twice the period; if the record does, declare half its frequency for the run"
+)
+NEARLY_DOUBLED = (
+    "the periodic solution of {} is close to where its period doubles (multiplier -1): an estimate"
+    " may have settled there because the record repeats in twice the period only"
+)
+SECOND_FREQUENCY = (
+    "the periodic solution of {} is unstable: a rig answers with a second frequency beside the"
+    " input's"
+)
+ELSEWHERE = (
+    "the periodic solution of {} is unstable (multiplier above 1): a rig leaves it for another"
+    " answer to the same input"
+)
+JUMPED = (
+    "branch jumps: the periodic solution of {} went to another branch, or changed its stability,"
+    " between neighbouring parameters (how often in brackets): the model has several answers to"
+    " this input, and a fit may follow the wrong one"
+)
+
+
+def _telling(multipliers: Complex) -> complex:
+    """The least of the real ones where that is the nearest to -1, else the largest."""
+    least = multipliers[np.argmin(multipliers.real)]
+    near = least.imag == 0 and least.real < NEAR and np.abs(multipliers[0]) <= 1.0 + MARGIN
+    return complex(least if near else multipliers[0])
+
+
+def _finding(multipliers: Complex, unstable: int) -> str:
+    """What a rig would do, where it would not stay on the solution or hardly so."""
+    if unstable < 0:
+        return ""
+    value = _telling(multipliers)
+    if not unstable:
+        return NEARLY_DOUBLED if value.imag == 0 and value.real < NEAR else ""
+    if value.imag:
+        return SECOND_FREQUENCY
+    return DOUBLED if value.real < 0 else ELSEWHERE
 
 
 def _spelled(multiplier: complex) -> str:

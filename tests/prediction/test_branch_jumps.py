@@ -122,13 +122,14 @@ def test_multipliers_of_the_linear_oscillator_come_with_derivatives():
 def test_notes_say_what_would_happen_instead():
     table = np.array(
         [[0.5, 0.1], [-1.7, 0.2], [1.4, 0.3], [1.1 + 0.5j, 1.1 - 0.5j], [np.nan, np.nan]]
+        + [[-0.97, 0.1]]
     )
-    jumps = np.array([0, 0, 2, 0, 0])
-    found = Stability(tuple("abcde"), table, jumps)
-    assert found.unstable.tolist() == [0, 1, 1, 2, -1]
-    doubled, left, second, jumped = found.notes()
-    assert "run b (-1.7)" in doubled
-    assert "the period doubles" in doubled
+    jumps = np.array([0, 0, 2, 0, 0, 0])
+    found = Stability(tuple("abcdef"), table, jumps)
+    assert found.unstable.tolist() == [0, 1, 1, 2, -1, 0]
+    doubled, left, second, close, jumped = found.notes()
+    assert "run b (-1.7) is unstable and its period doubles" in doubled
+    assert "run f (-0.97) is close" in close
     assert "run c (1.4)" in left
     assert "another answer" in left
     assert "run d (1.1 ± 0.5i)" in second
