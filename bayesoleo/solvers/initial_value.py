@@ -8,7 +8,7 @@ they are those of the numbers computed. Kinks and jumps of the equations are loc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,11 +82,11 @@ class Dynamics:
         """Number D of state components."""
         return sum(self.orders)
 
-    def functions(self) -> tuple[Any, ...]:
+    def addresses(self) -> loop.Addresses:
         """The kernels as :func:`bayesoleo.solvers.march.march` takes them."""
         k = self.kernels
         used = (k.jacobian, k.parameters, k.output, k.output_jacobian, k.admissible)
-        return tuple(kernel.pointer for kernel in used)
+        return loop.Addresses(*(kernel.address for kernel in used))
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +292,8 @@ def _run(
 ) -> tuple[loop.Path, int, int, int]:  # fmt: skip
     constants = np.concatenate([p, np.ones(dynamics.switches + 1)])
     system = loop.System(
-        np.array(dynamics.orders, dtype=np.int64), radau_method(stages), dynamics.signal, constants,
+        dynamics.addresses(), np.array(dynamics.orders, dtype=np.int64), radau_method(stages),
+        dynamics.signal, constants,
         np.arange(p.size, p.size + dynamics.switches, dtype=np.int64),
         dynamics.active if by_parameter else 0, dynamics.conditions,
     )  # fmt: skip
@@ -300,10 +301,7 @@ def _run(
         stages, dynamics.orders, dynamics.signal.cosine.shape[0], dynamics.active,
         dynamics.conditions, dynamics.switches,
     )  # fmt: skip
-    run: Any = loop.march  # mypy takes what Numba returns for a function without arguments
-    return run(
-        *dynamics.functions(), task, np.array(start, dtype=float), columns, scale, system, work
-    )
+    return loop.march(task, np.array(start, dtype=float), columns, scale, system, work)
 
 
 def _check(dynamics: Dynamics, start: Array, times: Array, stages: int) -> None:

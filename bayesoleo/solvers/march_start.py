@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo.solvers.inner import evaluate, inner
 from bayesoleo.solvers.signals import rows_at
-from bayesoleo.solvers.sweep import eliminate, jit
+from bayesoleo.solvers.sweep import eliminate
 
 
-@jit
-def rate_at_start(jacobian, state, top, t, system, work):
+@inner
+def rate_at_start(state, top, t, system, work):
     """Highest derivatives ``top (d,)`` at one time; false where there are none."""
     orders, p = system.orders, system.p
     d, row, first = orders.size, 0, 0
@@ -25,7 +26,7 @@ def rate_at_start(jacobian, state, top, t, system, work):
         for j in range(d):
             row += orders[j] + 1
             work.z1[row, 0] = top[j]
-        jacobian(work.z1.ctypes, work.u1.ctypes, p.ctypes, work.g1.ctypes, 1)
+        evaluate(system.kernels.jacobian, work.z1, work.u1, p, work.g1, 1)
         for e in range(d):
             work.small[e, 0] = -work.g1[e, 0]
             row = d + e * (d + state.size) - 1
@@ -46,12 +47,12 @@ def rate_at_start(jacobian, state, top, t, system, work):
     return True
 
 
-@jit
-def is_inside(admissible, z, u, count, system, work):
+@inner
+def is_inside(z, u, count, system, work):
     """Whether all points lie in the admissible region."""
     if system.conditions == 0:
         return True
-    admissible(z.ctypes, u.ctypes, system.p.ctypes, work.a.ctypes, count)
+    evaluate(system.kernels.admissible, z, u, system.p, work.a, count)
     for k in range(system.conditions):
         for i in range(count):
             if not (work.a[k, i] > 0.0):
@@ -59,20 +60,20 @@ def is_inside(admissible, z, u, count, system, work):
     return True
 
 
-@jit
-def starts(jacobian, switches, admissible, front, t, h, system, work):
+@inner
+def starts(front, t, h, system, work):
     """Rates and modes at the start; false if there are none or it is not admissible."""
     for _ in range(2 if system.modes.size > 0 else 1):
         # Modes depend on the rates only where a state starts on a switch.
-        if not rate_at_start(jacobian, front.state, front.rate, t, system, work):
+        if not rate_at_start(front.state, front.rate, t, system, work):
             return False
-        _initial_modes(switches, front.state, front.rate, t, h, system, work)
+        _initial_modes(front.state, front.rate, t, h, system, work)
     rows_at(system.signal, t, 0.0, np.zeros(1), work.u1)
-    return is_inside(admissible, work.z1, work.u1, 1, system, work)
+    return is_inside(work.z1, work.u1, 1, system, work)
 
 
-@jit
-def _initial_modes(switches, state, top, t, h, system, work):
+@inner
+def _initial_modes(state, top, t, h, system, work):
     """Modes by the signs of the switching functions at the start, or just after it."""
     orders, modes, p = system.orders, system.modes, system.p
     if modes.size == 0:
@@ -87,7 +88,7 @@ def _initial_modes(switches, state, top, t, h, system, work):
             work.z1[row + orders[j], 0] = top[j]
             row += orders[j] + 1
             first += orders[j]
-        switches(work.z1.ctypes, work.u1.ctypes, p.ctypes, work.y.ctypes, 1)
+        evaluate(system.kernels.switches, work.z1, work.u1, p, work.y, 1)
         for k in range(modes.size):
             if part == 0.0 or p[modes[k]] == 0.5:
                 value = work.y[k, 0]
@@ -95,3 +96,17 @@ def _initial_modes(switches, state, top, t, h, system, work):
     for k in range(modes.size):
         if p[modes[k]] == 0.5:
             p[modes[k]] = 1.0
+
+
+@inner
+def first_sizes(state, rate, scale, orders, h):
+    """From rest, a state is as large as its rates make it in the first step."""
+    first = 0
+    for j in range(orders.size):
+        last = first + orders[j] - 1
+        change = h * abs(rate[j])
+        scale[last] = max(scale[last], change)
+        if orders[j] == 2:
+            change = h * (abs(state[last]) + change)
+            scale[first] = max(scale[first], change)
+        first += orders[j]

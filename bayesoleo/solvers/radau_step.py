@@ -15,7 +15,8 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BLOCK
-from bayesoleo.solvers.sweep import eliminate, jit
+from bayesoleo.solvers.inner import evaluate, inner
+from bayesoleo.solvers.sweep import eliminate
 from bayesoleo.solvers.tableau import tableau
 
 Array = NDArray[np.float64]
@@ -109,7 +110,7 @@ def workspace(
     )  # fmt: skip
 
 
-@jit
+@inner
 def copy_to(source, target):
     """Copy a table; compiles in a fraction of the time of an assignment, which checks shapes."""
     for i in range(source.shape[0]):
@@ -117,7 +118,7 @@ def copy_to(source, target):
             target[i, j] = source[i, j]
 
 
-@jit
+@inner
 def rows_of_stages(state, top, h, method, orders, z):
     """Values and derivatives ``z (nz, s)`` at the stages."""
     s = method.c.size
@@ -139,7 +140,7 @@ def rows_of_stages(state, top, h, method, orders, z):
         first += orders[j]
 
 
-@jit
+@inner
 def assemble(g, h, method, orders, matrix):
     """Derivatives of the stages' equations by the stages' unknowns, ``(s d, s d)``."""
     d, s = orders.size, method.c.size
@@ -166,7 +167,7 @@ MAXIMUM_ITERATIONS = 8
 ROUND_OFF = 1e-10
 
 
-@jit
+@inner
 def solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work):
     """Newton's method for the stages' unknowns, from ``top (s, d)`` as given.
 
@@ -178,7 +179,7 @@ def solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work
     before = np.inf
     for iteration in range(MAXIMUM_ITERATIONS):
         rows_of_stages(state, top, h, method, orders, work.z)
-        jacobian(work.z.ctypes, work.u.ctypes, p.ctypes, work.g.ctypes, s)
+        evaluate(jacobian, work.z, work.u, p, work.g, s)
         assemble(work.g, h, method, orders, work.matrix)
         for i in range(s):
             for e in range(d):
@@ -208,7 +209,7 @@ def solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work
     return DIVERGED, MAXIMUM_ITERATIONS
 
 
-@jit
+@inner
 def end_of_step(work, s, orders, state):
     """State at the last stage, from ``work.z``."""
     row = first = 0
@@ -219,7 +220,7 @@ def end_of_step(work, s, orders, state):
         first += orders[j]
 
 
-@jit
+@inner
 def local_error(state, top0, h, scale, method, orders, work, error):
     """Largest filtered error ``(D,)`` of a solved step over ``scale``; ``top0 (d,)`` at its start.
 
@@ -268,7 +269,7 @@ def local_error(state, top0, h, scale, method, orders, work, error):
     return largest if np.isfinite(largest) else np.inf
 
 
-@jit
+@inner
 def differentiate_step(
     jacobian, parameters, before, top_by, after, h, method, orders, p, work, active
 ):
@@ -279,10 +280,10 @@ def differentiate_step(
     """
     d, s, columns = orders.size, method.c.size, before.shape[1]
     nz = d + before.shape[0]
-    jacobian(work.z.ctypes, work.u.ctypes, p.ctypes, work.g.ctypes, s)
+    evaluate(jacobian, work.z, work.u, p, work.g, s)
     assemble(work.g, h, method, orders, work.matrix)
     if active > 0:
-        parameters(work.z.ctypes, work.u.ctypes, p.ctypes, work.gp.ctypes, s)
+        evaluate(parameters, work.z, work.u, p, work.gp, s)
     for i in range(s):
         for e in range(d):
             for column in range(columns):
@@ -316,7 +317,7 @@ def differentiate_step(
     return True
 
 
-@jit
+@inner
 def interpolate(state, top, h, position, method, orders, z):
     """Rows ``z (nz, 1)`` at a position in the step, in units of its length, or beyond it."""
     d, s = orders.size, method.c.size
@@ -342,7 +343,7 @@ def interpolate(state, top, h, position, method, orders, z):
         first += orders[j]
 
 
-@jit
+@inner
 def stretch(top, ratio, method, following):
     """Stage unknowns of the next step, ``ratio`` times as long, by extrapolation.
 

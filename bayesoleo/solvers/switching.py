@@ -11,25 +11,25 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo.solvers.inner import evaluate, inner
 from bayesoleo.solvers.radau_step import SOLVED, copy_to, interpolate, solve_stages, stretch
 from bayesoleo.solvers.signals import rows_at
-from bayesoleo.solvers.sweep import jit
 
 #: A switching function beyond zero by less than this, over its largest value, has not switched:
 #: with analytic pieces the difference is of that size.
 SLACK = 1e-13
 
 
-@jit
+@inner
 def sigma_at(switches, k, t, state, top, h, position, method, orders, signal, p, work):
     """Switching function ``k`` on the step's polynomial."""
     interpolate(state, top, h, position, method, orders, work.z1)
     rows_at(signal, t, h, np.full(1, position), work.u1)
-    switches(work.z1.ctypes, work.u1.ctypes, p.ctypes, work.y.ctypes, 1)
+    evaluate(switches, work.z1, work.u1, p, work.y, 1)
     return work.y[k, 0]
 
 
-@jit
+@inner
 def first_switch(switches, t, state, top, h, modes, largest, method, orders, signal, p, work):
     """Position (in the solved step) and number of the first switch, or -1 for none.
 
@@ -37,7 +37,7 @@ def first_switch(switches, t, state, top, h, modes, largest, method, orders, sig
     keeps the largest values of the switching functions.
     """
     s = method.c.size
-    switches(work.z.ctypes, work.u.ctypes, p.ctypes, work.y.ctypes, s)
+    evaluate(switches, work.z, work.u, p, work.y, s)
     values = np.empty((modes.size, s))
     copy_to(work.y[: modes.size, :s], values)
     earliest, which = 2.0, -1
@@ -71,7 +71,7 @@ def first_switch(switches, t, state, top, h, modes, largest, method, orders, sig
     return earliest, which
 
 
-@jit
+@inner
 def _root(
     switches, k, sign, low, high, t, state, top, h, method, orders, signal, p, work
 ):  # fmt: skip
@@ -101,7 +101,7 @@ def _root(
     return low
 
 
-@jit
+@inner
 def step_to_switch(
     jacobian, switches, k, position, t, state, top, h,
     scale, enough, largest, method, orders, signal, p, work,
@@ -126,7 +126,7 @@ def step_to_switch(
     return h
 
 
-@jit
+@inner
 def slope_of_switch(switches, k, t, state, top, h, method, orders, signal, p, work):
     """Time derivative of a switching function at the end of a step, along its polynomial."""
     ahead = sigma_at(switches, k, t, state, top, h, 1.0 + 1e-4, method, orders, signal, p, work)
@@ -134,7 +134,7 @@ def slope_of_switch(switches, k, t, state, top, h, method, orders, signal, p, wo
     return (ahead - behind) / (2e-4 * h)
 
 
-@jit
+@inner
 def jump_of_derivatives(
     slopes, k, slope, top_by, before, after, columns, s, switches, orders, p, work, active
 ):  # fmt: skip
@@ -151,7 +151,7 @@ def jump_of_derivatives(
     if jump < 1e-12:
         return
     nz, count, last = d + columns.shape[0], columns.shape[1], s - 1
-    slopes(work.z.ctypes, work.u.ctypes, p.ctypes, work.slopes.ctypes, s)
+    evaluate(slopes, work.z, work.u, p, work.slopes, s)
     for column in range(count):
         change, row, first = 0.0, k * nz, 0
         for j in range(d):
