@@ -107,6 +107,7 @@ RMS: Final = "rms"
 REPEATING: Final = "repeating"
 RATIO_TO_NOISE: Final = "ratio_to_noise"
 ACCEPTED: Final = "accepted"
+ACCEPTED_TARGET: Final = "accepted_target"
 REASON: Final = "reason"
 
 # Values of ``role``

@@ -29,7 +29,7 @@ import sympy as sp
 from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
 from bayesoleo.effects.places import is_quantity, substitute
 from bayesoleo.model import Dof, Model
-from bayesoleo.model.expressions import symbol
+from bayesoleo.model.expressions import split_derivative, symbol, total_derivative
 
 _ROLES = ("volume_ratio", "free_volume_ratio", "temperature_ratio", "gas_pressure")
 
@@ -83,6 +83,24 @@ SOLUBILITY = Effect(
 # -- volume that follows pressure ------------------------------------------------------------------
 
 
+def volume_ratio_rate(model: Model) -> sp.Expr:
+    """Rate of the gas volume over ``initial_volume``, with that of what pressure adds to it."""
+    return total_derivative(model.expand(symbol("volume_ratio")), (*model.dofs, *model.inputs))
+
+
+def _with_its_work(before: Model, after: Model) -> Model:
+    """Let the power on the gas follow the volume as it now changes."""
+    if "gas_power" not in after.definitions:
+        return after
+    power, old = before.definitions["gas_power"], volume_ratio_rate(before)
+    rates = [item for item in old.free_symbols if split_derivative(item)[1] == 1]
+    a_volume = next((sp.diff(power, r) / sp.diff(old, r) for r in rates if power.has(r)), None)
+    if a_volume is None:
+        return after
+    more = a_volume * (volume_ratio_rate(after) - old)
+    return after.with_definition("gas_power", power + more)
+
+
 def _compliant(
     id: str,  # noqa: A002
     title: str,
@@ -105,9 +123,8 @@ def _compliant(
         wider = model.definitions[target] + added
         unit = Dof("", 0.0, "added gas volume over initial volume")
         follow = -compliance * pressure / symbol("initial_volume")
-        return model.with_dof(dof, unit, {"volume": added, "pressure": follow}).with_definition(
-            target, wider
-        )
+        extended = model.with_dof(dof, unit, {"volume": added, "pressure": follow})
+        return _with_its_work(model, extended.with_definition(target, wider))
 
     return Effect(
         id=id,

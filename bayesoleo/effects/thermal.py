@@ -16,11 +16,11 @@ from collections.abc import Sequence
 import sympy as sp
 
 from bayesoleo.effects.effect import Amplitude, Constant, Effect, Names, Scales, Shape, free_name
-from bayesoleo.effects.gas import has_gas
+from bayesoleo.effects.gas import has_gas, volume_ratio_rate
 from bayesoleo.effects.grids import geometric, period_grid
 from bayesoleo.effects.places import is_quantity
 from bayesoleo.model import Dof, Model
-from bayesoleo.model.expressions import derivative_symbol, symbol, total_derivative
+from bayesoleo.model.expressions import derivative_symbol, symbol
 
 SPECIFIC_HEAT_NITROGEN = 743.0  # J/(kg K), at constant volume
 GAS_CONSTANT_NITROGEN = 296.8  # J/(kg K)
@@ -30,9 +30,7 @@ _THERMAL = ("temperature", "heat_loss", "gas_power", "heat_capacity")
 
 def _power(model: Model, pressure: sp.Expr) -> sp.Expr:
     """Power of a pressure on the shrinking gas, ``-p dV/dt``."""
-    ratio = model.expand(symbol("volume_ratio"))
-    rate = total_derivative(ratio, (*model.dofs, *model.inputs))
-    return -pressure * symbol("initial_volume") * rate
+    return -pressure * symbol("initial_volume") * volume_ratio_rate(model)
 
 
 # -- heat exchange of a polytropic gas -------------------------------------------------------------

@@ -7,6 +7,7 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.plots import reading
+from bayesoleo.plots.rankings import chosen as accepted
 
 
 def point_table(tree: xr.DataTree) -> dict[str, tuple[float, float, str]]:
@@ -71,7 +72,7 @@ def _new_parameters(tree: xr.DataTree) -> set[str]:
     """Parameters that came with the effects accepted."""
     new: set[str] = set()
     for entry in reading.summary(tree).get("rounds", []):
-        for candidate in entry["candidates"]:
-            if candidate["effect"] == entry["accepted"]:
-                new |= set(candidate["expected"])
+        candidate = accepted(entry)
+        if candidate is not None:
+            new |= set(candidate["expected"])
     return new

@@ -66,11 +66,12 @@ def name(candidate: dict[str, Any]) -> str:
 
 
 def chosen(entry: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The accepted candidate of a round; of several with its id the one ranked first."""
+    """The accepted candidate of a round; of several with its id the one at its target."""
     if entry["accepted"] is None:
         return None
+    where = entry.get("accepted_target")
     own = (c for c in entry["candidates"] if c["effect"] == entry["accepted"])
-    return next(own, None)
+    return next((c for c in own if where is None or c.get("target") == where), None)
 
 
 def similar(entry: Mapping[str, Any]) -> list[dict[str, Any]]:

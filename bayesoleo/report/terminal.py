@@ -10,7 +10,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from bayesoleo import schema
-from bayesoleo.plots.rankings import format_p, name
+from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report import sentences, tables
 
 COLOURS = {
@@ -59,15 +59,15 @@ def _errors(summary: Mapping[str, Any]) -> RichTable:
 
 def _accepted(number: int, entry: Mapping[str, Any]) -> Text:
     """The effect that a round added, and what cannot be told from it."""
-    chosen = next((c for c in entry["candidates"] if c["effect"] == entry["accepted"]), None)
-    if chosen is None:
+    added = chosen(entry)
+    if added is None:
         return Text(f"Round {number}: {entry['accepted']} added")
-    p = format_p(chosen["p_value"])
-    share = f"{100 * chosen['gain']:.0f} % of the excess"
-    text = Text.assemble(f"Round {number}: ", (name(chosen), "bold"), f" explains {share}")
+    p = format_p(added["p_value"])
+    share = f"{100 * added['gain']:.0f} % of the excess"
+    text = Text.assemble(f"Round {number}: ", (name(added), "bold"), f" explains {share}")
     if p:
         text.append(f", {p}")
-    others = chosen["indistinguishable_from"]
+    others = added["indistinguishable_from"]
     if others:
         text.append(f"; these data cannot tell it from {', '.join(others)}", style="dim")
     return text

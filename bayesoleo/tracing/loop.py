@@ -52,6 +52,11 @@ class ClosedLoop:
         return tuple(effect for effect, _ in self.final.assembly.added)
 
     @property
+    def targets(self) -> tuple[str, ...]:
+        """Where each of them sits."""
+        return tuple(target for _, target in self.final.assembly.added)
+
+    @property
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
         if not self.effects:

@@ -238,6 +238,9 @@ def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
     data[schema.ACCEPTED] = xr.Variable(
         schema.ROUND, np.array([e.accepted.effect if e.accepted else "" for e in rounds])
     )
+    data[schema.ACCEPTED_TARGET] = xr.Variable(
+        schema.ROUND, np.array([e.accepted.target if e.accepted else "" for e in rounds])
+    )
     data[schema.REASON] = xr.Variable(schema.ROUND, np.array([e.reason for e in rounds]))
     first = rounds[0].before
     coords = {

@@ -63,6 +63,11 @@ class Ranked:
         """Canonical id."""
         return self.score.option.candidate.effect
 
+    @property
+    def target(self) -> str:
+        """Where it sits."""
+        return self.score.option.candidate.target
+
 
 @dataclass(frozen=True)
 class Round:

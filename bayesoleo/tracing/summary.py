@@ -38,6 +38,7 @@ def summarise(
         **about,
         "rounds": [_round(item) for item in loop.rounds],
         "effects": list(loop.effects),
+        "targets": list(loop.targets),
         "parameters": _parameters(final, samples),
         "error_before": loop.first.by_role,
         "error_after": final.by_role,
@@ -57,6 +58,7 @@ def _round(item: Round) -> dict[str, Any]:
         "error": item.before.errors.by_run(),
         "candidates": [_candidate(ranked) for ranked in item.ranking],
         "accepted": item.accepted.effect if item.accepted else None,
+        "accepted_target": item.accepted.target if item.accepted else None,
         "reason": item.reason,
     }
 

@@ -8,7 +8,7 @@ import sympy as sp
 from bayesoleo.effects import find_effect
 from bayesoleo.effects.places import damping_terms, force_places
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.expressions import symbol
+from bayesoleo.model.expressions import symbol, total_derivative
 from bayesoleo.systems import system
 
 
@@ -117,3 +117,58 @@ def test_series_compliance_of_a_damper_is_a_maxwell_element(scales):
     law = symbol("damping") * (symbol("dot(displacement)") - given) + symbol("force_offset")
     assert sp.expand(model.output("force") - law) == 0
     assert model.inputs["force_within_displacement"] == "N"
+
+
+@pytest.mark.parametrize("compliance", ["oil_compressibility", "cylinder_expansion"])
+def test_work_on_the_gas_does_not_depend_on_the_order_of_effects(scales, compliance):
+    heat, give = find_effect("heat_exchange"), find_effect(compliance)
+    plain = system("f16n1d2")
+    one = give.extend(heat.extend(plain, "temperature_ratio", scales).model, "volume_ratio", scales)
+    other = heat.extend(
+        give.extend(plain, "volume_ratio", scales).model, "temperature_ratio", scales
+    )
+    added = f"dot({compliance}_ratio)"
+    first, second = (
+        model.expand(model.equation("temperature")) for model in (one.model, other.model)
+    )
+    assert first.has(symbol(added)), "the volume that pressure adds does work too"
+    assert sp.simplify(first - second) == 0
+
+
+def test_work_is_pressure_times_the_rate_of_the_volume(scales):
+    """Along a motion the power is what differences of the volume give, added volume included."""
+    heat, give = find_effect("heat_exchange"), find_effect("oil_compressibility")
+    model = give.extend(
+        heat.extend(system("f16n1d2"), "temperature_ratio", scales).model, "volume_ratio", scales
+    ).model
+    numbers = {
+        **model.nominal(),
+        symbol("oil_compressibility"): 3e-12,
+        symbol("initial_pressure"): 5e5,
+        symbol("ambient_temperature"): 293.0,
+    }
+    added, rate = symbol("oil_compressibility_ratio"), symbol("dot(oil_compressibility_ratio)")
+
+    def at(time):
+        now = numbers | {
+            symbol("stroke"): 0.05 + 0.1 * time,
+            symbol("dot(stroke)"): 0.1,
+            symbol("temperature"): 320.0 + 40.0 * time,
+            symbol("dot(temperature)"): 40.0,
+        }
+        equation = model.expand(model.equation(added.name)).xreplace(now)
+        now[added] = sp.nsolve(equation, added, 1e-4, prec=30)
+        slope = total_derivative(model.equation(added.name), (*model.dofs, *model.inputs))
+        now[rate] = sp.solve(slope.xreplace(now), rate)[0]
+        return [
+            model.expand(symbol(name)).xreplace(now)
+            for name in ("volume_ratio", "gas_pressure", "gas_power", "initial_volume")
+        ]
+
+    step = sp.Float("1e-8", 30)
+    later, before = at(step)[0], at(-step)[0]
+    _, pressure, power, volume = at(sp.Integer(0))
+    gauge = pressure - numbers[symbol("ambient_pressure")]
+    assert float(power) == pytest.approx(
+        float(-gauge * volume * (later - before) / (2 * step)), rel=1e-6
+    )

@@ -127,6 +127,16 @@ def test_an_id_with_several_targets_marks_the_one_that_is_meant():
     assert found == [("lag", "stroke"), ("offset", "force"), ("wall", None)]
 
 
+def test_of_two_places_the_one_that_was_added_is_marked():
+    candidates = [
+        {"effect": "lag", "target": target, "gain": gain, "indistinguishable_from": []}
+        for target, gain in (("force", 0.5), ("stroke", 0.4))
+    ]
+    entry = {"accepted": "lag", "accepted_target": "stroke", "candidates": candidates}
+    assert chosen(entry) is candidates[1]
+    assert chosen(entry | {"accepted_target": None}) is candidates[0]
+
+
 def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo):
     figure = plots.corner(oleo)
     assert len(figure.axes) == 100

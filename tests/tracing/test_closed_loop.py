@@ -104,7 +104,10 @@ def test_the_summary_says_what_happened(with_friction):
     loop, _ = with_friction
     summary = summarise(loop, None, ABOUT)
     assert summary["effects"] == ["coulomb_friction"]
+    assert summary["targets"] == [loop.rounds[0].accepted.target] == ["force"]
+    assert summary["rounds"][0]["accepted_target"] == "force"
     assert summary["rounds"][-1]["accepted"] is None
+    assert summary["rounds"][-1]["accepted_target"] is None
     assert summary["rounds"][0]["candidates"][0]["effect"] == "coulomb_friction"
     before, after = (summary[k]["hold-out"]["force"] for k in ("error_before", "error_after"))
     assert after["repeating"] < 0.2 * before["repeating"]
