@@ -179,8 +179,8 @@ def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
         "fingerprint": fingerprint,
         "phase": segment.phase,
         "evaluations": segment.evaluations,
+        "branch_jumps": segment.branch_jumps,
         "generator": [name, int(position), int(has_gauss)],
-        "degrees": segment.mixture.degrees,
         **counters,
     }
     arrays: dict[str, NDArray[Any]] = {
@@ -192,6 +192,7 @@ def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
         "centres": segment.mixture.centres,
         "covariances": segment.mixture.covariances,
         "log_weights": segment.mixture.log_weights,
+        "degrees": np.asarray(segment.mixture.degrees),
         "about": np.frombuffer(json.dumps(about, sort_keys=True).encode(), dtype=np.uint8),
     }
     arrays["checksum"] = _checksum(arrays)
@@ -210,7 +211,7 @@ def decode(content: bytes, index: int) -> tuple[Segment, str]:
         raise _BrokenSegmentError
     name, position, has_gauss = about["generator"]
     mixture = Mixture(
-        arrays["centres"], arrays["covariances"], arrays["log_weights"], about["degrees"]
+        arrays["centres"], arrays["covariances"], arrays["log_weights"], arrays["degrees"]
     )
     segment = Segment(
         phase=cast("Phase", about["phase"]),
@@ -229,6 +230,7 @@ def decode(content: bytes, index: int) -> tuple[Segment, str]:
         failures=Counter(about["failures"]),
         proposed=Counter(about["proposed"]),
         accepted=Counter(about["accepted"]),
+        branch_jumps=about.get("branch_jumps", 0),  # absent from segments of older versions
     )
     return segment, about["fingerprint"]
 

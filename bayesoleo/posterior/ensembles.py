@@ -42,6 +42,16 @@ class MoveWeights:
     differential: float = 0.15
     snooker: float = 0.05
 
+    @classmethod
+    def tuned(cls, acceptance: float) -> MoveWeights:
+        """Weights for an acceptance of the independence move.
+
+        An accepted independence move is worth a hundred of the others; where few are accepted, the
+        others carry walkers through what the mixture does not describe.
+        """
+        share = float(np.clip(2 * acceptance, 0.3, 0.9))
+        return cls(share, 0.75 * (1 - share), 0.25 * (1 - share))
+
 
 def default_walkers(dimension: int) -> int:
     """Walkers of one ensemble: each half spans the space and leaves differences to choose from."""
@@ -139,9 +149,10 @@ class Ensembles:
             log_density[None],
             by_run[None],
             random.get_state(legacy=True),
-            mixture,
+            mixture.defended(),
             tally.evaluations,
             tally.failures,
+            branch_jumps=tally.branch_jumps,
         )
 
     def advance(self, last: Segment, steps: int, phase: Phase) -> Segment:
@@ -193,6 +204,7 @@ class Ensembles:
             tally.failures,
             Counter({move.name: move.proposed for move, _ in moves}),
             Counter({move.name: move.accepted for move, _ in moves}),
+            tally.branch_jumps,
         )
 
     @property
@@ -222,10 +234,16 @@ class _Tally:
 
     evaluations: int
     failures: Counter[str]
+    branch_jumps: int
 
     @classmethod
     def of(cls, log_density: Density) -> _Tally:
-        return cls(log_density.evaluations, Counter(log_density.failures))
+        jumps = getattr(log_density, "branch_jumps", 0)  # of densities that solve something
+        return cls(log_density.evaluations, Counter(log_density.failures), jumps)
 
     def __sub__(self, other: _Tally) -> _Tally:
-        return _Tally(self.evaluations - other.evaluations, self.failures - other.failures)
+        return _Tally(
+            self.evaluations - other.evaluations,
+            self.failures - other.failures,
+            self.branch_jumps - other.branch_jumps,
+        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +147,7 @@ def sample(
     max_evaluations : int
         Rows of the log density to stop at.
     weights : MoveWeights, optional
-        How often each kind of move is chosen.
+        How often each kind of move is chosen; by default the warm-up's acceptance decides.
     segment : int
         Draws of the longest checkpointed segment.
     quick : bool
@@ -189,6 +189,8 @@ def sample(
         bar = _Bar(schedule.effective_size, progress)
         try:
             _warm_up(store, group, schedule, start, seed, bar)
+            if weights is None:
+                group = replace(group, weights=_tuned(store.segments))
             quality, short = _keep(store, group, schedule, bar)
         finally:
             bar.close()
@@ -198,7 +200,7 @@ def sample(
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
     if quick:
         return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 25, 10.0, segment)
-    return Schedule(effective_size, evaluations, 40, 6, 50, 20.0, segment)
+    return Schedule(effective_size, evaluations, 20, 7, 50, 20.0, segment)
 
 
 def _fingerprint(
@@ -216,7 +218,7 @@ def _fingerprint(
         seed,
         schedule.warm_up,
         schedule.most_rounds,
-        start.degrees,
+        np.asarray(start.degrees).tolist(),
     ]
     digest.update(json.dumps(settings).encode())
     for array in (start.centres, start.covariances, start.log_weights):
@@ -249,8 +251,22 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
         return True
     if len(rounds) < 2:
         return False
+    # More than half of the proposals that forget where a walker was are taken: so it did.
+    if _independence(rounds[-1]) > 0.5:
+        return True
     times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
     return bool(np.all(rounds[-1].draws >= 10 * times))
+
+
+def _tuned(segments: list[Segment]) -> MoveWeights:
+    """From the last round of the warm-up: fixed before draws are kept, the same after a restart."""
+    rounds = [s for s in segments if s.phase == "warm-up"]
+    return MoveWeights.tuned(_independence(rounds[-1])) if rounds else MoveWeights()
+
+
+def _independence(segment: Segment) -> float:
+    """Acceptance of the independence move."""
+    return segment.accepted["independence"] / max(segment.proposed["independence"], 1)
 
 
 def _keep(
@@ -337,6 +353,7 @@ def _samples(
         acceptance=acceptance,
         evaluations=sum(s.evaluations for s in segments),
         failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
+        branch_jumps=sum(s.branch_jumps for s in segments),
         reached=not short,
         warning="; ".join(short),
     )

@@ -112,3 +112,29 @@ def test_a_start_that_cannot_be_evaluated_is_refused():
     dead = Mode(np.zeros(2), np.eye(2), -np.inf, Status.NOT_FINITE)
     with pytest.raises(InputError, match="no mode"):
         mixture_of([dead])
+
+
+def test_a_defended_mixture_is_nearly_normal_and_bounds_the_ratio_far_out(two):
+    defended = two.defended()
+    draws = np.random.default_rng(1).normal(size=(4000, 2)) * 3
+    np.testing.assert_allclose(defended.weights.sum(), 1.0)
+    parts = [
+        share * weight * stats.multivariate_t(centre, covariance, degrees).pdf(draws)
+        for share, degrees in ((0.9, 50.0), (0.1, 4.0))
+        for weight, centre, covariance in zip(
+            two.weights, two.centres, two.covariances, strict=True
+        )
+    ]
+    np.testing.assert_allclose(defended.log_density(draws), np.log(np.sum(parts, axis=0)))
+    # Along a ray the density of heavy tails falls like r^-(4 + 2).
+    near, far = defended.log_density(np.array([[1e3, 0.0], [1e4, 0.0]]))
+    assert near - far == pytest.approx(6 * np.log(10), rel=0.01)
+
+
+def test_the_weight_of_tails_follows_the_draws(two):
+    rng = np.random.default_rng(2)
+    normal = rng.standard_normal((20_000, 2))
+    heavy = normal / np.sqrt(rng.chisquare(3, size=20_000) / 3)[:, None]
+    one = Mixture(np.zeros((1, 2)), np.eye(2)[None], np.zeros(1)).defended()
+    assert one.refitted(normal, rounds=50).weights[1] < 0.05
+    assert one.refitted(heavy, rounds=50).weights[1] > 0.3
