@@ -37,6 +37,9 @@ INDIFFERENCE: Final = "indifference"
 PROFILE: Final = "profile"
 SENSITIVITY: Final = "sensitivity"
 ASSESSMENT: Final = "assessment"
+LOG_PRIOR: Final = "log_prior"
+ERROR_MODEL: Final = "error_model"
+COMPARISON: Final = "comparison"
 
 GROUPS: Final = (
     OBSERVED_DATA,
@@ -56,6 +59,9 @@ GROUPS: Final = (
     PROFILE,
     SENSITIVITY,
     ASSESSMENT,
+    LOG_PRIOR,
+    ERROR_MODEL,
+    COMPARISON,
 )
 
 # Dims; each that is not just a counter has a coordinate of the same name
@@ -72,6 +78,7 @@ MULTIPLIER: Final = "multiplier"
 PART: Final = "part"
 ROUND: Final = "round"
 EFFECT: Final = "effect"
+QUANTITY: Final = "quantity"
 
 # Variables and coordinates
 TIME: Final = "time"
@@ -137,6 +144,7 @@ EQUATIONS_LATEX: Final = "equations_latex"
 EFFECTS: Final = "effects"
 VERDICT: Final = "verdict"
 SUMMARY: Final = "summary"
+BETWEEN_RUNS: Final = "between_runs"
 
 # Attributes of every variable
 UNITS: Final = "units"

@@ -58,10 +58,12 @@ def parameter_sets(tree: xr.DataTree, draws: int | None, seed: int) -> list[dict
     if schema.POSTERIOR not in tree.children:
         raise ResultsError("the result holds no posterior to draw from", hint="leave --draws out")
     posterior = tree[schema.POSTERIOR].to_dataset()
+    scattering = json.loads(posterior.attrs.get(schema.BETWEEN_RUNS, "[]"))
+    population = {make(n) for n in scattering for make in (schema.population_mean, schema.spread)}
     names = [
         str(name)
         for name in posterior.data_vars
-        if not str(name).startswith(schema.log_variance(""))
+        if not schema.of_errors(str(name)) and str(name) not in population
     ]
     flat = {name: posterior[name].values.ravel() for name in names}
     rng = np.random.default_rng(seed)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
@@ -23,8 +22,9 @@ from bayesoleo.estimation.nuisance import declared_nuisance, uncertain_condition
 from bayesoleo.estimation.per_run import by_run_dataset
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.document import to_document
-from bayesoleo.posterior import LogDensity, Samples, laplace_mixture
+from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
+from bayesoleo.posterior.error_models import ERROR_MODELS
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.report import write_report
 from bayesoleo.simulation import merged, model_of, parameter_sets, simulate_like
@@ -33,8 +33,15 @@ from bayesoleo.storage import provenance, write_text_atomic, write_tree
 from bayesoleo.systems import equations, equations_latex
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.fit import Fit, Numerics, first_steps, fit_model
+from bayesoleo.tracing.inference import Inference, at_mode, mixture_at, mode_group, mode_of
 from bayesoleo.tracing.loop import ClosedLoop, close_loop
-from bayesoleo.tracing.result import loop_groups, point_group, posterior_groups, records_tree
+from bayesoleo.tracing.result import (
+    loop_groups,
+    point_group,
+    posterior_groups,
+    predictive_groups,
+    records_tree,
+)
 from bayesoleo.tracing.roles import Roles, assign
 from bayesoleo.tracing.summary import summarise
 
@@ -74,6 +81,11 @@ class Settings:
     nuisance : tuple of {"conditions", "offset", "gain"}
         What is estimated within its declared tolerance: conditions by run (``sd``), offset and gain
         of sensors (``accuracy``).
+    error_model : {"independent", "per-run", "full", "correlated", "discrepancy"}
+        What the errors of the outputs have in common; see :mod:`bayesoleo.posterior.error_models`.
+    between_runs : tuple of str
+        Parameters that scatter between runs about a mean that is estimated; see
+        :mod:`bayesoleo.posterior.hierarchy`.
     """
 
     seed: int = 0
@@ -87,6 +99,13 @@ class Settings:
     effects: tuple[Effect, ...] | None = None
     command: str = ""
     nuisance: tuple[str, ...] = ()
+    error_model: str = ERROR_MODELS[0]
+    between_runs: tuple[str, ...] = ()
+
+    @property
+    def inference(self) -> Inference:
+        """What is assumed of errors and of runs."""
+        return Inference(self.error_model, self.between_runs)
 
     @property
     def numerics(self) -> Numerics:
@@ -163,6 +182,7 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     InputError
         If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
     """
+    model = settings.inference.declare(model)
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
     starts = not all(record.periodic for record in reduced.records)
@@ -289,7 +309,20 @@ def estimate(
     """
     task = prepare(campaign, model, settings)
     fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
-    return _finish(task, {schema.POINT: point_group(fit)}, fit, out)
+    fit, more = _under_error_model(fit, settings, say)
+    return _finish(task, {schema.POINT: point_group(fit), **more}, fit, out)
+
+
+def _under_error_model(fit: Fit, settings: Settings, say: Say) -> tuple[Fit, dict[str, xr.Dataset]]:
+    """The estimate moved to the mode under the error model that was chosen, with what it found."""
+    inference = settings.inference
+    if inference.plain:
+        return fit, {}
+    say(f"posterior mode, {inference.error_model} errors")
+    density = inference.density(fit, settings.jobs)
+    mode = mode_of(density, fit.point.theta)
+    group = mode_group(density, mode, inference.error_model)
+    return at_mode(fit, density, mode, inference.error_model), {schema.ERROR_MODEL: group}
 
 
 def estimate_each(
@@ -352,8 +385,12 @@ def sample(
     """
     task = prepare(campaign, model, settings)
     fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
-    samples = _sample(task, fit, out, say, progress)
-    groups = {schema.POINT: point_group(fit), **posterior_groups(fit, samples, settings.seed)}
+    fit, more = _under_error_model(fit, settings, say)
+    samples, density = _sample(task, fit, out, say, progress)
+    groups = {schema.POINT: point_group(fit), **more}
+    groups |= posterior_groups(fit, samples, settings.seed, density)
+    groups |= predictive_groups(fit, samples, settings.seed)
+    groups[schema.COMPARISON] = compare(groups)
     return _finish(task, groups, fit, out)
 
 
@@ -416,8 +453,8 @@ def close(
     task = prepare(campaign, model, settings, progress=progress)
     loop = _loop(task, settings.max_effects, say)
     say("sample the posterior")
-    samples = _sample(task, loop.final.fit, out, say, progress)
-    return _result(task, loop, samples, out, say)
+    drawn = _sample(task, loop.final.fit, out, say, progress)
+    return _result(task, loop, drawn, out, say)
 
 
 def _loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
@@ -433,16 +470,17 @@ def _loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
     )
 
 
-def _sample(task: Task, fit: Fit, out: Path | None, say: Say, progress: bool) -> Samples:
+def _sample(
+    task: Task, fit: Fit, out: Path | None, say: Say, progress: bool
+) -> tuple[Samples, LogDensity]:
     settings = task.settings
-    fit.problem.freeze(fit.point.theta)
-    density = LogDensity(fit.problem, settings.jobs)
-    start = laplace_mixture(density, np.stack([fit.point.theta]))
+    density = settings.inference.density(fit, settings.jobs)
+    start = mixture_at(density, fit.point.theta)
     # Another seed or quality is another run, with a folder of its own.
     parts = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
-    parts += [settings.seed, settings.quick]
+    parts += [settings.seed, settings.quick, settings.error_model, settings.between_runs]
     fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-    return draw_samples(
+    samples = draw_samples(
         density,
         start,
         effective_size=settings.effective_size,
@@ -452,19 +490,26 @@ def _sample(task: Task, fit: Fit, out: Path | None, say: Say, progress: bool) ->
         progress=progress,
         quick=settings.quick,
     )
+    return samples, density
 
 
 def _result(
-    task: Task, loop: ClosedLoop, samples: Samples | None, out: Path | None, say: Say
+    task: Task,
+    loop: ClosedLoop,
+    drawn: tuple[Samples, LogDensity] | None,
+    out: Path | None,
+    say: Say,
 ) -> xr.DataTree:
     seed, fit = task.settings.seed, loop.final.fit
+    samples, density = drawn or (None, None)
     # Bare names: they stay true when the folder moves.
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
     files = {} if out is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
     groups = {schema.POINT: point_group(fit), **loop_groups(loop, samples, seed)}
     if samples is not None:
-        groups |= posterior_groups(fit, samples, seed)
+        groups |= posterior_groups(fit, samples, seed, density)
+        groups[schema.COMPARISON] = compare(groups)
     tree = _finish(task, groups, fit, None, summary=summary)
     if out is not None:
         say("write results and report")

@@ -44,7 +44,7 @@ def chosen(tree: xr.DataTree, most: int) -> list[str]:
     new = _new_parameters(tree)
 
     def rank(name: str) -> tuple[bool, bool, int]:
-        secondary = "[" in name or name.startswith(schema.log_variance(""))
+        secondary = "[" in name or schema.of_errors(name)
         return name not in new, secondary, names.index(name)
 
     return sorted(sorted(names, key=rank)[:most], key=names.index)

@@ -1,24 +1,33 @@
 """Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
 
+from bayesoleo.posterior.comparison import compare
 from bayesoleo.posterior.density import LogDensity
 from bayesoleo.posterior.diagnostics import Comparison, compare_with_point
+from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
+from bayesoleo.posterior.hierarchy import hierarchical
 from bayesoleo.posterior.laplace import Mode, find_mode, laplace_mixture
 from bayesoleo.posterior.mixture import Mixture
 from bayesoleo.posterior.predictive import choose_draws
+from bayesoleo.posterior.prior_sensitivity import prior_sensitivity
 from bayesoleo.posterior.sample import sample
 from bayesoleo.posterior.samples import Samples
 from bayesoleo.posterior.tree import to_datasets
 
 __all__ = [
+    "ERROR_MODELS",
     "Comparison",
     "LogDensity",
     "Mixture",
     "Mode",
     "Samples",
     "choose_draws",
+    "compare",
     "compare_with_point",
+    "error_model",
     "find_mode",
+    "hierarchical",
     "laplace_mixture",
+    "prior_sensitivity",
     "sample",
     "to_datasets",
 ]

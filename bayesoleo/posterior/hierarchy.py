@@ -9,22 +9,35 @@ with the parameter's own prior for the mean :math:`\mu`, and a half-normal one f
 in its unit; of one with a bound it is the spread of the logarithm of the distance to that bound, of
 one with two bounds that of the logit.
 
-Where the runs determine their own values far better than the population does, the values themselves
-are the coordinates (centred); where they do not, their deviations :math:`(u_\kappa - \mu) / s` are
-(not centred), because the values would all have to move together whenever :math:`s` shrinks.
+Sampled as they stand, the runs' values and the mean would have to move together whenever :math:`s`
+shrinks; their deviations from it would, whenever :math:`s` grows. So the coordinates follow what
+the runs say for themselves: where run :math:`\kappa` alone puts its value at
+:math:`\hat u_\kappa \pm \sigma_\kappa`,
+
+.. math::
+
+    u_\kappa = \frac{s^2 \hat u_\kappa + \sigma_\kappa^2 \mu}{s^2 + \sigma_\kappa^2}
+               + \frac{s \sigma_\kappa}{\sqrt{s^2 + \sigma_\kappa^2}}\, z_\kappa ,
+
+and likewise :math:`\mu` is its own mean and spread given :math:`s`, plus so many of them. For a
+linear model with normal errors all :math:`z` are then independent and standard normal whatever
+:math:`s` is: centred where the data are strong, not centred where they are weak, and anything
+between. The posterior does not depend on the numbers :math:`\hat u` and :math:`\sigma`, only the
+work does.
 
 References
 ----------
-Gelman et al. (2013), *Bayesian Data Analysis*, third edition, chapter 5. Papaspiliopoulos, Roberts
-and Sköld (2007), "A general framework for the parametrization of hierarchical models",
-*Statistical Science* 22, section 2 (when to centre). Gelman (2006), "Prior distributions for
-variance parameters in hierarchical models", *Bayesian Analysis* 1, section 2.2.
+Gelman et al. (2013), *Bayesian Data Analysis*, third edition, section 5.4 (the conditional means
+and variances). Papaspiliopoulos, Roberts and Sköld (2007), "A general framework for the
+parametrization of hierarchical models", *Statistical Science* 22, section 4 (between centred and
+not). Gelman (2006), "Prior distributions for variance parameters in hierarchical models",
+*Bayesian Analysis* 1, section 2.2 (half-normal).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -34,13 +47,15 @@ from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Problem
 from bayesoleo.model.priors import Prior
-from bayesoleo.posterior.transforms import Transform, Transforms
-from bayesoleo.posterior.unknowns import Array, PlainUnknowns, Unknowns, prior_curvature
+from bayesoleo.posterior.transforms import Transform
+from bayesoleo.posterior.unknowns import Array, PlainUnknowns, Unknowns
 
 _HALF_NORMAL = 0.5 * float(np.log(2 / np.pi))
 _LOG_SQRT_2_PI = 0.5 * float(np.log(2 * np.pi))
 #: A start's spread is at least this part of its prior's scale.
 _LEAST_SPREAD = 0.02
+# Step of central differences over coordinates of about unit spread.
+_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -55,56 +70,100 @@ class Population:
         Places of the runs' values among the unknowns.
     prior : Prior
         Of the mean, in the parameter's unit.
-    centred : bool
-        Whether the runs' values are coordinates themselves.
+    centres, sds : ndarray, shape (N,)
+        What each run says of its value by itself, in coordinates without bounds.
     """
 
     name: str
     members: NDArray[np.int64]
     prior: Prior
-    centred: bool
+    centres: Array
+    sds: Array
 
     @cached_property
     def transform(self) -> Transform:
-        """From coordinates to the parameter's unit."""
+        """From coordinates without bounds to the parameter's unit."""
         return Transform(*self.prior.support)
 
     @cached_property
-    def scale(self) -> float:
-        """Scale of the spread's prior: the parameter's prior sd, in coordinates."""
-        u = self.transform.unbounded(np.array([self.prior.mean]))
-        return float(self.prior.sd / abs(self.transform.derivative(u)[0]))
+    def middle(self) -> float:
+        """The prior's mean, in coordinates without bounds."""
+        return float(self.transform.unbounded(np.array([self.prior.mean]))[0])
 
-    def log_prior(self, u: Array, mean: Array, log_spread: Array) -> Array:
-        """Log density of coordinates: of the runs (W, N), or deviations, and of mean and spread."""
+    @cached_property
+    def scale(self) -> float:
+        """Scale of the spread's prior: the parameter's prior sd, in coordinates without bounds."""
+        slope = self.transform.derivative(np.array([self.middle]))[0]
+        return float(self.prior.sd / abs(slope))
+
+    def mean_given(self, spread: Array) -> tuple[Array, Array]:
+        """Mean of ``mu`` given spreads (W,), and its standard deviation."""
+        precision = np.full(spread.shape, self.scale**-2.0)
+        weighted = precision * self.middle
+        for centre, sd in zip(self.centres, self.sds, strict=True):
+            weight = 1.0 / (sd * sd + spread * spread)
+            precision += weight
+            weighted += weight * centre
+        return weighted / precision, 1.0 / np.sqrt(precision)
+
+    def run_given(self, k: int, mean: Array, spread: Array) -> tuple[Array, Array]:
+        """Mean of run ``k``'s value given ``mu`` and spreads (W,), and its standard deviation."""
+        own, common = self.sds[k] * self.sds[k], spread * spread
+        total = own + common
+        middle = (common * self.centres[k] + own * mean) / total
+        return middle, self.sds[k] * spread / np.sqrt(total)
+
+    def values(self, z: Array, zeta: Array, log_spread: Array) -> tuple[Array, Array, Array, Array]:
+        """Runs' values (W, N), mean, spread and log Jacobian (W,) from coordinates."""
         spread = np.exp(log_spread)
+        middle, width = self.mean_given(spread)
+        mean, jacobian = middle + width * zeta, np.log(width)
+        u = np.empty(z.shape)
+        for k in range(z.shape[1]):
+            middle, width = self.run_given(k, mean, spread)
+            u[:, k] = middle + width * z[:, k]
+            jacobian = jacobian + np.log(width)
+        return u, mean, spread, jacobian
+
+    def coordinates(self, u: Array, mean: Array, spread: Array) -> tuple[Array, Array]:
+        """``z (W, N)`` and ``zeta (W,)`` of values, mean and spread."""
+        middle, width = self.mean_given(spread)
+        zeta, z = (mean - middle) / width, np.empty(u.shape)
+        for k in range(u.shape[1]):
+            middle, width = self.run_given(k, mean, spread)
+            z[:, k] = (u[:, k] - middle) / width
+        return z, zeta
+
+    def log_prior(self, u: Array, mean: Array, spread: Array) -> Array:
+        """Log density, shape (W,), of values and mean without bounds, and of the spread."""
         total = self.prior.log_density(self.transform.natural(mean))
-        total = total + self.transform.log_jacobian(mean)
-        scaled = spread / self.scale
-        total += _HALF_NORMAL - np.log(self.scale) - 0.5 * scaled * scaled + log_spread
+        total = total + self.transform.log_jacobian(mean) + self.log_prior_of_spread(spread)
         for column in u.T:
-            away = (column - mean) / spread if self.centred else column
-            total -= 0.5 * away * away + _LOG_SQRT_2_PI
-            if self.centred:
-                total -= log_spread
+            away = (column - mean) / spread
+            total -= 0.5 * away * away + np.log(spread) + _LOG_SQRT_2_PI
         return np.asarray(total)
+
+    def log_prior_of_spread(self, spread: Array) -> Array:
+        """Half-normal."""
+        scaled = spread / self.scale
+        return np.asarray(_HALF_NORMAL - np.log(self.scale) - 0.5 * scaled * scaled)
 
 
 @dataclass(frozen=True)
 class HierarchicalUnknowns(Unknowns):
     """Unknowns of which some scatter between runs.
 
-    Coordinates are the problem's ``l``, then mean and logarithm of the spread of each population.
+    There are the problem's ``l`` unknowns, then mean and spread of each population.
 
     Parameters
     ----------
     plain : PlainUnknowns
-        All unknowns of the problem; priors of members are those of their population's mean.
+        All unknowns of the problem; the priors of members are those of their population's mean.
     populations : tuple of Population
     """
 
     plain: PlainUnknowns
-    populations: tuple[Population, ...] = field(default=())
+    populations: tuple[Population, ...] = ()
 
     @cached_property
     def _shared(self) -> NDArray[np.int64]:
@@ -114,145 +173,133 @@ class HierarchicalUnknowns(Unknowns):
 
     @cached_property
     def _rest(self) -> PlainUnknowns:
+        labels, priors = self.plain.labels, self.plain.priors
         return PlainUnknowns(
-            tuple(self.plain.labels[k] for k in self._shared),
-            tuple(self.plain.priors[k] for k in self._shared),
+            tuple(labels[k] for k in self._shared), tuple(priors[k] for k in self._shared)
         )
+
+    @property
+    def scattering(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Names of the populations."""
+        return tuple(population.name for population in self.populations)
 
     @property
     def names(self) -> tuple[str, ...]:
         more = [
             name
-            for population in self.populations
-            for name in (schema.population_mean(population.name), schema.spread(population.name))
+            for label in self.scattering
+            for name in (schema.population_mean(label), schema.spread(label))
         ]
         return (*self.plain.names, *more)
 
     def _places(self, k: int) -> tuple[int, int]:
-        """Places of the mean and the log spread of population ``k``."""
+        """Places of mean and spread of population ``k``."""
         first = len(self.plain.labels) + 2 * k
         return first, first + 1
 
-    def _unbounded(self, block: Array) -> Array:
-        """Coordinates of the unknowns themselves, (W, l): deviations are turned into values."""
-        u = np.array(block[:, : len(self.plain.labels)], dtype=float)
-        for k, population in enumerate(self.populations):
-            if not population.centred:
-                mean, log_spread = (np.ascontiguousarray(block[:, i]) for i in self._places(k))
-                spread = np.exp(log_spread)
-                for member in population.members:
-                    u[:, member] = mean + spread * block[:, member]
-        return u
+    def _values(self, block: Array, k: int) -> tuple[Array, Array, Array, Array]:
+        """Values, mean, spread and log Jacobian of population ``k``."""
+        mean, spread = (np.ascontiguousarray(block[:, i]) for i in self._places(k))
+        population = self.populations[k]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return population.values(block[:, population.members], mean, spread)
 
     def theta(self, block: Array) -> Array:
-        return self.plain.theta(self._unbounded(block))
+        u = np.array(block[:, : len(self.plain.labels)], dtype=float)
+        for k, population in enumerate(self.populations):
+            u[:, population.members] = self._values(block, k)[0]
+        return self.plain.theta(u)
 
     def natural(self, block: Array) -> Array:
         out = np.empty(np.shape(block))
         out[:, : len(self.plain.labels)] = self.theta(block)
         for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            out[:, mean] = population.transform.natural(np.ascontiguousarray(block[:, mean]))
-            out[:, spread] = np.exp(np.ascontiguousarray(block[:, spread]))
+            _, mean, spread, _ = self._values(block, k)
+            first, second = self._places(k)
+            out[:, first], out[:, second] = population.transform.natural(mean), spread
         return out
 
     def coordinates(self, natural: Array) -> Array:
-        out = np.empty(np.shape(natural))
-        count = len(self.plain.labels)
+        out, count = np.empty(np.shape(natural)), len(self.plain.labels)
         out[:, :count] = self.plain.coordinates(natural[:, :count])
         for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            out[:, mean] = population.transform.unbounded(natural[:, mean])
-            out[:, spread] = np.log(natural[:, spread])
-            if not population.centred:
-                away = out[:, population.members] - out[:, mean, None]
-                out[:, population.members] = away / natural[:, spread, None]
+            first, second = self._places(k)
+            mean = population.transform.unbounded(natural[:, first])
+            spread = np.ascontiguousarray(natural[:, second])
+            u = out[:, population.members]
+            z, out[:, first] = population.coordinates(u, mean, spread)
+            out[:, population.members], out[:, second] = z, np.log(spread)
         return out
 
     def log_prior(self, block: Array) -> Array:
+        total = np.zeros(len(block))
+        if self._shared.size:
+            total += self._rest.log_prior(np.ascontiguousarray(block[:, self._shared]))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = np.zeros(len(block))
-            if self._shared.size:
-                total += self._rest.log_prior(np.ascontiguousarray(block[:, self._shared]))
             for k, population in enumerate(self.populations):
-                mean, spread = (np.ascontiguousarray(block[:, i]) for i in self._places(k))
-                total += population.log_prior(block[:, population.members], mean, spread)
+                u, mean, spread, jacobian = self._values(block, k)
+                # The spread's coordinate is its logarithm.
+                total += population.log_prior(u, mean, spread) + jacobian + np.log(spread)
         return total
 
     def natural_log_prior(self, natural: Array) -> dict[str, Array]:
         found = self._rest.natural_log_prior(natural[:, self._shared])
         for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            scaled = natural[:, spread] / population.scale
-            found[schema.population_mean(population.name)] = population.prior.log_density(
-                natural[:, mean]
-            )
-            found[schema.spread(population.name)] = (
-                _HALF_NORMAL - np.log(population.scale) - 0.5 * scaled**2
-            )
+            first, second = self._places(k)
+            mean, spread = self.names[first], self.names[second]
+            found[mean] = population.prior.log_density(natural[:, first])
+            found[spread] = population.log_prior_of_spread(natural[:, second])
         return found
 
     def sample_prior(self, rng: np.random.Generator, size: int) -> Array:
         out = np.empty((size, len(self.names)))
         out[:, self._shared] = self._rest.sample_prior(rng, size)
         for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            out[:, mean] = population.prior.sample(rng, size)
-            out[:, spread] = population.scale * np.abs(rng.standard_normal(size))
-            centre = population.transform.unbounded(out[:, mean])
-            scatter = rng.standard_normal((size, population.members.size))
-            u = centre[:, None] + out[:, spread, None] * scatter
-            for j, member in enumerate(population.members):
-                out[:, member] = population.transform.natural(np.ascontiguousarray(u[:, j]))
+            first, second = self._places(k)
+            out[:, first] = population.prior.sample(rng, size)
+            out[:, second] = population.scale * np.abs(rng.standard_normal(size))
+            mean = population.transform.unbounded(out[:, first])
+            for member in population.members:
+                u = mean + out[:, second] * rng.standard_normal(size)
+                out[:, member] = population.transform.natural(u)
         return out
 
     def start(self, theta: Array) -> Array:
+        theta = np.asarray(theta, dtype=float)
         u = self.plain.start(theta)
-        natural = np.concatenate([np.asarray(theta, dtype=float), np.empty(self._more)])
+        natural = np.concatenate([theta, np.empty(2 * len(self.populations))])
         for k, population in enumerate(self.populations):
-            own = u[population.members]
-            mean, spread = self._places(k)
-            natural[mean] = population.transform.natural(np.array([own.mean()]))[0]
-            natural[spread] = max(float(own.std(ddof=1)), _LEAST_SPREAD * population.scale)
+            own, (first, second) = u[population.members], self._places(k)
+            natural[first] = population.transform.natural(np.array([own.mean()]))[0]
+            natural[second] = max(float(own.std(ddof=1)), _LEAST_SPREAD * population.scale)
         return self.coordinates(natural[None])[0]
 
-    @property
-    def _more(self) -> int:
-        return 2 * len(self.populations)
-
     def jacobian(self, block: Array) -> Array:
-        count = len(self.plain.labels)
-        u = self._unbounded(block[None])
-        by_u = np.eye(count, len(block))
-        for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            if not population.centred:
-                size = np.exp(block[spread])
-                members = population.members
-                by_u[members, members] = size
-                by_u[members, mean] = 1.0
-                by_u[members, spread] = size * block[members]
-        return np.asarray(self.plain.transforms.derivative(u)[0][:, None] * by_u)
+        steps = _STEP * np.eye(len(block))
+        ahead, behind = self.theta(block + steps), self.theta(block - steps)
+        return np.asarray((ahead - behind).T / (2 * _STEP))
 
     def precision(self, block: Array) -> Array:
-        matrix = np.zeros((len(block), len(block)))
-        shared = self._shared
+        matrix, shared = np.zeros((len(block), len(block))), self._shared
         if shared.size:
             matrix[np.ix_(shared, shared)] = self._rest.precision(block[shared])
-        for k, population in enumerate(self.populations):
-            mean, spread = self._places(k)
-            members, each = population.members, np.exp(-2 * block[spread])
-            transforms = Transforms((population.transform,))
-            curvature = prior_curvature([population.prior], transforms, block[mean : mean + 1])
-            matrix[mean, mean] = curvature[0]
-            # Of a logarithm of a standard deviation that N values determine; of one that only a
-            # half-normal prior does, about two.
-            matrix[spread, spread] = 2.0 * members.size if population.centred else 2.0
-            matrix[members, members] = each if population.centred else 1.0
-            if population.centred:
-                matrix[mean, mean] += members.size * each
-                matrix[members, mean] = matrix[mean, members] = -each
+        steps = _STEP * np.eye(len(block))
+        for k in range(len(self.populations)):
+            # As sums of squares: the runs' deviations, and the mean's from its prior.
+            ahead, behind = (self._deviations(block + sign * steps, k) for sign in (1, -1))
+            slope = (ahead - behind) / (2 * _STEP)
+            matrix += slope @ slope.T
+            # Of the logarithm of a spread hardly anything is known.
+            place = self._places(k)[1]
+            matrix[place, place] += 1.0
         return matrix
+
+    def _deviations(self, block: Array, k: int) -> Array:
+        """Standardised deviations of population ``k`` from its mean, and of that, (W, N + 1)."""
+        u, mean, spread, _ = self._values(block, k)
+        population = self.populations[k]
+        own = (u - mean[:, None]) / spread[:, None]
+        return np.column_stack([own, (mean - population.middle) / population.scale])
 
 
 def hierarchical(
@@ -261,7 +308,6 @@ def hierarchical(
     *,
     theta: Array | None = None,
     sd: Array | None = None,
-    centred: bool | None = None,
 ) -> HierarchicalUnknowns:
     """Let parameters that vary by run scatter about a mean that is estimated.
 
@@ -272,10 +318,9 @@ def hierarchical(
     names : sequence of str
         Parameters that scatter.
     theta, sd : ndarray, shape (l,), optional
-        An estimate with its standard deviations, which says whether to centre: where the runs'
-        values scatter by more than a typical one is uncertain.
-    centred : bool, optional
-        Instead of finding out; by default, without an estimate, True.
+        What the runs say by themselves: an estimate with its standard deviations, infinite or
+        large where a run says nothing. The posterior does not depend on them, only how many
+        evaluations it takes. By default the problem's start and the priors' spread.
 
     Returns
     -------
@@ -287,39 +332,35 @@ def hierarchical(
         If a parameter does not vary by run, or there are fewer than three runs.
     """
     plain = PlainUnknowns(tuple(problem.names), tuple(problem.priors))
+    centres = plain.start(np.asarray(problem.start if theta is None else theta, dtype=float))
+    widths = np.array([prior.sd for prior in plain.priors])
+    widths = widths if sd is None else np.minimum(sd, widths)
+    slopes = np.abs(plain.transforms.derivative(centres[None])[0])
     populations = []
     for name in dict.fromkeys(names):
-        wanted = [schema.by_run(name, run) for run in problem.runs]
-        members = np.array([k for k, own in enumerate(problem.names) if own in wanted])
-        if members.size == 0:
-            raise InputError(
-                "this parameter has no value of each run's own",
-                key="between_runs",
-                value=name,
-                hint="declare it with by_run=True",
-            )
-        if members.size < 3:
-            raise InputError(
-                "a scatter between runs needs three of them",
-                key="between_runs",
-                value=name,
-                hint="leave it common to all runs",
-            )
-        prior = problem.priors[int(members[0])]
-        populations.append(
-            Population(name, members, prior, _centred(prior, members, theta, sd, centred))
-        )
+        members = _members(problem, name)
+        prior = plain.priors[int(members[0])]
+        own = (centres[members], widths[members] / slopes[members])
+        populations.append(Population(name, members, prior, *own))
     return HierarchicalUnknowns(plain, tuple(populations))
 
 
-def _centred(
-    prior: Prior,
-    members: NDArray[np.int64],
-    theta: Array | None,
-    sd: Array | None,
-    wanted: bool | None,
-) -> bool:
-    if wanted is not None or theta is None or sd is None:
-        return True if wanted is None else wanted
-    scatter = float(np.std(theta[members], ddof=1))
-    return bool(scatter > float(np.median(sd[members])))
+def _members(problem: Problem, name: str) -> NDArray[np.int64]:
+    """Places of a parameter's values in the runs."""
+    wanted = {schema.by_run(name, run) for run in problem.runs}
+    members = np.array([k for k, own in enumerate(problem.names) if own in wanted], dtype=np.int64)
+    if members.size == 0:
+        raise InputError(
+            "this parameter has no value of each run's own",
+            key="between_runs",
+            value=name,
+            hint="declare it with by_run=True",
+        )
+    if members.size < 3:
+        raise InputError(
+            "a scatter between runs needs three of them",
+            key="between_runs",
+            value=name,
+            hint="leave it common to all runs",
+        )
+    return members

@@ -10,7 +10,9 @@ from bayesoleo.posterior.samples import Samples
 Array = NDArray[np.float64]
 
 
-def choose_draws(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]:
+def choose_draws(
+    samples: Samples, size: int, *, seed: int, run: str | None = None
+) -> tuple[Array, Array]:
     """Pick draws at random, none twice.
 
     Parameters
@@ -21,6 +23,8 @@ def choose_draws(samples: Samples, size: int, *, seed: int) -> tuple[Array, Arra
         How many; all of them if there are fewer.
     seed : int
         Seeds the choice.
+    run : str, optional
+        Whose variances to take where the errors have one of each run's own.
 
     Returns
     -------
@@ -30,7 +34,7 @@ def choose_draws(samples: Samples, size: int, *, seed: int) -> tuple[Array, Arra
         Error variances of the outputs, in squared units.
     """
     theta = samples.theta.reshape(-1, samples.theta.shape[-1])
-    log_variance = samples.log_variance.reshape(len(theta), -1)
+    log_variance = samples.log_variance_of(run).reshape(len(theta), -1)
     rng = np.random.default_rng(seed)
     picks = rng.choice(len(theta), size=min(size, len(theta)), replace=False)
     return theta[picks], np.exp(log_variance[picks])

@@ -50,6 +50,9 @@ class Samples:
         Whether the effective size asked for was reached and the ensembles agree.
     warning : str
         What was not reached; empty otherwise.
+    branch_jumps : int
+        Solutions of runs, warm-up included, that left the branch of the one they started from.
+        Where there are any, the density may be that of several answers of the model to one input.
     """
 
     names: tuple[str, ...]
@@ -68,6 +71,7 @@ class Samples:
     failures: dict[str, int]
     reached: bool
     warning: str
+    branch_jumps: int = 0
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -90,3 +94,10 @@ class Samples:
         names = self.names[len(self.parameters) :]
         count = sum(name.startswith(LOG_VARIANCE) and not name.endswith("]") for name in names)
         return self.of_errors[:, :, :count]
+
+    def log_variance_of(self, run: str | None) -> Array:
+        """The same of a run, where the error model has variances of each run's own."""
+        end = f"[{run}]"
+        pairs = enumerate(self.names)
+        own = [k for k, n in pairs if n.startswith(LOG_VARIANCE) and n.endswith(end)]
+        return self.draws[:, :, own] if own else self.log_variance

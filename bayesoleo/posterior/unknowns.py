@@ -23,6 +23,9 @@ STEP = 0.25
 class Unknowns(ABC):
     """Map of ``p`` coordinates to the ``l`` unknowns of a problem, with their prior."""
 
+    #: Parameters that scatter between runs.
+    scattering: tuple[str, ...] = ()
+
     @property
     @abstractmethod
     def names(self) -> tuple[str, ...]:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from bayesoleo import schema
 from bayesoleo.data import Campaign
 from bayesoleo.estimation import to_dataset
-from bayesoleo.posterior import Samples, choose_draws, to_datasets
+from bayesoleo.posterior import LogDensity, Samples, choose_draws, to_datasets
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fit import Fit
-from bayesoleo.tracing.holdout import Prediction
+from bayesoleo.tracing.holdout import Prediction, predict_fitted
 from bayesoleo.tracing.loop import ClosedLoop
 from bayesoleo.tracing.rounds import Ranked, Round
 from bayesoleo.tracing.state import State
@@ -89,22 +89,45 @@ def _units(fit: Fit) -> list[str]:
     ]
 
 
-def posterior_groups(fit: Fit, samples: Samples, seed: int) -> dict[str, xr.Dataset]:
-    """The groups posterior, prior, sample_stats and log_likelihood."""
+def posterior_groups(
+    fit: Fit, samples: Samples, seed: int, density: LogDensity | None = None
+) -> dict[str, xr.Dataset]:
+    """The groups posterior, prior, sample_stats, log_likelihood and log_prior."""
     units = dict(zip(fit.problem.names, _units(fit), strict=True))
     units |= {name: fit.model.outputs[name].unit for name in fit.predictor.outputs}
-    return to_datasets(samples, fit.problem.priors, units=units, seed=seed)
+    scattering = [] if density is None else density.unknowns.scattering
+    for name in scattering:
+        unit = fit.model.parameters[name].unit
+        support = fit.problem.priors[fit.problem.names.index(f"{name}[{samples.runs[0]}]")].support
+        units[schema.population_mean(name)] = unit
+        # With a bound the spread is that of a logarithm.
+        units[schema.spread(name)] = "1" if np.isfinite(support).any() else unit
+    groups = to_datasets(samples, fit.problem.priors, units=units, seed=seed, density=density)
+    groups[schema.POSTERIOR].attrs[schema.BETWEEN_RUNS] = json.dumps(list(scattering))
+    return groups
+
+
+def predictive_groups(fit: Fit, samples: Samples, seed: int) -> dict[str, xr.Dataset]:
+    """The groups prediction and posterior_predictive of the fitted runs."""
+    found = predict_fitted(fit)
+    return {
+        schema.PREDICTION: _predictions([("before", fit, found)]),
+        schema.POSTERIOR_PREDICTIVE: _predictive(fit, found, samples, seed),
+    }
 
 
 def loop_groups(loop: ClosedLoop, samples: Samples | None, seed: int) -> dict[str, xr.Dataset]:
     """The groups prediction, residual, discovery and posterior_predictive."""
     groups = {
-        schema.PREDICTION: _predictions(loop),
+        schema.PREDICTION: _predictions(
+            [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
+        ),
         schema.RESIDUAL: _residuals(loop),
         schema.DISCOVERY: _discovery(loop.rounds),
     }
     if samples is not None:
-        groups[schema.POSTERIOR_PREDICTIVE] = _predictive(loop.final, samples, seed)
+        final = loop.final
+        groups[schema.POSTERIOR_PREDICTIVE] = _predictive(final.fit, ordered(final), samples, seed)
     return groups
 
 
@@ -135,16 +158,15 @@ def _stages(loop: ClosedLoop) -> list[tuple[str, State]]:
     )
 
 
-def _predictions(loop: ClosedLoop) -> xr.Dataset:
+def _predictions(stages: Sequence[tuple[str, Fit, list[Prediction]]]) -> xr.Dataset:
     data = {}
-    for stage, state in _stages(loop):
-        found = ordered(state)
-        for b, output in enumerate(state.fit.predictor.outputs):
-            unit = state.fit.model.outputs[output].unit
+    for stage, fit, found in stages:
+        for b, output in enumerate(fit.predictor.outputs):
+            unit = fit.model.outputs[output].unit
             data[f"{output}_{stage}"] = _padded(
                 [p.y[b] for p in found], (schema.RUN, schema.SAMPLE), unit, f"predicted {output}"
             )
-    return xr.Dataset(data, coords={schema.RUN: [p.record.label for p in ordered(loop.first)]})
+    return xr.Dataset(data, coords={schema.RUN: [p.record.label for p in stages[0][2]]})
 
 
 def _residuals(loop: ClosedLoop) -> xr.Dataset:
@@ -288,19 +310,20 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
     }
 
 
-def _predictive(state: State, samples: Samples, seed: int) -> xr.Dataset:
+def _predictive(fit: Fit, found: Sequence[Prediction], samples: Samples, seed: int) -> xr.Dataset:
     """Draws of the outputs over one period, noise included."""
-    theta, variance = choose_draws(samples, PREDICTIVE_DRAWS, seed=seed)
+    theta, _ = choose_draws(samples, PREDICTIVE_DRAWS, seed=seed)
     rng = np.random.default_rng(seed)
     names = dict(zip(samples.parameters, theta.T, strict=True))
-    found = ordered(state)
-    outputs = state.fit.predictor.outputs
+    outputs = fit.predictor.outputs
     values = np.full((len(outputs), theta.shape[0], len(found), PHASES), np.nan)
     for r, prediction in enumerate(found):
         vectors = np.zeros((theta.shape[0], len(prediction.theta)))
         for k, (name, value) in enumerate(prediction.theta.items()):
             vectors[:, k] = names.get(name, value)
         y = _on_phases(prediction, vectors)
+        label = prediction.record.label
+        _, variance = choose_draws(samples, PREDICTIVE_DRAWS, seed=seed, run=label)
         noise = rng.standard_normal(y.shape) * np.sqrt(variance)[:, :, None]
         values[:, :, r] = np.moveaxis(y + noise, 1, 0)
     data = {
@@ -308,7 +331,7 @@ def _predictive(state: State, samples: Samples, seed: int) -> xr.Dataset:
             (schema.CHAIN, schema.DRAW, schema.RUN, schema.PHASE),
             values[b][None],
             {
-                schema.UNITS: state.fit.model.outputs[output].unit,
+                schema.UNITS: fit.model.outputs[output].unit,
                 schema.LONG_NAME: f"predicted {output}",
             },
         )

@@ -1,0 +1,146 @@
+"""From a fitted model to the density that is sampled: its error model, and what scatters between
+runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from bayesoleo import schema
+from bayesoleo.errors import ModelError
+from bayesoleo.model import Model
+from bayesoleo.posterior import LogDensity, Mixture
+from bayesoleo.posterior.error_models import ERROR_MODELS, check_word
+from bayesoleo.posterior.hierarchy import hierarchical
+from bayesoleo.posterior.laplace import Mode, find_mode, mixture_of, start_coordinates
+from bayesoleo.tracing.fit import Fit
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What is assumed of errors and of runs.
+
+    Parameters
+    ----------
+    error_model : str
+        One of :data:`~bayesoleo.posterior.error_models.ERROR_MODELS`.
+    between_runs : tuple of str
+        Parameters that scatter between runs about a mean that is estimated.
+
+    Raises
+    ------
+    InputError
+        If there is no such error model.
+    """
+
+    error_model: str = ERROR_MODELS[0]
+    between_runs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_word(self.error_model)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the estimate's own objective is what is sampled (Verbeek 1993, eq. 2.29)."""
+        return self.error_model == ERROR_MODELS[0] and not self.between_runs
+
+    def declare(self, model: Model) -> Model:
+        """The model with a value of each run's own for what scatters between runs.
+
+        Raises
+        ------
+        ModelError
+            If it has no such parameter, or it is not estimated.
+        """
+        estimated = model.estimated()
+        for name in self.between_runs:
+            if name not in estimated:
+                raise ModelError(
+                    f"model {model.name!r} does not estimate this parameter",
+                    key="between_runs",
+                    value=name,
+                    hint=f"choose from {', '.join(estimated)}",
+                )
+        chosen = {name: replace(model.parameters[name], by_run=True) for name in self.between_runs}
+        return model.with_parameters(**chosen) if chosen else model
+
+    def density(self, fit: Fit, jobs: int | None = None) -> LogDensity:
+        """The log posterior density of a fitted model; the solver starts from the estimate."""
+        problem, point = fit.problem, fit.point
+        problem.freeze(point.theta)
+        unknowns = None
+        if self.between_runs:
+            # How well the runs by themselves know their values: without the prior.
+            variances = np.diag(point.covariance_likelihood)
+            sd = np.sqrt(np.where(variances > 0, variances, np.inf))
+            unknowns = hierarchical(problem, self.between_runs, theta=point.theta, sd=sd)
+        return LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
+
+
+def mode_of(density: LogDensity, theta: Array) -> Mode:
+    """The mode next to a parameter vector."""
+    return find_mode(density, start_coordinates(density, theta))
+
+
+def mixture_at(density: LogDensity, theta: Array) -> Mixture:
+    """Where walkers start."""
+    return mixture_of([mode_of(density, theta)])
+
+
+def at_mode(fit: Fit, density: LogDensity, mode: Mode, word: str) -> Fit:
+    """The fit with its point at the mode of a density under another error model."""
+    block, eta = (part[0] for part in density.split(mode.centre[None]))
+    theta = density.unknowns.theta(block[None])[0]
+    jacobian = density.unknowns.jacobian(block)
+    size = len(block)
+    covariance = jacobian @ mode.covariance[:size, :size] @ jacobian.T
+    variance = np.exp(eta[: len(fit.problem.outputs)])
+    point = replace(
+        fit.point,
+        theta=theta,
+        covariance=covariance,
+        variance=variance,
+        error_covariance=np.diag(variance),
+        status=mode.status,
+        objective_name=word,
+    )
+    fit.problem.freeze(theta)
+    predictions = fit.problem.predictor.predict(fit.problem.full(theta[None])[0])
+    return replace(fit, point=point, predictions=predictions)
+
+
+def mode_group(density: LogDensity, mode: Mode, word: str) -> xr.Dataset:
+    """The group ``error_model``: the mode of all that is not a parameter of the model."""
+    names = density.names
+    first = len(density.problem.names)
+    natural = density.natural(mode.centre[None])[0]
+    sd = np.sqrt(np.diag(mode.covariance))
+    # By differences of one standard deviation either way: exact where a quantity is a coordinate.
+    steps = np.diag(sd)
+    ends = density.natural(np.concatenate([mode.centre + steps, mode.centre - steps]))
+    own = np.arange(len(names))
+    half = 0.5 * np.abs(ends[own, own] - ends[len(names) + own, own])
+    return xr.Dataset(
+        {
+            schema.ESTIMATE: (schema.QUANTITY, natural[first:], _about("posterior mode")),
+            schema.SD: (schema.QUANTITY, half[first:], _about("standard deviation at the mode")),
+        },
+        coords={schema.QUANTITY: list(names[first:])},
+        attrs={"word": word},
+    )
+
+
+def _about(text: str) -> dict[str, str]:
+    return {schema.LONG_NAME: text, schema.UNITS: "unit of each quantity"}
+
+
+def names_of(words: str | Sequence[str]) -> tuple[str, ...]:
+    """Names from a list, or from text with commas between them."""
+    parts = words.split(",") if isinstance(words, str) else list(words)
+    return tuple(part.strip() for part in parts if part.strip())
