@@ -219,7 +219,7 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
             f"{status['scheme']} with {status['steps']} steps in a period: half as long, they would"
             f" move no parameter by more than {status['mesh_shift']:.2g} sd"
         )
-    return lines
+    return lines + json.loads(status["notes"])
 
 
 def sample(

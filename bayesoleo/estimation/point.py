@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -108,6 +108,13 @@ class PointEstimate:
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])
+
+    def following(self, first: PointEstimate | None) -> PointEstimate:
+        """The same, with the jumps on the way of the estimate that it was polished from."""
+        if first is None or first.stability is None or self.stability is None:
+            return self
+        jumps = self.stability.jumps + first.stability.jumps
+        return replace(self, stability=self.stability.with_jumps(jumps))
 
     def __str__(self) -> str:
         from bayesoleo.estimation.table import as_text

@@ -54,6 +54,7 @@ def to_dataset(
     if units is not None and len(units) != len(point.names):
         raise InputError("units must have one entry per parameter", key="units", value=list(units))
     stages = [point] if mbe is None else [mbe, point]
+    point = point.following(mbe)
     answers = {} if point.stability is None else _stability(point.stability)
     dataset = xr.Dataset(
         {**_parameters(point, mbe, units), **_spread(point), **_history(stages), **answers},
@@ -72,7 +73,8 @@ def to_dataset(
         "evaluations": sum(stage.evaluations for stage in stages),
         "failures": json.dumps(added(stage.failures for stage in stages)),
         "on_limit": ", ".join(point.on_limit),
-        "branch_jumps": sum(stage.branch_jumps for stage in stages),
+        "branch_jumps": point.branch_jumps,
+        "notes": json.dumps(point.notes, ensure_ascii=False),
     }
     if point.stability is not None:
         dataset = dataset.assign_coords(

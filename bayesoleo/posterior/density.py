@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Misfit, Problem
+from bayesoleo.estimation.problem import Misfit, Problem, jumps_of
 from bayesoleo.estimation.residuals import ResidualProblem
 from bayesoleo.parallel import thread_map
 from bayesoleo.posterior.error_models import ErrorModel, error_model
@@ -130,6 +130,11 @@ class LogDensity:
             np.ascontiguousarray(phi[:, : self._size]),
             np.ascontiguousarray(phi[:, self._size :]),
         )
+
+    @property
+    def branch_jumps(self) -> int:
+        """Solutions of runs so far that left the branch of the one they started from."""
+        return int(jumps_of(self.problem).sum())
 
     def natural(self, phi: Array) -> Array:
         """All quantities in their units, from coordinates, both of shape (W, p + m)."""

@@ -41,6 +41,8 @@ class Segment:
         Rows of density zero by reason.
     proposed, accepted : collections.Counter
         Proposals by kind of move.
+    branch_jumps : int
+        Solutions of runs that left the branch of the one they started from.
     """
 
     phase: Phase
@@ -53,6 +55,7 @@ class Segment:
     failures: Counter[str] = field(default_factory=Counter)
     proposed: Counter[str] = field(default_factory=Counter)
     accepted: Counter[str] = field(default_factory=Counter)
+    branch_jumps: int = 0
 
     @property
     def draws(self) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -131,6 +132,19 @@ class Stability:
     def with_jumps(self, jumps: NDArray[np.int64]) -> Stability:
         """The same solutions after so many jumps."""
         return replace(self, jumps=jumps)
+
+    def as_plain(self) -> dict[str, dict[str, Any]]:
+        """By run, in what JSON knows: multipliers as real and imaginary part; None if unknown."""
+        return {
+            run: {
+                "multipliers": [[float(m.real), float(m.imag)] for m in row] if count >= 0 else [],
+                "stable": bool(count == 0) if count >= 0 else None,
+                "branch_jumps": int(jumps),
+            }
+            for run, row, count, jumps in zip(
+                self.runs, self.multipliers, self.unstable, self.jumps, strict=True
+            )
+        }
 
     def together(self, other: Stability) -> Stability:
         """These runs and others, of one model."""

@@ -65,6 +65,7 @@ def _content(tree: xr.DataTree) -> dict[str, Any]:
         "error_by_role": tables.error_by_role(summary, units),
         "error_by_run": tables.error_by_run(summary, units),
         "remainder": sentences.remainder(summary),
+        "stability": sentences.stability(summary),
         "records": tables.records(tree),
         "rounds": list(_rounds(tree, summary)),
         "parameters": tables.parameters(summary),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from bayesoleo import schema
 from bayesoleo.plots.rankings import format_p, name
 from bayesoleo.plots.units import Scale
@@ -68,6 +70,30 @@ def reason(entry: Mapping[str, Any]) -> str:
     ids = {str(entry["accepted"])}
     ids |= {str(c[key]) for c in entry["candidates"] for key in ("effect", "target")}
     return f"{text if first in ids or '_' in first else text[0].upper() + text[1:]}."
+
+
+def stability(summary: Mapping[str, Any]) -> str:
+    """Whether the periodic solutions are such that a rig can stay on; empty if there are none."""
+    known = {
+        run: max(np.hypot(*pair) for pair in entry["multipliers"])
+        for run, entry in summary.get("stability", {}).items()
+        if entry["multipliers"]
+    }
+    if not known:
+        return ""
+    largest = max(known, key=lambda run: known[run])
+    end = f"largest Floquet multiplier {format_short(known[largest])}, in {largest}"
+    lost = [run for run in known if not summary["stability"][run]["stable"]]
+    jumps = summary["branch_jumps"]["estimate"]
+    text = (
+        f"The periodic solution of {', '.join(lost)} is unstable"
+        if lost
+        else f"The periodic solutions of all {len(known)} runs are stable"
+        if len(known) > 1
+        else "The periodic solution is stable"
+    )
+    went = f" Solutions changed branch or stability {jumps} times on the way." if jumps else ""
+    return f"{text}; {end}.{went}"
 
 
 def remainder(summary: Mapping[str, Any]) -> list[str]:

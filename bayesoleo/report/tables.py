@@ -29,6 +29,7 @@ DIAGNOSTICS = {
     "effective_sample_size": "effective sample size",
     "rhat_nested": "nested R̂ over ensembles",
     "evaluations": "evaluations of the posterior",
+    "branch_jumps": "solutions that left the estimate's branch",
     "reached": "effective size asked for reached",
 }
 BY_PARAMETER = {
@@ -267,7 +268,8 @@ def point_status(tree: xr.DataTree) -> Table | None:
     attributes = dict(tree[schema.POINT].attrs)
     if attributes.get("status_message") == attributes.get("status"):
         attributes.pop("status_message", None)
-    plain = {key: value for key, value in attributes.items() if key != "failures"}
+    elsewhere = ("failures", "notes")
+    plain = {key: value for key, value in attributes.items() if key not in elsewhere}
     rows = [[str(key).replace("_", " "), _plain(value)] for key, value in plain.items()]
     rows += _failures(attributes)
     return Table(["point estimate", ""], [row for row in rows if row[1]])

@@ -38,11 +38,20 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             console.print(_accepted(number, entry))
     for line in sentences.remainder(summary):
         console.print(Text(line, style="dim"))
+    for line in _warnings(summary):
+        console.print(Text(line, style="yellow"))
     files = summary.get("files", {})
     if files:
         console.print()
     for what, path in files.items():
         console.print(Text.assemble((f"{what:<10}", "dim"), path), soft_wrap=True)
+
+
+def _warnings(summary: Mapping[str, Any]) -> list[str]:
+    """What is said of stability where not all is well."""
+    runs = summary.get("stability", {}).values()
+    bad = any(run["stable"] is False or run["branch_jumps"] for run in runs)
+    return [sentences.stability(summary)] if bad else []
 
 
 def _errors(summary: Mapping[str, Any]) -> RichTable:

@@ -15,6 +15,7 @@ from bayesoleo.estimation.nuisance import with_held
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor, RunPrediction
 from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.schemes import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
@@ -94,6 +95,11 @@ class Fit:
     def records(self) -> tuple[Record, ...]:
         """The fitted runs."""
         return self.predictor.records
+
+    @property
+    def stability(self) -> Stability | None:
+        """Of the fitted runs' periodic solutions, jumps on the way to both points included."""
+        return self.point.following(self.mbe).stability
 
     @property
     def values(self) -> dict[str, float]:

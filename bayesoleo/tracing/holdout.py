@@ -54,13 +54,16 @@ class Prediction:
 def predict_fitted(fit: Fit) -> list[Prediction]:
     """Predictions of the runs that were fitted."""
     found = []
-    for run, record in zip(fit.predictions, fit.records, strict=True):
+    for run, solved in zip(fit.predictions, fit.predictor.runs, strict=True):
+        record = solved.record
         mine = {
             name: v
             for name, v in fit.values.items()
             if name in fit.model.parameters or name.endswith(f"[{record.label}]")
         }
         predictor = _single(fit, record)
+        if record.periodic:  # stay on the branch of the fit
+            predictor.runs[0].anchor = solved.anchor
         prediction = Prediction(record, run.y, mine, 0, run.status, predictor)
         predictor.set_anchor(prediction.vector)
         found.append(prediction)

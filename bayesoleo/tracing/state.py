@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesoleo.prediction.stability import Stability
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.errors_table import ErrorTable, error_table
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
@@ -45,6 +46,19 @@ class State:
         held = {entry.run for entry in self.hold_errors.entries}
         rest = tuple(entry for entry in self.fit_errors.entries if entry.run not in held)
         return ErrorTable((*rest, *self.hold_errors.entries))
+
+    @property
+    def stability(self) -> Stability | None:
+        """Of the periodic solutions of fitted and held-out runs; None where there are none."""
+        known = self.fit.stability
+        if known is None:
+            return None
+        # Where runs are held out in turn, all of them are fitted as well.
+        runs = {p.record.label: p.predictor.runs[0] for p in self.held_out}
+        runs = {label: run for label, run in runs.items() if label not in known.runs}
+        matrices = [run.anchor.monodromy if run.anchor else None for run in runs.values()]
+        jumps = np.array([run.jumps for run in runs.values()], dtype=np.int64)
+        return known.together(Stability.of(tuple(runs), matrices, jumps))
 
     @property
     def by_role(self) -> dict[str, dict[str, dict[str, float]]]:

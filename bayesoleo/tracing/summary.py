@@ -33,7 +33,7 @@ def summarise(
     dict
         Checked against the schema.
     """
-    final = loop.final
+    final, stability = loop.final, loop.final.stability
     summary = {
         **about,
         "rounds": [_round(item) for item in loop.rounds],
@@ -46,7 +46,17 @@ def summarise(
         "hold_out": loop.roles.description,
         "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
         "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
-        "notes": [*loop.notes, *_input_noise_notes(final), *_sampler_notes(samples)],
+        "stability": {} if stability is None else stability.as_plain(),
+        "branch_jumps": {
+            "estimate": 0 if stability is None else stability.branch_jumps,
+            "posterior": None if samples is None else samples.branch_jumps,
+        },
+        "notes": [
+            *loop.notes,
+            *([] if stability is None else stability.notes()),
+            *_input_noise_notes(final),
+            *_sampler_notes(samples),
+        ],
     }
     clean = _finite(summary)
     schema.validate_summary(clean)
@@ -122,7 +132,15 @@ def _input_noise_notes(state: State) -> list[str]:
 
 
 def _sampler_notes(samples: Samples | None) -> list[str]:
-    return [f"sampler: {samples.warning}"] if samples is not None and samples.warning else []
+    if samples is None:
+        return []
+    notes = [f"sampler: {samples.warning}"] if samples.warning else []
+    if samples.branch_jumps:
+        notes.append(
+            f"sampler: {samples.branch_jumps} solutions of runs left the branch of the estimate, in"
+            f" {samples.evaluations} evaluations: the posterior mixes several answers of the model"
+        )
+    return notes
 
 
 def _finite(value: Any) -> Any:

@@ -1,0 +1,49 @@
+"""Solutions that left their branch are counted through segments, restarts and the stored groups."""
+
+from __future__ import annotations
+
+import numpy as np
+from kill_target import run
+from posterior_targets import Gaussian
+
+from bayesoleo.model.priors import Normal
+from bayesoleo.posterior import LogDensity, to_datasets
+
+
+class Jumping(Gaussian):
+    """Says of every row beyond two that its solution left the branch."""
+
+    def __init__(self) -> None:
+        super().__init__(np.ones(2))
+        self.branch_jumps = 0
+
+    def __call__(self, phi):
+        self.branch_jumps += int(np.sum(phi[:, 0] > 2.0))
+        return super().__call__(phi)
+
+
+def test_jumps_are_counted_and_outlive_a_restart(tmp_path):
+    target = Jumping()
+    first = run(target, tmp_path)
+    assert first.branch_jumps == target.branch_jumps > 0
+    again = Jumping()
+    assert run(again, tmp_path).branch_jumps == first.branch_jumps
+    assert again.branch_jumps == 0
+    groups = to_datasets(first, (Normal(0, 1), Normal(0, 1)))
+    assert groups["sample_stats"].attrs["branch_jumps"] == first.branch_jumps
+
+
+def test_a_density_that_counts_none_has_none():
+    assert run(Gaussian(np.ones(2)), None).branch_jumps == 0
+
+
+class Solved:
+    """A problem whose runs have solutions, some of which jumped."""
+
+    names, outputs, runs = ("x",), ("y",), ("a", "b")
+    priors, counts = (Normal(0.0, 1.0),), np.ones((2, 1), dtype=np.int64)
+    branch_jumps = np.array([2, 1])
+
+
+def test_the_log_density_takes_the_count_from_its_problem():
+    assert LogDensity(Solved()).branch_jumps == 3
