@@ -130,6 +130,19 @@ def test_a_cubic_spring_missing_in_an_oscillator_is_found_first(tmp_path):
     for name, true in {"cubic_stiffness": HARDENING, "stiffness": SPRING, "damping": DRAG}.items():
         k = names.index(name)
         assert abs(loop.final.fit.point.theta[k] - true) < 4 * loop.final.fit.point.sd[k]
+    summary = summarise(loop, None, ABOUT)
+    assert summary["branch_jumps"] == {"estimate": 0, "posterior": None}
+    damping, mass = loop.final.fit.point["damping"], 1.0
+    for record in loop.roles.fitted:
+        entry = summary["stability"][record.label]
+        assert entry["stable"] is True
+        values = np.array(entry["multipliers"]) @ [1, 1j]
+        # Abel, Jacobi and Liouville: the damping is linear whatever the spring.
+        expected = np.exp(-damping / mass / record.frequency)
+        assert np.prod(values).real == pytest.approx(expected, rel=1e-5)
+    assert set(summary["stability"]) == {
+        r.label for r in (*loop.roles.fitted, *loop.roles.held_out)
+    }
 
 
 def test_two_effects_are_found_one_after_the_other(tmp_path):
