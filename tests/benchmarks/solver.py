@@ -1,181 +1,143 @@
-"""Speed and accuracy of the periodic solver, as ratios taken in one run.
+"""Speed, accuracy and success of the periodic solvers, as ratios taken in one run.
 
-Run as ``python tests/benchmarks/solver.py [--json]``. The campaign is found through
-``BAYESOLEO_DATA``. ``solve_us`` and ``log_density_ms`` are wall time with all cores, best of
-several repetitions; what fails counts beside it in ``failures``.
+Run as ``python tests/benchmarks/solver.py [--json] [--only PART ...]``. The campaign is found
+through ``BAYESOLEO_DATA``. What fails counts in keys that end in ``failures``; errors are of the
+stroke over its amplitude, against shooting at 1e-12. ``solve_us``, ``default_solve_us`` and
+``log_density_ms`` are wall time with all cores, best of several, and so are CasADi's and Diffrax's;
+those ending in ``cpu_us`` and SciPy's are one thread's CPU time.
+
+==============  ====================================================================================
+``headline``    time per solve and error: backward differences with n = 800, and the default scheme
+``density``     one log density of the campaign
+``equal``       both schemes at errors of 1e-5 and 1e-8
+``scaling``     exponents of the cost
+``scipy``       LSODA until the motion repeats (right-hand side in Python, and compiled), solve_bvp
+``peers``       CasADi's collocation of the same equations, shooting by Diffrax
+``shooting``    shooting against discretisation at equal error
+``end_stop``    the adaptive mesh on the stiffest end stop
+``resources``   memory, a new model, the import
+==============  ====================================================================================
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable
+from functools import cached_property
 
-import numpy as np
-from scipy.integrate import solve_ivp
+import equal_error
+import other_codes
+import peers
+import resources
+import shooting
+import solves
+from cases import Case, campaign, cases
 
-from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
-from bayesoleo.model import driven_by
-from bayesoleo.parallel import available_cores, thread_map
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.periodic import solve_periodic
-from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.parallel import available_cores
+from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.simulate import RunPlan, motion
 from bayesoleo.systems import system
 
-#: Parameter vectors in a batch, and their relative distance from the anchor.
-BATCH, SPREAD = 32, 0.01
+#: Verbeek (1993), section 4.3.3, at the stiffest stop, from 60 periods of LSODA at rtol 1e-9.
+END_STOP = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
+STIFFEST, STATE = 1e11, (0.8155908, 1.2154198)
+#: One run of each group of the campaign: high, middle, low.
+REPRESENTATIVE = "dim"
 
 
-def best(function: Callable[[], object], repetitions: int = 7) -> float:
-    """Shortest wall time of several repetitions, s."""
-    times = []
-    for _ in range(repetitions):
-        begin = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - begin)
-    return min(times)
+class Benchmark:
+    """The campaign's figures; what several parts need is made once."""
 
+    def __init__(self) -> None:
+        self.model = system("f16n2d1")
 
-def batch(predictor: Predictor, count: int = BATCH) -> np.ndarray:
-    """Parameter vectors around the anchor at the nominal one, shape (count, l)."""
-    nominal = predictor.layout.start(predictor.model)
-    predictor.set_anchor(nominal)
-    noise = np.random.default_rng(1993).standard_normal((count, nominal.size))
-    return nominal * (1.0 + SPREAD * noise)
+    @cached_property
+    def records(self) -> list:
+        return campaign()
 
+    @cached_property
+    def cases(self) -> list[Case]:
+        return cases(self.model, self.records)
 
-def solves(predictor: Predictor, theta: np.ndarray, runs: int | None = None) -> tuple[float, int]:
-    """Time of a solve, s, and number of failures, over runs and vectors from the anchors."""
-    chosen = range(len(predictor.runs))[:runs]
-    constants = [predictor.constants(theta, r) for r in chosen]
-    failed = np.zeros(len(chosen), dtype=int)
+    @cached_property
+    def solve_times(self) -> dict[str, float]:
+        return solves.headline(self.model, self.records)
 
-    def one(r: int) -> None:
-        run, p = predictor.runs[r], constants[r]
-        start = run.anchor.predict(p[:, run.active] - run.anchor.p[run.active])
-        failed[r] = np.count_nonzero(solve_periodic(run.boundary, p, start).status)
+    def headline(self) -> dict[str, float]:
+        return self.solve_times | solves.accuracy(self.model, self.cases)
 
-    seconds = best(lambda: thread_map(one, chosen))
-    return seconds / (len(chosen) * len(theta)), int(failed.sum())
+    def density(self) -> dict[str, float]:
+        return solves.log_density(self.records)
 
+    def equal(self) -> dict[str, float]:
+        chosen = [case for case in self.cases if case.record.label in REPRESENTATIVE]
+        return equal_error.measure(self.model, chosen)
 
-def exponent(sizes: list[int], seconds: list[float]) -> float:
-    """Slope of total time against size on logarithmic scales."""
-    return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
+    def scaling(self) -> dict[str, float]:
+        return solves.scaling(self.model, self.records)
 
+    def scipy(self) -> dict[str, float]:
+        """Ratios to backward differences, and to the default scheme, which errs about as little."""
+        found = other_codes.measure(self.model, self.cases)
+        for name in other_codes.NAMES:
+            found[f"{name}_ratio"] = 1e3 * found[f"{name}_ms"] / self.solve_times["solve_us"]
+            by_default = 1e3 * found[f"{name}_ms"] / self.solve_times["default_solve_us"]
+            found[f"{name}_ratio_default"] = by_default
+        return found
 
-def scaling(records: list, model) -> dict[str, float]:
-    """Exponents of time in steps, runs and parameter vectors."""
-    by_steps, sizes = [], [400, 800, 1600, 3200]
-    for n in sizes:
-        predictor = Predictor(model, records[:4], steps=n, scheme="thesis")
-        by_steps.append(solves(predictor, batch(predictor))[0])
-    predictor = Predictor(model, records, steps=800, scheme="thesis")
-    theta = batch(predictor, 128)
-    runs, vectors = [2, 4, 8, 14], [16, 32, 64, 128]
-    return {
-        "exponent_n": exponent(sizes, by_steps),
-        "exponent_runs": exponent(runs, [r * solves(predictor, theta[:32], r)[0] for r in runs]),
-        "exponent_vectors": exponent(
-            vectors, [v * solves(predictor, theta[:v])[0] for v in vectors]
-        ),
-    }
+    def peers(self) -> dict[str, float]:
+        found = peers.measure(self.model, self.cases)
+        for name in ("casadi", "diffrax"):
+            if f"{name}_ms" in found:
+                ratio = 1e3 * found[f"{name}_ms"] / self.solve_times["default_solve_us"]
+                found[f"{name}_ratio"] = ratio
+        return found
 
+    def shooting(self) -> dict[str, float]:
+        return {f"shooting_{key}" if key != "shooting_ratio" else key: value
+                for key, value in shooting.measure().items()}  # fmt: skip
 
-def integrated(predictor: Predictor, r: int) -> float:
-    """Seconds in which LSODA settles on a run's orbit, from rest, until it repeats to 1e-6."""
-    run = predictor.runs[r]
-    harmonics = run.record.harmonics
-    rows = run.kernels.derived.inputs
+    def end_stop(self) -> dict[str, float]:
+        """Errors of position and velocity at phase zero."""
+        answer = periodic_answer(
+            system("end_stop"), END_STOP, {"stop_stiffness": STIFFEST}, stiffness="stop_stiffness"
+        )
+        errors = abs(answer.orbit.states[0] - STATE)
+        return {
+            "end_stop_error_1e11": float(errors[0]),
+            "end_stop_velocity_error_1e11": float(errors[1]),
+            "end_stop_steps": answer.orbit.states.shape[0],
+            "end_stop_failures": int(not answer.orbit.status.ok),
+        }
 
-    def inputs(t: np.ndarray) -> np.ndarray:
-        phase = np.atleast_1d(t) / run.period
-        return np.stack([harmonics[name].evaluate(phase, 1 / run.period, k) for name, k in rows])
+    def resources(self) -> dict[str, float]:
+        return resources.new_model() | resources.peak_memory()
 
-    p = predictor.constants(predictor.layout.start(predictor.model)[None], r)[0]
-    derived = run.kernels.derived
-    space = StateSpace(run.kernels, derived.orders, inputs, len(derived.active))
-    rates = space.right_side(p)
-    start = run.guess(p)[0, 0]
-    orders = derived.orders
-    s = start[: sum(orders)].copy()  # the default scheme's unknowns begin with the state
-    begin = time.perf_counter()
-    for period in range(60):
-        span = (period * run.period, (period + 1) * run.period)
-        end = solve_ivp(rates, span, s, method="LSODA", rtol=1e-6, atol=1e-9).y[:, -1]
-        change = np.max(np.abs(end - s) / np.maximum(np.abs(end), 1e-3))
-        s = end
-        if change < 1e-6:
-            break
-    return time.perf_counter() - begin
-
-
-NEW_MODEL = """
-import json, sys, time
-from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
-begin = time.perf_counter()
-model = Model("new", inputs={"force": "N"}, dofs={"q": Dof("m")},
-    parameters={"damping": Parameter(0.3, sd=0.1), "cubic": Parameter(0.7, sd=0.1)},
-    equations={"q": {"all": "ddot(q) + damping*dot(q) + q + cubic*q**3 - force"}},
-    outputs={"displacement": Output("q", "m")})
-simulate_run(model, RunPlan("a", 0.2, {"force": motion(0.1, [1.0])}), backend="numba")
-print(time.perf_counter() - begin)
-"""
-
-
-def new_model() -> dict[str, float]:
-    """Declaration to first solve in two processes with one cache, and the import."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"BAYESOLEO_CACHE": folder}
-
-        def run(code: str) -> float:
-            command = [sys.executable, "-c", code]
-            done = subprocess.run(
-                command, env=environment, check=True, capture_output=True, text=True
-            )
-            return float(done.stdout.splitlines()[-1])
-
-        first, second = run(NEW_MODEL), run(NEW_MODEL)
-    imports = "import time; t = time.perf_counter(); import bayesoleo"
-    imports += "; print(time.perf_counter() - t)"
-    return {"new_model_s": first, "new_model_cached_s": second, "import_s": run(imports)}
-
-
-def measure() -> dict[str, float]:
-    """All figures."""
-    records = list(reduce_campaign(load_campaign(dataset_folder("shaker-plain"))).records)
-    model = system("f16n2d1")
-    result: dict[str, float] = {"cores": available_cores()}
-    predictor = Predictor(model, records, steps=800, scheme="thesis")
-    seconds, failures = solves(predictor, batch(predictor))
-    result |= {"solve_us": seconds * 1e6, "failures": failures}
-    default = Predictor(model, records, steps=256)
-    seconds, failures = solves(default, batch(default))
-    result |= {"default_solve_us": seconds * 1e6, "default_failures": failures}
-    driven = Predictor(driven_by(system("f16n2d2"), "displacement"), records, steps=256)
-    theta = batch(driven)
-    total = best(lambda: driven.sum_of_squares(theta))
-    result["log_density_ms"] = total / len(theta) * 1e3
-    result |= scaling(records, model)
-    result["lsoda_ratio"] = integrated(default, 3) / (result["solve_us"] * 1e-6)
-    return result | new_model()
+    @property
+    def parts(self) -> dict[str, Callable[[], dict[str, float]]]:
+        """All parts by name, the ones first that other work in this process would slow down."""
+        names = ("headline", "density", "scaling", "equal", "shooting", "end_stop", "resources")
+        return {name: getattr(self, name) for name in (*names, "scipy", "peers")}
 
 
 def main() -> None:
+    parts = Benchmark().parts
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="one flat object")
-    result = measure() if parser.parse_args().json else None
-    if result is not None:
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), metavar="PART",
+                        help=f"of {', '.join(parts)}")  # fmt: skip
+    asked = parser.parse_args()
+    result: dict[str, float] = {"cores": available_cores()}
+    for name in asked.only:
+        found = parts[name]()
+        result |= found
+        if not asked.json:
+            print(name, flush=True)
+            for key, value in found.items():
+                print(f"    {key:45s} {value:.4g}", flush=True)
+    if asked.json:
         print(json.dumps(result))
-        return
-    for key, value in measure().items():
-        print(f"{key:22s} {value:.4g}")
 
 
 if __name__ == "__main__":
