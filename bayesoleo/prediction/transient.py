@@ -104,7 +104,9 @@ class TransientRun(RunPredictor):
     def _inputs(self, time: Array) -> Array:
         if time.size == 1 and all(name in self.record.smoothed for name, _ in self._input_names):
             now, known = float(time[0]), self.record.smoothed
-            return np.array([[known[name].at_once(now, k)] for name, k in self._input_names])
+            rows = [known[name].at_once(now, k) for name, k in self._input_names]
+            # A column also where a model has no input.
+            return np.array(rows, dtype=float).reshape(-1, 1)
         return input_rows(self.record, self.kernels.derived.inputs, time / self.period)
 
     def _adopt(self, mesh: Mesh) -> None:
