@@ -112,6 +112,12 @@ class AdaptiveSolution:
         found = Solution(self.level.x[None], zero, zero)
         return sensitivities(self.level.boundary, self.p[None], found)[1][0]
 
+    def motion_by_parameter(self, phase: Array) -> Array:
+        """Derivatives of :meth:`motion` by the active parameters, shape (nz, na, N)."""
+        n = self.level.x.shape[0]
+        plan, step = self.level.scheme.plan(phase, n), self.level.boundary.step(n)
+        return self.level.scheme.sample(self.sensitivities()[None], plan, step)[0]
+
 
 def solve_adaptive(
     problem: PeriodicProblem,

@@ -109,9 +109,10 @@ class _Switching:
             own = switched(self.switches, z[lane], u, p[lane])
             self.equations.jacobian(z, own, p, np.array([lane]), *out)
 
-    @property
-    def parameters(self) -> Callable[..., Any]:
-        return self.equations.parameters
+    def parameters(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
+        for lane in lanes:
+            own = switched(self.switches, z[lane], u, p[lane])
+            self.equations.parameters(z, own, p, np.array([lane]), *out)
 
     @property
     def admissible(self) -> Callable[..., Any]:
@@ -198,17 +199,25 @@ class Level:
 
 def kinks_of(problem: PeriodicProblem, level: Level, p: Array) -> Crossings | None:
     """Where along a motion the equations switch."""
+    found = crossings_of(problem, level.motion, level.mesh, p)
+    # Edges that were moved there are where they should be; found again, they scatter by round-off.
+    same = found is not None and level.kinks is not None and level.kinks.alike(found)
+    return level.kinks if same else found
+
+
+def crossings_of(
+    problem: PeriodicProblem, motion: Motion, mesh: Mesh, p: Array
+) -> Crossings | None:
+    """The same of any motion, looked for in the steps of a mesh; None where nothing switches."""
     switches = problem.switches
     if switches is None:
         return None
 
     def values(phase: Array) -> Array:
-        z, u = level.motion(phase), problem.inputs_at(phase)
+        z, u = motion(phase), problem.inputs_at(phase)
         return switches.values(z, switched(switches, z, u, p), p)
 
-    found = find_crossings(values, level.mesh)
-    # Edges that were moved there are where they should be; found again, they scatter by round-off.
-    return level.kinks if level.kinks is not None and level.kinks.alike(found) else found
+    return find_crossings(values, mesh)
 
 
 def state_rows(orders: tuple[int, ...]) -> list[int]:
