@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from bayesoleo.effects import force_effect as force_effect
     from bayesoleo.errors import BayesoleoError as BayesoleoError
     from bayesoleo.errors import InputError as InputError
+    from bayesoleo.forecast import predict as predict
     from bayesoleo.model import Condition as Condition
     from bayesoleo.model import Dof as Dof
     from bayesoleo.model import LogNormal as LogNormal
@@ -58,6 +59,7 @@ _HOMES = {
     "data": ("Campaign", "load_campaign", "write_campaign"),
     "effects": ("Effect", "catalogue", "find_effect", "force_effect"),
     "errors": ("BayesoleoError", "InputError"),
+    "forecast": ("predict",),
     "model": (
         "Condition",
         "Dof",

@@ -1,4 +1,5 @@
-"""How good an estimate is: ``assess`` tests its residuals, ``replicate`` repeats its experiment."""
+"""How good an estimate is: ``assess`` tests its residuals, ``predict`` scores what it foresees,
+``replicate`` repeats its experiment."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ PANEL = "How good an estimate is"
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    shell.add(app, PANEL, assess, replicate)
+    shell.add(app, PANEL, assess, predict, replicate)
 
 
 def assess(
@@ -117,6 +118,87 @@ def _draw(data: xr.Dataset, drawn: list[Series], figure: Path) -> None:
         figures = {output: plots.assessment(data, output) for output in outputs}
     for output, made in figures.items():
         made.savefig(figure.with_stem(f"{figure.stem}-{output}"))
+
+
+def predict(
+    results: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULTS.nc",
+            show_default=False,
+            help="results.nc of estimate, sample or close.",
+        ),
+    ],
+    campaign: options.CampaignPath,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            "-m",
+            metavar="MODEL",
+            show_default="that of the result",
+            help="Another model with parameters of the same names, e.g. the specimen on another "
+            "rig. A file is code, and is run.",
+        ),
+    ] = None,
+    runs: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,…", show_default="all", help="Labels of the runs."),
+    ] = None,
+    draws: Annotated[int, typer.Option(min=2, metavar="N", help="Draws of the parameters.")] = 200,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            "--figure",
+            metavar="FILE.png",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw bands and transforms; one file an output, its name added.",
+        ),
+    ] = None,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    as_json: options.Json = False,
+) -> None:
+    """Predict runs that were not used, with intervals, and score the prediction.
+
+    Parameters are drawn from the posterior of the result, or from the normal distribution about its
+    estimate; what it does not know, such as a constant held to a tolerance, from its prior. "rms"
+    is what came, "expected" what the prediction thought would; the part of the samples within the
+    interval, and the distance of their probability integral transform from uniform, say whether the
+    prediction knew how good it was.
+
+    \b
+    Examples:
+      bayesoleo predict point/results.nc shaker --runs c,h
+      bayesoleo predict point/results.nc drops --model drop.py:model --figure drops.png
+    """
+    from bayesoleo import plots, workflow
+    from bayesoleo.forecast import predict as foresee
+    from bayesoleo.modelfile import load_model
+    from bayesoleo.storage import read_tree
+
+    if figure is not None:
+        shell.check_writable(figure.parent)
+    labels = None if runs is None else [label.strip() for label in runs.split(",")]
+    found = foresee(
+        read_tree(results),
+        workflow.reduce(campaign, jobs=jobs),
+        model=None if model is None else load_model(model),
+        runs=labels,
+        draws=draws,
+        seed=seed,
+        jobs=jobs,
+    )
+    if as_json:
+        numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
+        shell.print_json(tables.plain(numbers.drop_vars(schema.TIME).to_dict()))
+    else:
+        shell.console().print(str(found), markup=False, soft_wrap=True)
+    if figure is not None:
+        for output in found.data[schema.OUTPUT].values:
+            path = figure.with_stem(f"{figure.stem}-{output}")
+            plots.forecast(found.data, str(output)).savefig(path)
 
 
 def replicate(

@@ -8,6 +8,7 @@ from bayesoleo.plots.assessments import assessment
 from bayesoleo.plots.corners import corner
 from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
+from bayesoleo.plots.forecasts import forecast
 from bayesoleo.plots.forest import point_against_posterior
 from bayesoleo.plots.period_search import period_search
 from bayesoleo.plots.predictions import predictive
@@ -28,6 +29,7 @@ __all__ = [
     "engineering",
     "error",
     "fit",
+    "forecast",
     "format_unit",
     "format_value",
     "indifference",

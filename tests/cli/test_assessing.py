@@ -58,3 +58,19 @@ def test_half_the_frequency_is_warned_of(run, campaign):
     assert "warning: run fast: the motion repeats 2 times" in result.stderr
     assert "write frequency = 2" in result.stderr
     assert len(json.loads(run("reduce", campaign, "--json").stdout)["findings"]) == 1
+
+
+def test_unused_run_is_predicted_and_scored(run, campaign, model, tmp_path):
+    out = tmp_path / "point"
+    result = run("estimate", campaign, "--model", model, "--out", out, "--quiet", "--jobs", 1)
+    assert result.exit_code == 0, result.output
+    arguments = ["predict", out / "results.nc", campaign, "--runs", "fast", "--jobs", 1]
+    result = run(*arguments, "--figure", tmp_path / "bands.png")
+    assert result.exit_code == 0, result.output
+    assert "within 95 %" in result.stdout
+    assert (tmp_path / "bands-displacement.png").stat().st_size > 10_000
+    numbers = json.loads(run(*arguments, "--json").stdout)["data_vars"]
+    assert numbers["coverage"]["data"][0][0] == pytest.approx(0.95, abs=0.03)
+    refused = run(*arguments[:-3], "slaw")
+    assert refused.exit_code == 2
+    assert "no such run" in refused.stderr

@@ -1,0 +1,328 @@
+"""Predict runs that were not used, from a result with all of its uncertainty, and score it.
+
+Unknowns come as draws: of the posterior where the result holds one, else of the normal distribution
+about the estimate. What the result does not know, a by-run parameter of a new run or a constant
+known to a tolerance, is drawn from its prior. Noise of a sample is added to the interval.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo import schema
+from bayesoleo.assessment import Score, score_draws
+from bayesoleo.data import ReducedCampaign
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.nuisance import uncertain_conditions
+from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.model import Model
+from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction.records import Record
+from bayesoleo.simulation import model_of, parameter_sets
+from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.status import Status, count, counted
+
+Array = NDArray[np.float64]
+
+#: Steps of the mesh in a period, and points of one at which the band is kept.
+STEPS, POINTS = 512, 200
+#: Bins of the probability integral transform.
+BINS = 20
+_NUMBERS = {
+    "rms": ("root mean square of what was measured less the mean of the prediction", True),
+    "bias": ("mean of it", True),
+    "expected_rms": ("root mean square that the prediction expects", True),
+    "log_score": ("mean log density of a sample, higher is better", False),
+    "coverage": ("part of the samples inside the interval", False),
+    "pit_distance": ("distance of the probability integral transform from uniform", False),
+}
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a result knows, as draws.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        The estimate.
+    draws : mapping of str to ndarray, shape (m,)
+        Of each unknown; together they are joint draws.
+    sd : mapping of str to ndarray, shape (m,)
+        Standard deviation of an output's errors, one for each draw.
+    """
+
+    values: Mapping[str, float]
+    draws: Mapping[str, Array]
+    sd: Mapping[str, Array]
+
+
+def predict(
+    tree: xr.DataTree,
+    campaign: ReducedCampaign,
+    *,
+    model: Model | None = None,
+    runs: Sequence[str] | None = None,
+    draws: int = 200,
+    level: float = 0.95,
+    seed: int = 0,
+    scheme: str = DEFAULT_SCHEME,
+    steps: int = STEPS,
+    jobs: int | None = None,
+) -> Shown:
+    """Predict runs from a result and hold the prediction against what was measured.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Of ``estimate``, ``sample`` or ``close``.
+    campaign : ReducedCampaign
+        With the runs to be predicted, which need not be those that were fitted.
+    model : Model, optional
+        Another model with parameters of the same names, for example the oleo in a drop test; by
+        default the result's own.
+    runs : sequence of str, optional
+        Labels; by default all.
+    draws : int, optional
+        Number of draws.
+    level : float, optional
+        Of the intervals.
+    seed : int, optional
+    scheme, steps
+        Discretisation.
+    jobs : int, optional
+        Threads.
+
+    Returns
+    -------
+    Shown
+        By ``(output, run)``: ``rms``, ``bias``, ``expected_rms``, ``log_score``, ``coverage``,
+        ``pit_distance``; ``failed(run)``, the draws without a solution, which are left out;
+        ``pit(output, run, bin)``, a histogram that is flat where the prediction is calibrated;
+        ``time(run, point)``, and ``mean``, ``low``, ``high`` and ``measured``
+        ``(output, run, point)`` over the first period, or the whole of a transient.
+
+    Raises
+    ------
+    InputError
+        If there is no such run, or a run cannot be predicted.
+
+    References
+    ----------
+    Gneiting and Raftery (2007); Dawid (1984); Verbeek (1993), section 6.4 (drop tests).
+    """
+    if not 0 < level < 1 or draws < 2:
+        raise InputError(
+            "level must lie between 0 and 1, draws be two or more", value=(level, draws)
+        )
+    rng = np.random.default_rng(seed)
+    known = draws_of(tree, draws, rng)
+    used = model_of(tree) if model is None else model
+    used = used.freeing(*used.uncertain())
+    chosen = campaign.records if runs is None else [campaign.record(label) for label in runs]
+    records = uncertain_conditions(used).complete(chosen)
+    found = [_one_run(used, record, known, rng, level, scheme, steps, jobs) for record in records]
+    data = _dataset(used, records, found)
+    data.attrs = {"level": level, "draws": draws, "model": used.name}
+    return Shown(data, forecast_text(data))
+
+
+def draws_of(tree: xr.DataTree, number: int, rng: np.random.Generator) -> Known:
+    """Joint draws of what a result knows.
+
+    Parameters
+    ----------
+    tree : DataTree
+    number : int
+        Of draws.
+    rng : numpy.random.Generator
+    """
+    (values,) = parameter_sets(tree, None, 0)
+    point = tree[schema.POINT].to_dataset()
+    outputs = [str(name) for name in point[schema.OUTPUT].values]
+    if schema.POSTERIOR not in tree.children:
+        mean, covariance = point[schema.ESTIMATE].values, point[schema.COVARIANCE].values
+        # In units of the standard deviations: parameters differ by ten orders of magnitude.
+        unit = np.sqrt(np.diag(covariance))
+        root = np.linalg.cholesky(covariance / np.outer(unit, unit))
+        table = mean + unit * (rng.standard_normal((number, mean.size)) @ root.T)
+        sd = np.sqrt(point[schema.VARIANCE].values)
+        return Known(
+            values,
+            dict(zip(values, table.T, strict=True)),
+            {name: np.full(number, s) for name, s in zip(outputs, sd, strict=True)},
+        )
+    posterior = tree[schema.POSTERIOR].to_dataset()
+    flat = {str(name): draws.values.ravel() for name, draws in posterior.data_vars.items()}
+    size = len(next(iter(flat.values())))
+    chosen = rng.choice(size, size=number, replace=number > size)
+    sds: dict[str, Array] = {}
+    for name, variance in zip(outputs, point[schema.VARIANCE].values, strict=True):
+        log_variance = flat.get(schema.log_variance(name))
+        if log_variance is None:
+            sds[name] = np.full(number, np.sqrt(variance))
+        else:
+            sds[name] = np.exp(0.5 * log_variance[chosen])
+    return Known(values, {name: flat[name][chosen] for name in values if name in flat}, sds)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run's prediction: draws at the samples, and its score by output."""
+
+    mean: Array
+    spread: Array
+    low: Array
+    high: Array
+    scores: Sequence[Score]
+    failed: Mapping[str, int]
+
+
+def _one_run(
+    model: Model,
+    record: Record,
+    known: Known,
+    rng: np.random.Generator,
+    level: float,
+    scheme: str,
+    steps: int,
+    jobs: int | None,
+) -> _Run:
+    predictor = Predictor(model, [record], steps=steps, scheme=scheme, jobs=jobs)
+    names, priors = predictor.layout.names, predictor.layout.priors(model)
+    number = len(next(iter(known.sd.values())))
+    theta = np.array(
+        [known.values.get(n, v) for n, v in zip(names, predictor.layout.start(model), strict=True)]
+    )
+    (status,) = predictor.set_anchor(theta)
+    if not status.ok:
+        raise InputError(
+            f"cannot be predicted at the estimate: {status.message}",
+            run=record.label,
+            hint="leave it out with runs=",
+        )
+    table = np.column_stack(
+        [
+            known.draws[n] if n in known.draws else prior.sample(rng, number)
+            for n, prior in zip(names, priors, strict=True)
+        ]
+    )
+    found = predictor.simulate(table, 0)
+    good = found.status == Status.CONVERGED.value
+    if good.sum() < 2:
+        raise InputError(
+            "hardly any draw of the parameters can be solved", run=record.label,
+            value=count(found.status), hint="narrow the estimate, or leave the run out",
+        )  # fmt: skip
+    y = found.y[good]
+    noise = np.stack([_sd_of(name, known, record)[good] for name in predictor.outputs], axis=1)
+    mean = y.mean(axis=0)
+    spread = np.sqrt(y.var(axis=0) + np.mean(noise**2, axis=0)[:, None])
+    half = stats.norm.isf(0.5 * (1 - level)) * spread
+    scores = [
+        score_draws(record.samples[name], y[:, b], noise[:, b, None], level=level)
+        for b, name in enumerate(predictor.outputs)
+    ]
+    failed = {key: n for key, n in count(found.status).items() if key != "converged"}
+    return _Run(mean, spread, mean - half, mean + half, scores, failed)
+
+
+def _sd_of(output: str, known: Known, record: Record) -> Array:
+    """Noise of an output; of one that was not fitted, what the record itself shows."""
+    number = len(next(iter(known.sd.values())))
+    return known.sd.get(output, np.full(number, record.signal_noise.get(output, 0.0)))
+
+
+def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> xr.Dataset:
+    outputs = list(model.outputs)
+    grid, each = (schema.OUTPUT, schema.RUN), (schema.OUTPUT, schema.RUN, "point")
+    tables = {key: np.full((len(outputs), len(records)), np.nan) for key in _NUMBERS}
+    pit = np.zeros((len(outputs), len(records), BINS))
+    bands = {
+        key: np.full((len(outputs), len(records), POINTS), np.nan)
+        for key in ("mean", "low", "high", "measured")
+    }
+    time = np.full((len(records), POINTS), np.nan)
+    for r, (record, run) in enumerate(zip(records, found, strict=True)):
+        shown = _shown(record)
+        time[r, : shown.size] = record.time[shown] - record.time[0]
+        for b, name in enumerate(outputs):
+            error, score = record.samples[name] - run.mean[b], run.scores[b]
+            numbers = {
+                "rms": np.sqrt(np.mean(error**2)),
+                "bias": error.mean(),
+                "expected_rms": np.sqrt(np.mean(run.spread[b] ** 2)),
+                "log_score": score.log_score,
+                "coverage": score.coverage,
+                "pit_distance": score.distance,
+            }
+            for key, value in numbers.items():
+                tables[key][b, r] = value
+            pit[b, r] = np.histogram(score.pit, BINS, (0.0, 1.0), density=True)[0]
+            lines = {"mean": run.mean, "low": run.low, "high": run.high}
+            for key, line in lines.items():
+                bands[key][b, r, : shown.size] = line[b, shown]
+            bands["measured"][b, r, : shown.size] = record.samples[name][shown]
+    units = np.array([model.outputs[name].unit for name in outputs], dtype=object)
+    own = "output's SI unit"
+    failed = np.array([json.dumps(run.failed) for run in found], dtype=object)
+    return xr.Dataset(
+        {
+            **{
+                key: _variable(grid, tables[key], text, own if in_unit else "1")
+                for key, (text, in_unit) in _NUMBERS.items()
+            },
+            "pit": _variable((*grid, "bin"), pit, "density of the transform", "1"),
+            **{key: _variable(each, band, key, own) for key, band in bands.items()},
+            schema.TIME: _variable((schema.RUN, "point"), time, "time since the first sample", "s"),
+            "failed": ((schema.RUN,), failed),
+            schema.UNIT: ((schema.OUTPUT,), units),
+        },
+        coords={
+            schema.OUTPUT: outputs,
+            schema.RUN: [record.label for record in records],
+            "bin": (np.arange(BINS) + 0.5) / BINS,
+        },
+    )
+
+
+def _shown(record: Record) -> NDArray[np.int64]:
+    """Samples of the first span, thinned out."""
+    first = int(np.searchsorted(record.position, 1.0 + 1e-9))
+    return np.unique(np.linspace(0, first - 1, min(first, POINTS)).round().astype(np.int64))
+
+
+def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+
+
+def forecast_text(data: xr.Dataset) -> str:
+    """One line for each output of each run.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        Of :func:`predict`.
+    """
+    level = f"{100 * float(data.attrs['level']):.3g} %"
+    head = ["output", "run", "rms", "expected", "bias", "log score", f"within {level}", "PIT off"]
+    rows = []
+    for output in data[schema.OUTPUT].values:
+        for run in data[schema.RUN].values:
+            one = {key: float(data[key].sel(output=output, run=run)) for key in _NUMBERS}
+            cells = [f"{one[key]:.3g}" for key in ("rms", "expected_rms", "bias", "log_score")]
+            cells += [f"{100 * one['coverage']:.1f} %", f"{one['pit_distance']:.3f}"]
+            rows.append([str(output), str(run), *cells])
+    lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
+    for run in data[schema.RUN].values:
+        failed = json.loads(str(data["failed"].sel(run=run).values))
+        if failed:
+            lines.append(f"run {run}: draws left out: {counted(failed)}")
+    return "\n".join(lines)
