@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import carray
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BLOCK, call_kernel, caller, pointer
@@ -44,7 +45,13 @@ LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
-#: At least one more than a state has components.
+#: Steps with old derivatives, half as expensive, before there are new ones.
+MOST_CHORDS = 2
+#: Contraction that is none.
+SLOW_CHORD = 0.1
+#: What the steps that are not taken would add up to.
+CHORD_LEFT = 1e-14
+#: At least as many as a state has components.
 COLUMNS = 8
 WITHOUT_SIGN = np.int64(2**63 - 1)
 #: Fewer steps than that leave chunks empty.
@@ -64,11 +71,11 @@ class Sizes(NamedTuple):
     unknowns: int
     state: int
     new: int
+    window: int
     front: int
     stages: int
     block: int
     transfer: int
-    keep: int
     measured: int
 
 
@@ -109,17 +116,21 @@ class Layout:
 class Pieces(NamedTuple):
     """Addresses of the compiled functions of a model and of a scheme."""
 
+    residual: int
     jacobian: int
     admissible: int
     rows: int
     measure: int
     eliminate: int
     chain: int
+    substitute: int
+    follow: int
     update: int
 
 
 _call_rows, _call_measure = caller(SIGNATURES["rows"]), caller(SIGNATURES["measure"])
 _call_eliminate, _call_chain = caller(SIGNATURES["eliminate"]), caller(SIGNATURES["chain"])
+_call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
 _call_update = caller(SIGNATURES["update"])
 
 
@@ -150,6 +161,7 @@ class Work(NamedTuple):
     history: Any
     start: Any
     products: Any
+    inverse: Any
     measures: Any
     before: Any
     constants: Any
@@ -160,7 +172,7 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
     positions, w, D, d = sweep.source.size, sizes.unknowns, sizes.state, sizes.d
     rows = max(d * (1 + sizes.nz), sizes.conditions)
     blocks = sweep.inputs.shape[0]
-    length = (blocks * sizes.block // WIDTH + 1) * sizes.new + D
+    length = (blocks * sizes.block // WIDTH + 1) * sizes.new + sizes.window
     history = np.zeros((length, D + 1, WIDTH))
     history[sweep.order, np.arange(D)] = 1.0  # a chunk's first state, in terms of itself
     return Work(
@@ -173,10 +185,11 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
         out=np.zeros((rows, BLOCK)),
         sums=np.zeros((2 * d, BLOCK)),
         scratch=np.zeros(1),
-        transfer=np.zeros((blocks if sizes.keep else 1, sizes.transfer * sizes.block)),
+        transfer=np.zeros((blocks, sizes.transfer * sizes.block)),
         history=history,
         start=np.zeros((D, WIDTH)),
         products=np.zeros((2, D, COLUMNS)),
+        inverse=np.zeros((D, D)),
         measures=np.zeros(2 * d),
         before=np.zeros(2 * d),
         constants=np.zeros(max(sizes.constants, 1)),
@@ -210,30 +223,72 @@ def solve_lanes(pieces, sizes, sweep, work, options, p, x, status, iterations):
 
 @jit
 def _iterate(pieces, sizes, sweep, work, options):
-    """Newton's method from ``work.now``; returns how it ended and the number of iterations."""
-    outcome = _evaluate(pieces, sizes, sweep, work)
-    if outcome != CONVERGED:
-        return outcome, 0
-    last = np.inf
-    for iteration in range(1, options.max_iterations + 1):
+    """Newton's method from ``work.now``; returns how it ended and the number of steps."""
+    outcome, iteration = _evaluate(pieces, sizes, sweep, work), 0
+    last, chords = np.inf, True
+    while outcome == CONVERGED and iteration < options.max_iterations:
+        iteration += 1
         outcome = _step(pieces, sizes, sweep, work, options.initial)
         if outcome != CONVERGED:
             return outcome, iteration
         size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
         if not size < np.inf:
             return SINGULAR, iteration
-        ratio = size / last if last < np.inf else 1.0
-        if size < SMALL_STEP or (ratio < 0.1 and size < LAST_STEP):
+        if size < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
             _take(work.now, work.dx, 1.0, work.now)
             return CONVERGED, iteration
+        if chords and last < np.inf and _chord_suffices(size, last):
+            _keep(work.now, work.base)
+            steps, last = _chords(pieces, sizes, sweep, work, options, size)
+            iteration += steps
+            if last == 0.0:
+                return CONVERGED, iteration
+            chords = last < size
+            if not chords:
+                _keep(work.base, work.now)
+            outcome = _evaluate(pieces, sizes, sweep, work)
+            continue
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
-        if outcome != CONVERGED:
-            return outcome, iteration
         last = size if fraction == 1.0 else np.inf
         # A linear problem is solved by its first step.
-        if merit < 1e-14 and iteration > 1:
+        if outcome == CONVERGED and merit < 1e-14 and iteration > 1:
             return CONVERGED, iteration
-    return NO_CONVERGENCE, options.max_iterations
+    return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
+
+
+@jit
+def _chords(pieces, sizes, sweep, work, options, size):
+    """Take the step, and further ones with the same derivatives and closure.
+
+    Returns their number and the last one's size: zero where they converged, infinite where they did
+    not contract.
+    """
+    last = size
+    for count in range(1, MOST_CHORDS + 1):
+        _take(work.now, work.dx, 1.0, work.now)
+        if not _evaluate_again(pieces, sizes, sweep, work):
+            return count, np.inf
+        _start(sizes, sweep, work, options.initial)
+        _update(pieces.update, sizes, sweep, work)
+        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        if not size < SLOW_CHORD * last:
+            return count, np.inf
+        # What is left is a geometric series, twice as steep as seen where the first of the two
+        # steps was one of Newton's.
+        if size < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
+            _take(work.now, work.dx, 1.0, work.now)
+            return count, 0.0
+        last = size
+    return MOST_CHORDS, last
+
+
+@jit
+def _chord_suffices(size, last):
+    """Whether one more step with these derivatives leaves round-off, if Newton's error is squared:
+    ``k size**2`` with ``k = size / last**2``, which old derivatives contract by ``2 k size``.
+    """
+    ratio = size / last
+    return 2.0 * size * ratio**4 < CHORD_LEFT
 
 
 @jit
@@ -261,10 +316,15 @@ def _advance(pieces, sizes, sweep, work, monotone, size):
 
 @jit
 def _keep(source, target):
-    """Copy. Rows are cut out beforehand: where an index may be negative, so that the compiler has
-    to wrap it around, there are no vector instructions."""
-    source, target = source.reshape(source.size), target.reshape(target.size)
-    for i in range(source.size):
+    _copy(pointer(source, 0), pointer(target, 0), source.size)
+
+
+@jit
+def _copy(source, target, count):
+    """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
+    count references; and indices that may be negative allow no vector instructions."""
+    source, target = carray(source, (count,)), carray(target, (count,))
+    for i in range(count):
         target[i] = source[i]
 
 
@@ -279,8 +339,9 @@ def _take(base, dx, fraction, now):
 @jit
 def _step(pieces, sizes, sweep, work, initial):
     """The Newton step at all positions, from the recursion of the last evaluation."""
-    outcome = _close(sizes, sweep, work, initial)
+    outcome = CONVERGED if initial else _close(sizes, sweep, work)
     if outcome == CONVERGED:
+        _start(sizes, sweep, work, initial)
         _update(pieces.update, sizes, sweep, work)
     return outcome
 
@@ -297,8 +358,8 @@ def _evaluate(pieces, sizes, sweep, work):
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         for k in range(sizes.unknowns):
-            begin, reach = b * steps, steps + (sizes.front + 1) * WIDTH
-            _keep(work.now[k, begin : begin + reach], work.x_block[k, :reach])
+            at, reach = k * work.now.shape[1] + b * steps, steps + (sizes.front + 1) * WIDTH
+            _copy(pointer(work.now, at), pointer(work.x_block, k * REACH), reach)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
         _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
@@ -308,7 +369,7 @@ def _evaluate(pieces, sizes, sweep, work):
         if b == u.shape[0] - 1:
             _silence(sizes, sweep.lengths, b, count, work.z, work.out)
         _call_measure(pieces.measure, (z, out, sums, points))
-        transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
         bad += _call_eliminate(pieces.eliminate, (out, x, length, transfer, count))
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
         _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
@@ -324,12 +385,39 @@ def _evaluate(pieces, sizes, sweep, work):
 
 
 @jit
+def _evaluate_again(pieces, sizes, sweep, work):
+    """Equations alone at the present unknowns, solved with the last derivatives; whether the
+    unknowns are admissible."""
+    steps, stages = sizes.block, sizes.stages
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out = pointer(work.z, 0), pointer(work.out, 0)
+    outside = 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        for k in range(sizes.unknowns):
+            at, reach = k * work.now.shape[1] + b * steps, steps + (sizes.front + 1) * WIDTH
+            _copy(pointer(work.now, at), pointer(work.x_block, k * REACH), reach)
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        _call_rows(pieces.rows, (x, length, z, steps))
+        if sizes.conditions > 0:
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
+            outside += _outside(work.out, sizes, count)
+        call_kernel(pieces.residual, (z, inputs, p, out, points))
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        _call_substitute(pieces.substitute, (out, x, length, transfer, count))
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
+    return outside == 0
+
+
+@jit
 def _outside(a, sizes, count):
     """How many points break a condition; one that is not a number shows in the equations."""
     outside = 0
     for k in range(sizes.conditions):
         for stage in range(sizes.stages):
-            values = a[k, stage * sizes.block :]
+            values = carray(pointer(a, k * BLOCK + stage * sizes.block), (count,))
             for i in range(count):
                 outside += values[i] <= 0.0
     return outside
@@ -354,45 +442,29 @@ def _silence(sizes, lengths, b, count, z, out):
 
 
 @jit
-def _close(sizes, sweep, work, initial):
-    """First state of every chunk from the closure of the period, or from zero."""
-    D, start = sizes.state, work.start
-    if initial:
-        start[:, 0] = 0.0
-    else:
-        product = _product(D, sizes.new, sweep, work)
-        closure, right = np.empty((D, D)), np.empty((D, 1))
-        growth = 0.0
-        for i in range(D):
-            largest, size = 0.0, 1.0
-            for k in range(D):
-                closure[i, k] = (1.0 if i == k else 0.0) - product[i, k]
-                largest = max(largest, abs(closure[i, k]))
-                size += abs(product[i, k])
-            growth = max(growth, size)
-            right[i, 0] = product[i, D]
-            if not largest > ROUND_OFF * size:
-                return SINGULAR
-        if growth > LARGEST_GROWTH:
-            return NEEDS_EXCHANGE
-        if not eliminate(closure, right, ROUND_OFF):
+def _close(sizes, sweep, work):
+    """Invert the closure of the period, from the recursion's matrices alone."""
+    D, inverse = sizes.state, work.inverse
+    product = _product(D, sizes.new, sweep, work)
+    closure, growth = np.empty((D, D)), 0.0
+    for i in range(D):
+        largest, size = 0.0, 1.0
+        for k in range(D):
+            inverse[i, k] = 1.0 if i == k else 0.0
+            closure[i, k] = inverse[i, k] - product[i, k]
+            largest = max(largest, abs(closure[i, k]))
+            size += abs(product[i, k])
+        growth = max(growth, size)
+        if not largest > ROUND_OFF * size:
             return SINGULAR
-        for i in range(D):
-            start[i, 0] = right[i, 0]
-    for c in range(WIDTH - 1):
-        first = sweep.lengths[c] * sizes.new
-        for i in range(D):
-            row = work.history[first + sweep.order[i]]
-            value = row[D, c]
-            for o in range(D):
-                value += row[o, c] * start[o, c]
-            start[i, c + 1] = value
-    return CONVERGED
+    if growth > LARGEST_GROWTH:
+        return NEEDS_EXCHANGE
+    return CONVERGED if eliminate(closure, inverse, ROUND_OFF) else SINGULAR
 
 
 @jit
 def _product(D, new, sweep, work):
-    """The recursion from the period's start to its end: matrix and, in column ``D``, the constant.
+    """Matrix of the recursion from the period's start to its end.
 
     All :data:`COLUMNS` are computed, needed or not: a loop of known length becomes one instruction.
     """
@@ -403,16 +475,47 @@ def _product(D, new, sweep, work):
     for c in range(WIDTH):
         first = sweep.lengths[c] * new
         for i in range(D):
-            row, target = work.history[first + sweep.order[i]], following[i]
+            at = first + sweep.order[i]
             for k in range(COLUMNS):
-                target[k] = 0.0
+                following[i, k] = 0.0
             for o in range(D):
-                factor, old = row[o, c], product[o]
+                factor = work.history[at, o, c]
                 for k in range(COLUMNS):
-                    target[k] += factor * old[k]
-            target[D] += row[D, c]
+                    following[i, k] += factor * product[o, k]
         product, following = following, product
     return product
+
+
+@jit
+def _start(sizes, sweep, work, initial):
+    """First state of every chunk: that of the period from its closure, or zero."""
+    D, start, end = sizes.state, work.start, work.products[0, 0]
+    start[:, 0] = 0.0
+    if not initial:
+        _pass(sizes, sweep, work, end)
+        for i in range(D):
+            value = 0.0
+            for k in range(D):
+                value += work.inverse[i, k] * end[k]
+            start[i, 0] = value
+    _pass(sizes, sweep, work, end)
+
+
+@jit
+def _pass(sizes, sweep, work, end):
+    """States at the ends of the chunks, from the first one's start."""
+    D, start = sizes.state, work.start
+    for c in range(WIDTH):
+        first = sweep.lengths[c] * sizes.new
+        for i in range(D):
+            at = first + sweep.order[i]
+            value = work.history[at, D, c]
+            for o in range(D):
+                value += work.history[at, o, c] * start[o, c]
+            if c + 1 < WIDTH:
+                start[i, c + 1] = value
+            else:
+                end[i] = value
 
 
 @jit
@@ -423,12 +526,13 @@ def _update(update, sizes, sweep, work):
     start, to = pointer(work.start, 0), pointer(work.dx_block, 0)
     for b in range(sweep.inputs.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
-        transfer = pointer(work.transfer, (b if sizes.keep else 0) * work.transfer.shape[1])
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
         _call_update(update, (transfer, history, start, to, count // WIDTH, WIDTH))
         begin = sizes.front * WIDTH + b * steps
         for k in range(sizes.unknowns):
-            _keep(work.dx_block[k, :count], dx[k, begin : begin + count])
+            at = k * dx.shape[1] + begin
+            _copy(pointer(work.dx_block, k * BLOCK), pointer(dx, at), count)
     for k in range(sizes.unknowns):
         for i in range(sizes.front * WIDTH):
             dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
@@ -537,10 +641,10 @@ class Arranged:
             unknowns=program.unknowns,
             state=program.state,
             new=program.new,
+            window=program.window,
             front=program.front,
             stages=program.stages,
             block=program.steps,
             transfer=program.transfer,
-            keep=int(program.stages > 1),
             measured=min(sum(program.orders), program.unknowns),
         )

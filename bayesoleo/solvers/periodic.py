@@ -28,6 +28,8 @@ class Equations(Protocol):
     """What a solver needs of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
 
     @property
+    def residual(self) -> Any: ...
+    @property
     def jacobian(self) -> Any: ...
     @property
     def parameters(self) -> Callable[..., Any]: ...
@@ -189,8 +191,9 @@ def _compiled(
     iterations = np.zeros(x.shape[0], dtype=np.int64)
     sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
     pieces = newton.Pieces(
-        equations.jacobian.address, equations.admissible.address, program.rows, program.measure,
-        program.eliminate, program.chain, program.update,
+        equations.residual.address, equations.jacobian.address, equations.admissible.address,
+        program.rows, program.measure, program.eliminate, program.chain, program.substitute,
+        program.follow, program.update,
     )  # fmt: skip
     sweep = arranged.sweep
     newton.solve_lanes(

@@ -36,6 +36,8 @@ SIGNATURES = {
     "measure": types.void(_P, _P, _P, _I),
     "eliminate": _I(_P, _P, _P, _P, _I),
     "chain": types.void(_P, _P, _I, _I),
+    "substitute": types.void(_P, _P, _P, _P, _I),
+    "follow": types.void(_P, _P, _I, _I),
     "update": types.void(_P, _P, _P, _P, _I, _I),
 }
 
@@ -55,30 +57,38 @@ class Program:
         were too small.
     chain : int
         ``(transfer, history, rows, width)``: runs the recursion of all chunks through the block.
+    substitute : int
+        ``(out, x, h, transfer, count)``: other equations' constants, by the last elimination.
+    follow : int
+        As ``chain``, for constants only.
     update : int
         ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
         states.
     orders : tuple of int
         Order of each dof.
-    stages, unknowns, state, new, front : int
+    stages, unknowns, state, new, window, front : int
         Points of a step; unknowns of a step; size of the recursion's state; how many of its
-        components a step makes anew; rows of steps before a block that it looks at.
+        components a step makes anew; among how many of the history they stand; rows of steps before
+        a block that it looks at.
     order : tuple of int
         Where in the history the components of the state stand.
     transfer : int
-        Rows of a block's transfer.
+        Rows of a block's transfer, and of the factors behind it.
     """
 
     rows: int
     measure: int
     eliminate: int
     chain: int
+    substitute: int
+    follow: int
     update: int
     orders: tuple[int, ...]
     stages: int
     unknowns: int
     state: int
     new: int
+    window: int
     front: int
     order: tuple[int, ...]
     transfer: int
@@ -113,7 +123,21 @@ def _sum(terms: Sequence[str]) -> str:
     return " + ".join(terms) if terms else "0.0"
 
 
-def _solve(source: _Source, matrix: list[list[str]], right: list[list[str]]) -> list[list[str]]:
+@dataclass(frozen=True)
+class _Factors:
+    """Where an elimination keeps what a later right-hand side needs: behind the transfer."""
+
+    first: int
+    size: int
+    steps: int
+
+    def at(self, i: int, j: int) -> str:
+        return f"transfer[{(self.first + i * self.size + j) * self.steps} + i]"
+
+
+def _solve(
+    source: _Source, matrix: list[list[str]], right: list[list[str]], factors: _Factors
+) -> list[list[str]]:
     """Emit elimination without exchange of rows, counting pivots that ask for one."""
     m, k = len(matrix), len(right[0])
     for i in range(m):
@@ -129,8 +153,10 @@ def _solve(source: _Source, matrix: list[list[str]], right: list[list[str]]) -> 
         source.add(f"size = {SMALL_PIVOT!r}*s{c}")
         source.add(f"bad += 0 if (abs(m{c}_{c}) > size and size <= o{c}) else 1")
         source.add(f"v{c} = 1.0/m{c}_{c}")
+        source.add(f"{factors.at(c, c)} = v{c}")
         for i in range(c + 1, m):
             source.add(f"f = m{i}_{c}*v{c}")
+            source.add(f"{factors.at(i, c)} = f")
             for j in range(c + 1, m):
                 source.add(f"g = f*m{c}_{j}")
                 source.add(f"m{i}_{j} -= g")
@@ -138,11 +164,25 @@ def _solve(source: _Source, matrix: list[list[str]], right: list[list[str]]) -> 
                     source.add(f"s{i} += abs(g)")
             for j in range(k):
                 source.add(f"r{i}_{j} -= f*r{c}_{j}")
+        for j in range(c + 1, m):
+            source.add(f"{factors.at(c, j)} = m{c}_{j}")
     for i in range(m - 1, -1, -1):
         for j in range(k):
             done = [f"m{i}_{o}*r{o}_{j}" for o in range(i + 1, m)]
             source.add(f"r{i}_{j} = (r{i}_{j} - ({_sum(done)}))*v{i}")
     return [[f"r{i}_{j}" for j in range(k)] for i in range(m)]
+
+
+def _solve_again(source: _Source, right: list[str], factors: _Factors) -> list[str]:
+    """Emit the solution for another right-hand side."""
+    m = len(right)
+    for i in range(m):
+        done = [f"{factors.at(i, c)}*r{c}" for c in range(i)]
+        source.add(f"r{i} = {right[i]} - ({_sum(done)})")
+    for i in range(m - 1, -1, -1):
+        done = [f"{factors.at(i, o)}*r{o}" for o in range(i + 1, m)]
+        source.add(f"r{i} = (r{i} - ({_sum(done)}))*{factors.at(i, i)}")
+    return [f"r{i}" for i in range(m)]
 
 
 def _measure(orders: Sequence[int]) -> str:
@@ -164,11 +204,14 @@ def _measure(orders: Sequence[int]) -> str:
     return "\n".join(source.lines)
 
 
-def _chain(new: int, past: int, order: Sequence[int], steps: int) -> str:
-    """Recursion of the chunks; the history is ``(t, new, past + 1, WIDTH)``, oldest first."""
+def _chain(
+    new: int, window: int, order: Sequence[int], steps: int, constants_only: bool = False
+) -> str:
+    """Recursion of the chunks; the history is ``(t, new, D + 1, WIDTH)``, oldest first."""
+    past = len(order)
     columns = past + 1
     source = _Source(
-        "chain",
+        "follow" if constants_only else "chain",
         "transfer, history, rows, width",
         {"transfer": new * columns * steps, "history": 10**9},
     )
@@ -180,19 +223,24 @@ def _chain(new: int, past: int, order: Sequence[int], steps: int) -> str:
     for i in range(new):
         for o in range(columns):
             source.add(f"{factors[i][o]} = transfer[{(i * columns + o) * steps} + at + c]")
-    for k in range(columns):
+    for k in range(past if constants_only else 0, columns):
         for o in range(past):
             source.add(f"h{o} = history[base + {(order[o] * columns + k) * WIDTH} + c]")
         for i in range(new):
             terms = [factors[i][past]] if k == past else []
             # The latest last: they are what the next step has to wait for.
             terms += [f"{factors[i][o]}*h{o}" for o in sorted(range(past), key=order.__getitem__)]
-            target = f"history[base + {((past + i) * columns + k) * WIDTH} + c]"
+            target = f"history[base + {((window + i) * columns + k) * WIDTH} + c]"
             source.add(f"{target} = {_sum(terms)}")
     return "\n".join(source.lines)
 
 
-# Backward differences: the unknowns are the dofs at the nodes, the state three past nodes.
+# Backward differences: the unknowns are the dofs at the nodes, the state those of past nodes.
+
+
+def _past(orders: Sequence[int]) -> list[tuple[int, int]]:
+    """How many nodes back, and which dof: three for one of second order, two for one of first."""
+    return [(past, j) for past in (1, 2, 3) for j in range(len(orders)) if past <= orders[j] + 1]
 
 
 def _difference_rows(orders: Sequence[int], first: Sequence[float], second: Sequence[float]) -> str:
@@ -220,12 +268,16 @@ def _difference_rows(orders: Sequence[int], first: Sequence[float], second: Sequ
 def _difference_elimination(
     orders: Sequence[int], first: Sequence[float], second: Sequence[float], steps: int
 ) -> str:
-    d, nz = len(orders), sum(orders) + len(orders)
-    columns = 3 * d + 1
+    d, nz, columns = len(orders), sum(orders) + len(orders), len(_past(orders)) + 1
+    factors = _Factors(d * columns, d, steps)
     source = _Source(
         "eliminate",
         "out, x, h, transfer, count",
-        {"out": d * (1 + nz) * BLOCK, "h": BLOCK, "transfer": d * columns * steps},
+        {
+            "out": d * (1 + nz) * BLOCK,
+            "h": BLOCK,
+            "transfer": (d * columns + d * d) * steps,
+        },
     )
     source.add("bad = 0")
     source.add("once = 1.0/h[0]")
@@ -246,11 +298,10 @@ def _difference_elimination(
                 entries[past][e][j] = f"w{past}_{e}_{j}"
                 source.add(f"w{past}_{e}_{j} = {_sum(terms)}")
     right = [
-        [f"-{entries[past][e][j]}" for past in (1, 2, 3) for j in range(d)]
-        + [f"-out[{e * BLOCK} + i]"]
+        [f"-{entries[past][e][j]}" for past, j in _past(orders)] + [f"-out[{e * BLOCK} + i]"]
         for e in range(d)
     ]
-    solution = _solve(source, entries[0], right)
+    solution = _solve(source, entries[0], right, factors)
     for e in range(d):
         for k in range(columns):
             source.add(f"transfer[{(e * columns + k) * steps} + i] = {solution[e][k]}")
@@ -259,9 +310,24 @@ def _difference_elimination(
     return "\n".join(source.lines)
 
 
+def _difference_substitution(orders: Sequence[int], steps: int) -> str:
+    d, columns = len(orders), len(_past(orders)) + 1
+    factors = _Factors(d * columns, d, steps)
+    source = _Source(
+        "substitute",
+        "out, x, h, transfer, count",
+        {"out": d * BLOCK, "transfer": (d * columns + d * d) * steps},
+    )
+    source.loop("for i in range(count):")
+    solution = _solve_again(source, [f"-out[{e * BLOCK} + i]" for e in range(d)], factors)
+    for e in range(d):
+        source.add(f"transfer[{(e * columns + columns - 1) * steps} + i] = {solution[e]}")
+    return "\n".join(source.lines)
+
+
 def _difference_update(orders: Sequence[int]) -> str:
-    d = len(orders)
-    past, columns = 3 * d, 3 * d + 1
+    d, past = len(orders), len(_past(orders))
+    columns, window = past + 1, 3 * d
     source = _Source(
         "update",
         "transfer, history, start, dx, rows, width",
@@ -274,7 +340,7 @@ def _difference_update(orders: Sequence[int]) -> str:
     for k in range(past):
         source.add(f"s{k} = start[{k * WIDTH} + c]")
     for j in range(d):
-        at = [f"history[base + {((past + j) * columns + k) * WIDTH} + c]" for k in range(columns)]
+        at = [f"history[base + {((window + j) * columns + k) * WIDTH} + c]" for k in range(columns)]
         terms = [at[past]] + [f"{at[k]}*s{k}" for k in range(past)]
         source.add(f"d{j} = {_sum(terms)}")
     for j in range(d):
@@ -349,57 +415,83 @@ def _stage_equations(
     return matrix, right
 
 
-def _collocation_elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
+def _collocation_source(name: str, orders: Sequence[int], method: Tableau, steps: int) -> _Source:
     d, s, D = len(orders), method.stages, sum(orders)
-    ba, columns = method.b @ method.a, D + 1
-    source = _Source(
-        "eliminate",
+    return _Source(
+        name,
         "out, x, h, transfer, count",
         {
             "out": d * (1 + D + d) * BLOCK,
             "x": (D + s * d) * REACH,
             "h": BLOCK,
-            "transfer": (D + s * d) * columns * steps,
+            "transfer": ((D + s * d) * (D + 1) + (s * d) ** 2) * steps,
         },
     )
+
+
+def _collocation_elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
+    m, D = len(orders) * method.stages, sum(orders)
+    source = _collocation_source("eliminate", orders, method, steps)
     source.add("bad = 0")
     source.loop("for i in range(count):")
     source.add("h1 = h[i]")
     source.add("h2 = h1*h1")
-    solution = _solve(source, *_stage_equations(source, orders, method, steps))
+    factors = _Factors((D + m) * (D + 1), m, steps)
+    solution = _solve(source, *_stage_equations(source, orders, method, steps), factors)
+    for k in range(D + 1):
+        own = [solution[line][k] for line in range(m)]
+        _collocation_column(source, orders, method, steps, k, own)
+    source.indent = "    "
+    source.add("return bad")
+    return "\n".join(source.lines)
+
+
+def _collocation_substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
+    d, m, D = len(orders), len(orders) * method.stages, sum(orders)
+    source = _collocation_source("substitute", orders, method, steps)
+    source.loop("for i in range(count):")
+    source.add("h1 = h[i]")
+    source.add("h2 = h1*h1")
+    factors = _Factors((D + m) * (D + 1), m, steps)
+    right = [f"-out[{e * BLOCK + i * steps} + i]" for i in range(method.stages) for e in range(d)]
+    _collocation_column(source, orders, method, steps, D, _solve_again(source, right, factors))
+    return "\n".join(source.lines)
+
+
+def _collocation_column(
+    source: _Source, orders: Sequence[int], method: Tableau, steps: int, k: int, own: list[str]
+) -> None:
+    """Emit one column of the transfer: what the end of a step and its stages owe to a component of
+    its first state or, the last column, to the residual."""
+    d, s, D = len(orders), method.stages, sum(orders)
+    ba, columns = method.b @ method.a, D + 1
     state = 0
     for j in range(d):
         last = state + orders[j] - 1
         a = [f"x[{(D + st * d + j) * REACH} + i]" for st in range(s)]
-        for k in range(columns):
-            own = [solution[st * d + j][k] for st in range(s)]
-            once = _sum([f"{_number(method.b[st])}*{own[st]}" for st in range(s)])
-            total = ["1.0"] if k == last else []
+        mine = [own[st * d + j] for st in range(s)]
+        once = _sum([f"{_number(method.b[st])}*{mine[st]}" for st in range(s)])
+        total = ["1.0"] if k == last else []
+        if k == D:
+            gain = _sum([f"{_number(method.b[st])}*{a[st]}" for st in range(s)])
+            total = [f"(x[{last * REACH} + i] - x[{last * REACH + WIDTH} + i]) + h1*({gain})"]
+        source.add(
+            f"transfer[{(last * columns + k) * steps} + i] = {_sum([*total, f'h1*({once})'])}"
+        )
+        if orders[j] == 2:
+            twice = _sum([f"{_number(ba[st])}*{mine[st]}" for st in range(s)])
+            total = ["1.0"] if k == state else ["h1"] if k == last else []
             if k == D:
-                gain = _sum([f"{_number(method.b[st])}*{a[st]}" for st in range(s)])
-                total = [f"(x[{last * REACH} + i] - x[{last * REACH + WIDTH} + i]) + h1*({gain})"]
+                gain = _sum([f"{_number(ba[st])}*{a[st]}" for st in range(s)])
+                jump = f"(x[{state * REACH} + i] - x[{state * REACH + WIDTH} + i])"
+                total = [f"{jump} + h1*(x[{last * REACH} + i] + h1*({gain}))"]
             source.add(
-                f"transfer[{(last * columns + k) * steps} + i] = {_sum([*total, f'h1*({once})'])}"
+                f"transfer[{(state * columns + k) * steps} + i] = "
+                + _sum([*total, f"h2*({twice})"])
             )
-            if orders[j] == 2:
-                twice = _sum([f"{_number(ba[st])}*{own[st]}" for st in range(s)])
-                total = ["1.0"] if k == state else ["h1"] if k == last else []
-                if k == D:
-                    gain = _sum([f"{_number(ba[st])}*{a[st]}" for st in range(s)])
-                    jump = f"(x[{state * REACH} + i] - x[{state * REACH + WIDTH} + i])"
-                    total = [f"{jump} + h1*(x[{last * REACH} + i] + h1*({gain}))"]
-                source.add(
-                    f"transfer[{(state * columns + k) * steps} + i] = "
-                    + _sum([*total, f"h2*({twice})"])
-                )
         state += orders[j]
     for line in range(s * d):
-        for k in range(columns):
-            at = ((D + line) * columns + k) * steps
-            source.add(f"transfer[{at} + i] = {solution[line][k]}")
-    source.indent = "    "
-    source.add("return bad")
-    return "\n".join(source.lines)
+        source.add(f"transfer[{((D + line) * columns + k) * steps} + i] = {own[line]}")
 
 
 def _collocation_update(orders: Sequence[int], stages: int, steps: int) -> str:
@@ -434,18 +526,17 @@ def _collocation_update(orders: Sequence[int], stages: int, steps: int) -> str:
 def _compile(parts: Sequence[str]) -> dict[str, int]:
     source = "import numba\n\n\n" + "\n\n\n".join(parts) + "\n"
     module = load(source)
-    functions = {
-        name: numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})(
-            getattr(module, name)
-        )
-        for name, signature in SIGNATURES.items()
-    }
-    _ALIVE.append(functions)
-    return {name: int(function.address) for name, function in functions.items()}
+    addresses = {}
+    for name, signature in SIGNATURES.items():
+        compiler = numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})
+        function: Any = compiler(getattr(module, name))
+        _ALIVE.append(function)
+        addresses[name] = int(function.address)
+    return addresses
 
 
 #: An address does not keep what stands there.
-_ALIVE: list[dict[str, Any]] = []
+_ALIVE: list[Any] = []
 
 
 def differences(
@@ -476,13 +567,16 @@ def _differences(
     d = len(orders)
     if not 1 <= d <= 2:
         return None
-    order = tuple((2 - past) * d + j for past in range(3) for j in range(d))
+    order = tuple((3 - past) * d + j for past, j in _past(orders))
+    D = len(order)
     pieces = _compile(
         [
             _difference_rows(orders, first, second),
             _measure(orders),
             _difference_elimination(orders, first, second, BLOCK),
             _chain(d, 3 * d, order, BLOCK),
+            _difference_substitution(orders, BLOCK),
+            _chain(d, 3 * d, order, BLOCK, constants_only=True),
             _difference_update(orders),
         ]
     )
@@ -491,11 +585,12 @@ def _differences(
         orders=orders,
         stages=1,
         unknowns=d,
-        state=3 * d,
+        state=D,
         new=d,
+        window=3 * d,
         front=3,
         order=order,
-        transfer=d * (3 * d + 1),
+        transfer=d * (D + 1) + d * d,
     )
 
 
@@ -510,6 +605,8 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
             _measure(orders),
             _collocation_elimination(orders, method, steps),
             _chain(D, D, tuple(range(D)), steps),
+            _collocation_substitution(orders, method, steps),
+            _chain(D, D, tuple(range(D)), steps, constants_only=True),
             _collocation_update(orders, s, steps),
         ]
     )
@@ -520,9 +617,10 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
         unknowns=D + s * d,
         state=D,
         new=D,
+        window=D,
         front=0,
         order=tuple(range(D)),
-        transfer=(D + s * d) * (D + 1),
+        transfer=(D + s * d) * (D + 1) + (s * d) ** 2,
     )
 
 
