@@ -19,6 +19,9 @@ from bayesoleo.estimation.problem import Array
 # A step that turns back by more than this part of the last one overshoots: linear equations that
 # lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
 _OVERSHOOT = 0.3
+# Among steps below a standard deviation equations are close to linear, so that less tells as much;
+# what turns back by less than this gains a digit an iteration as it is.
+_OVERSHOOT_NEAR = 0.1
 # After so many steps in a row along one line, each longer than that part of the one before, steps
 # are lengthened, at most so far: the same equations can also fall short for ever.
 _STEADY = 4
@@ -74,7 +77,8 @@ class Pace:
         creeps = on_line and 0 < reach < 1 - _OVERSHOOT
         steady = self.steady + 1 if creeps else 0
         wanted = 1.0
-        if on_line and reach > 1 + _OVERSHOOT:
+        overshoot = _OVERSHOOT_NEAR if max(lengths) < 1 else _OVERSHOOT
+        if on_line and reach > 1 + overshoot:
             wanted = 1 / reach
         elif steady >= _STEADY:
             wanted = min(1 / reach, _LONGEST)
