@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bayesoleo import schema
+from bayesoleo.cli import each as by_run
 from bayesoleo.cli import options, shell, tables
 
 if TYPE_CHECKING:
@@ -159,17 +160,19 @@ def estimate(
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
+    each: by_run.Each = False,
     as_json: options.Json = False,
 ) -> None:
     """Estimate the parameters from the runs with role fit: MBE, then the mode of the posterior.
 
     Prints start, MBE point, mode and linearised standard deviation. Writes nothing without --out;
-    with it, results.nc in that folder.
+    with it, results.nc in that folder; with --each, each.nc.
 
     \b
     Examples:
       bayesoleo estimate shaker --model f16n2d2
       bayesoleo estimate shaker --model model.py:model --drive model --out point
+      bayesoleo estimate shaker --model f16n2d2 --each
     """
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
@@ -178,6 +181,9 @@ def estimate(
         shell.check_writable(out)
     chosen = options.settings(jobs=jobs, scheme=scheme, steps=steps, drive=drive, nuisance=nuisance)
     declared = load_model(model)
+    if each:
+        by_run.estimate_each(campaign, declared, chosen, out, quiet, as_json)
+        return
     with shell.stoppable(out):
         tree = workflow.estimate(campaign, declared, chosen, out=out, say=shell.teller(quiet))
     if as_json:

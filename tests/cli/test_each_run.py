@@ -1,0 +1,25 @@
+"""Estimates from each run by itself, on the command line."""
+
+from __future__ import annotations
+
+import json
+
+from bayesoleo.storage import read_tree
+
+
+def test_each_run_gets_its_line_and_the_runs_are_compared(run, campaign, model, tmp_path):
+    out = tmp_path / "each"
+    arguments = ["estimate", campaign, "--model", model, "--each", "--quiet", "--jobs", 1]
+    result = run(*arguments, "--out", out)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["slow", "fast"]
+    assert "p equal" in result.stdout
+    tree = read_tree(out / "each.nc")
+    assert tree["each"].sizes["run"] == 2
+    assert tree["between_runs"].sizes["parameter"] == 2
+    facts = json.loads(run(*arguments, "--json").stdout)
+    assert facts["each"]["data_vars"]["status"]["data"] == ["converged"] * 2
+    # simulated with 2000 N/m in both runs
+    stiffness = [row[1] for row in facts["each"]["data_vars"]["estimate"]["data"]]
+    assert max(abs(value - 2000) for value in stiffness) < 5
