@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.data import PeriodicAverage, periodic_average
 from bayesoleo.data.local_average import LocalAverage, local_average
+from bayesoleo.data.noise_spectrum import NoiseSpectrum, noise_spectrum
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.records import Record
@@ -33,6 +34,8 @@ class RunError:
         The residual averaged over the recorded periods; of a transient, over neighbouring samples.
     input_noise : float
         Part of the noise that comes from the input, SI.
+    spectrum : NoiseSpectrum or None
+        Of the noise that does not repeat; ``None`` for a transient.
     """
 
     run: str
@@ -41,6 +44,7 @@ class RunError:
     rms: float
     average: PeriodicAverage | LocalAverage
     input_noise: float
+    spectrum: NoiseSpectrum | None = None
 
     @property
     def repeating(self) -> float:
@@ -50,7 +54,20 @@ class RunError:
     @property
     def noise(self) -> float:
         """Standard error of that average, the input's noise included."""
-        return float(np.hypot(self.average.noise, self.input_noise))
+        own = self.average.noise if self.spectrum is None else self.spectrum.noise
+        return float(np.hypot(own, self.input_noise))
+
+    @property
+    def coefficients(self) -> float:
+        """Degrees of freedom of the averaged residual, were it noise."""
+        return self.average.number if self.spectrum is None else self.spectrum.coefficients
+
+    @property
+    def free(self) -> float:
+        """Degrees of freedom that its noise was measured with."""
+        if self.spectrum is None:
+            return self.average.samples - self.average.number
+        return self.spectrum.free
 
     @property
     def ratio(self) -> float:
@@ -145,9 +162,25 @@ def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
         average = _average(record, residual)
         rms = float(np.sqrt(np.mean(residual**2)))
         entries.append(
-            RunError(record.label, roles[record.label], output, rms, average, float(spread[b]))
+            RunError(
+                record.label,
+                roles[record.label],
+                output,
+                rms,
+                average,
+                float(spread[b]),
+                _spectrum(record, residual, average),
+            )
         )
     return entries
+
+
+def _spectrum(
+    record: Record, residual: Array, average: PeriodicAverage | LocalAverage
+) -> NoiseSpectrum | None:
+    if not record.periodic or not np.isfinite(residual).all():
+        return None
+    return noise_spectrum(residual - average.values, record.periods)
 
 
 def _average(record: Record, residual: Array) -> PeriodicAverage | LocalAverage:

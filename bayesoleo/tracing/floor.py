@@ -19,8 +19,8 @@ FALSE_ALARM = 1e-3
 def limit(entries: Sequence[RunError], tests: int = 1) -> float:
     """Ratio that noise alone hardly exceeds, at least :data:`FLOOR_RATIO`.
 
-    The squared ratio of white noise is an F variate with the numbers of coefficients and of free
-    samples as degrees of freedom.
+    The squared ratio of noise is an F variate with the effective numbers of coefficients and of
+    free samples as degrees of freedom: where noise is coloured, few coefficients hold most of it.
 
     Parameters
     ----------
@@ -29,8 +29,10 @@ def limit(entries: Sequence[RunError], tests: int = 1) -> float:
     tests : int
         Ratios that are looked at together.
     """
-    coefficients = sum(entry.average.number for entry in entries)
-    free = sum(entry.average.samples - entry.average.number for entry in entries)
+    # The pooled squared ratio is a mean over entries: variances of F variates add up.
+    size = len(entries)
+    coefficients = size**2 / sum(1.0 / entry.coefficients for entry in entries)
+    free = size**2 / sum(1.0 / entry.free for entry in entries)
     noise = math.sqrt(float(stats.f.isf(FALSE_ALARM / tests, coefficients, free)))
     return max(FLOOR_RATIO, noise)
 

@@ -17,8 +17,8 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesoleo.data.noise_spectrum import NoiseSpectrum
 from bayesoleo.model import Model
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
@@ -27,6 +27,8 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.assembly import Option
+from bayesoleo.tracing.colour import inflation_of
+from bayesoleo.tracing.errors_table import RunError
 from bayesoleo.tracing.fit import Fit
 
 Array = NDArray[np.float64]
@@ -36,8 +38,6 @@ Array = NDArray[np.float64]
 MOST_SAMPLES = 1500
 #: Stretches of a transient whose scatter stands in for that between periods.
 STRETCHES = 8
-#: Probability with which white noise may be taken for coloured.
-COLOURED = 0.05
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
 #: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
@@ -70,6 +70,8 @@ class RunBase:
         ``B J`` and ``B e``, kept because every candidate needs them.
     chosen : ndarray of int
         Samples kept for comparing candidates with each other.
+    spectra : tuple of NoiseSpectrum
+        Of the outputs' noise; empty where it is taken as white.
     """
 
     scale: Array
@@ -81,6 +83,7 @@ class RunBase:
     mixed: Array
     moved: Array
     chosen: NDArray[np.int64]
+    spectra: tuple[NoiseSpectrum, ...] = ()
 
     @classmethod
     def of(
@@ -90,6 +93,7 @@ class RunBase:
         sensitivity: Array,
         columns: Array,
         period: NDArray[np.int64],
+        spectra: tuple[NoiseSpectrum, ...] = (),
     ) -> RunBase:
         """Keep the directions of input noise that matter against the noise of the samples."""
         columns = columns * scale
@@ -97,7 +101,8 @@ class RunBase:
         kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
         inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
         e, J = residual * scale, sensitivity * scale
-        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, _choice(e.size))
+        chosen = _choice(e.size)
+        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, chosen, spectra)
 
     def products(self, new: Array) -> tuple[Array, Array, Array]:
         """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
@@ -146,16 +151,15 @@ class Base:
         return 2.0 * float(np.sqrt(2.0 * self.noise))
 
 
-def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float]]) -> Base:
+def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
     """Prepare scoring.
 
     Parameters
     ----------
     fit : Fit
         The present model.
-    errors : mapping of (run, output) to (sigma, repeating, noise)
-        Noise of a single sample, root mean square of the averaged residual, and its standard error,
-        input noise included.
+    errors : mapping of (run, output) to RunError
+        What is left in the fitted runs, and the noise.
     """
     unit = np.array([prior.sd for prior in fit.problem.priors])
     tolerances = _tolerance_columns(fit)
@@ -172,7 +176,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
     for r, record in enumerate(fit.records):
         run = fit.predictor.runs[r]
         sigma = [
-            _sigma(errors[record.label, o][0], m)
+            _sigma(errors[record.label, o].average.sigma, m)
             for o, m in zip(fit.predictor.outputs, run.measured, strict=True)
         ]
         columns = np.concatenate(
@@ -184,16 +188,22 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], tuple[float, float, float
             _flat(columns),
             _flat(input_columns(run, _present(fit, r))),
             np.tile(replicate(record), len(sigma)),
+            _spectra([errors[record.label, o] for o in fit.predictor.outputs]),
         )
         cross, _, _ = present.products(present.sensitivity)
         gram += cross
         gradient += present.products(present.sensitivity)[2]
         for output, value in zip(fit.predictor.outputs, sigma, strict=True):
-            _, repeating, floor = errors[record.label, output]
-            noise += record.time.size * (floor / value) ** 2
-            excess += record.time.size * (repeating**2 - floor**2) / value**2
+            entry = errors[record.label, output]
+            noise += record.time.size * (entry.noise / value) ** 2
+            excess += record.time.size * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(present)
     return Base(fit, runs, gram, gradient, noise, excess)
+
+
+def _spectra(entries: Sequence[RunError]) -> tuple[NoiseSpectrum, ...]:
+    found = tuple(entry.spectrum for entry in entries if entry.spectrum is not None)
+    return found if len(found) == len(entries) else ()
 
 
 def replicate(record: Record) -> NDArray[np.int64]:
@@ -263,7 +273,8 @@ class Score:
     share : float
         Part of the excess explained.
     inflation : float
-        Variance of the score between periods over what white noise gives; at least one.
+        Variance of the score by the noise's spectrum and by its scatter between periods, over what
+        white noise gives; at least one.
     columns : ndarray, shape (m, n)
         Thinned, weighted, normalised ``C_perp`` of all scanned shapes, for the correction for the
         search.
@@ -274,7 +285,7 @@ class Score:
     rank : int
         Directions that the new unknowns can move the outputs in, beside the present ones.
     freedom : int
-        Degrees of freedom that the inflation was measured with; zero where it was not needed.
+        Degrees of freedom that the inflation was measured with; zero where none was.
     """
 
     option: Option
@@ -332,17 +343,18 @@ def _attempt(base: Base, option: Option) -> Score | Status | None:
     columns = _columns(base, option, shapes)
     if isinstance(columns, Status):
         return columns
-    best, thinned = None, []
+    best, used, thinned = None, columns[0], []
     for values, block in zip(shapes, columns, strict=True):
         score = _evaluate(base, option, values, block)
         if score is None:
             continue
         thinned.append(score.columns)
         if best is None or score.fall > best.fall:
-            best = score
+            best, used = score, block
     if best is None:
         return None
-    return replace(best, columns=np.concatenate(thinned))
+    inflation, freedom = inflation_of(base, _directions(base, used, best.expected))
+    return replace(best, columns=np.concatenate(thinned), inflation=inflation, freedom=freedom)
 
 
 @dataclass(frozen=True)
@@ -442,12 +454,11 @@ def _evaluate(
         shapes=dict(values),
         fall=fall,
         share=fall / base.fall_back,
-        inflation=_inflation(base, columns, project, expected),
+        inflation=1.0,
         columns=(thin / np.where(norms > 0, norms, 1.0))[keep],
         contribution=expected @ thin,
         z=root * float(np.sign(expected[0])) if k == 1 else root,
         rank=int(rank),
-        freedom=_freedom(base),
     )
 
 
@@ -475,28 +486,14 @@ def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
     return np.concatenate(rows, axis=1)
 
 
-def _freedom(base: Base) -> int:
-    """Periods beyond the first, over all runs."""
-    return sum(int(run.period[-1]) for run in base.runs)
-
-
-def _inflation(base: Base, columns: Sequence[Array], project: Array, expected: Array) -> float:
-    """Variance of the score between periods relative to white noise's, along the expected
-    direction."""
-    if not np.any(expected):
-        return 1.0
-    measured = assumed = 0.0
+def _directions(base: Base, block: _Block, expected: Array) -> list[Array]:
+    """What the expected parameters add to each run beside the present ones, in noise units."""
+    columns = [_flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
+    cross = np.zeros((base.gram.shape[0], expected.size))
     for run, new in zip(base.runs, columns, strict=True):
-        direction = expected @ new - (project @ expected) @ run.sensitivity
-        # What the effect itself would explain is no noise, and must not count as such.
-        rest = run.residual - direction
-        sums = np.bincount(run.period, direction * rest)
-        if sums.size < 2:
-            continue
-        measured += sums.size * float(np.var(sums, ddof=1))
-        assumed += float(direction @ direction)
-    # Slow noise makes the score vary more than its formula says. That is believed where white noise
-    # would seldom scatter so much between so few periods; less than white is never believed.
-    ratio, freedom = (measured / assumed if assumed > 0 else 1.0), _freedom(base)
-    coloured = freedom > 0 and ratio > stats.chi2.isf(COLOURED, freedom) / freedom
-    return ratio if coloured else 1.0
+        cross += run.products(new)[0]
+    project = np.linalg.lstsq(base.gram, cross, rcond=1e-13)[0] if len(cross) else cross
+    return [
+        expected @ new - (project @ expected) @ run.sensitivity
+        for run, new in zip(base.runs, columns, strict=True)
+    ]

@@ -85,9 +85,7 @@ class State:
     def base(self) -> Base:
         """What candidates are scored against."""
         entries = self.fit_errors.entries
-        return base_of(
-            self.fit, {(e.run, e.output): (e.average.sigma, e.repeating, e.noise) for e in entries}
-        )
+        return base_of(self.fit, {(entry.run, entry.output): entry for entry in entries})
 
 
 def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:

@@ -75,7 +75,7 @@ def test_the_noise_of_the_input_is_counted(tmp_path):
     assert mean_square(errors) == pytest.approx(1.0, abs=4 * np.sqrt(2 / degrees))
     for entry in errors.entries:
         assert entry.input_noise > 0
-        assert entry.noise == pytest.approx(np.hypot(entry.average.noise, entry.input_noise))
+        assert entry.noise == pytest.approx(np.hypot(entry.spectrum.noise, entry.input_noise))
     without = np.mean([(e.repeating / e.average.noise) ** 2 for e in errors.entries])
     assert without > 1.5
 

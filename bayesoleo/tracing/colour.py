@@ -1,0 +1,80 @@
+"""How much more a score varies than white noise would make it: by the noise's spectrum, and by its
+scatter between periods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+if TYPE_CHECKING:
+    from bayesoleo.tracing.score import Base, RunBase
+
+Array = NDArray[np.float64]
+
+#: Probability with which stationary noise may be taken for one that is not.
+UNSTEADY = 0.05
+
+
+def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
+    """Variance of a score over white noise's, at least one, and its degrees of freedom.
+
+    The spectrum of each output's noise says how much of it lies along the direction; it uses all
+    lines between harmonics, and so knows it well from few periods. What it cannot see - noise that
+    comes and goes, or that outputs share - shows in the scatter of the score between periods, which
+    is believed where it is larger than the spectrum would seldom let it be.
+
+    Parameters
+    ----------
+    base : Base
+        Residuals and spectra by run.
+    directions : sequence of ndarray, shape (m,)
+        What the effect adds to each run, in noise units, outputs one after the other.
+    """
+    white = sum(float(d @ d) for d in directions)
+    if not white > 0:
+        return 1.0, 0
+    parts = [_by_spectrum(run, d) for run, d in zip(base.runs, directions, strict=True)]
+    variance = sum(value for value, _ in parts)
+    scatter = sum(value**2 / free for value, free in parts if free > 0)
+    freedom = variance**2 / scatter if scatter > 0 else np.inf
+    between, degrees = _between_periods(base.runs, directions)
+    # Against the spectrum's own uncertainty: neither is exact.
+    unsteady = degrees > 0 and between / variance > stats.f.isf(UNSTEADY, degrees, freedom)
+    if unsteady:
+        variance, freedom = between, degrees
+    known = int(min(freedom, 10**9)) if np.isfinite(freedom) else 0
+    return max(1.0, variance / white), known
+
+
+def _by_spectrum(run: RunBase, direction: Array) -> tuple[float, float]:
+    """Variance of the score of one run and its degrees of freedom, zero where it is assumed."""
+    if not run.spectra:
+        return float(direction @ direction), 0.0
+    size, variance, scatter = direction.size // len(run.spectra), 0.0, 0.0
+    for k, spectrum in enumerate(run.spectra):
+        part = slice(k * size, (k + 1) * size)
+        power = spectrum.power(direction[part]) * run.scale[part][0] ** 2
+        own, free = float(power @ spectrum.level), spectrum.freedom(power)
+        variance += own
+        scatter += own**2 / free if free > 0 else 0.0
+    return variance, variance**2 / scatter if scatter > 0 else 0.0
+
+
+def _between_periods(runs: Sequence[RunBase], directions: Sequence[Array]) -> tuple[float, int]:
+    """The same variance by the scatter of the score between periods.
+
+    A direction that repeats moves the mean over periods only, so that what was estimated takes one
+    degree of freedom a run from the scatter.
+    """
+    total, degrees = 0.0, 0
+    for run, direction in zip(runs, directions, strict=True):
+        # What the effect itself would explain is no noise, and must not count as such.
+        sums = np.bincount(run.period, direction * (run.residual - direction))
+        if sums.size > 1:
+            total += sums.size * float(np.var(sums, ddof=1))
+            degrees += sums.size - 1
+    return total, degrees
