@@ -122,6 +122,8 @@ def ratios():
         axes.semilogy(table.run, rms / noise, look, label=variant)
     axes.axhline(1, color="0.7")
     axes.set(xlabel="run", ylabel="force residual / noise")
+    axes.set_yticks([1, 2, 3], ["1", "2", "3"])
+    axes.minorticks_off()
     axes.legend(frameon=False)
     return figure
 

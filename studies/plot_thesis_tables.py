@@ -15,8 +15,12 @@ to that, and out comes table 6.2, if the print is right.
 # with the positive sign only, if the pressure at rest is to be 4.9 bar. So there are three
 # readings:
 
+import matplotlib.pyplot as plt
+import numpy as np
 from stored import Study
-from thesis_tables import VARIANTS, differences, print_comparison, table_6_5_to_6_2
+from thesis_tables import VARIANTS, print_comparison, table_6_5_to_6_2
+
+from bayesoleo.systems.verbeek import SHAKER_RUNS, TABLE_6_2
 
 for variant in VARIANTS:
     print(variant)
@@ -49,20 +53,16 @@ study.text("comparison", lambda: print_comparison(found))
 
 def figure():
     """Print and refit by run, one panel a parameter."""
-    import matplotlib.pyplot as plt
-
     figure, panels = plt.subplots(3, 1, figsize=(9, 8), sharex=True, layout="constrained")
     looks = dict(zip(VARIANTS, ("o-", "s:", "^--"), strict=True))
-    first = next(iter(found.values()))
+    runs = [run.label for run in SHAKER_RUNS]
+    printed = np.array([TABLE_6_2.get(run, [np.nan] * 4)[:3] for run in runs])
     for k, (axes, title) in enumerate(zip(panels, ("θ₄ [10⁻³ m²]", "θ₆ [1/m]", "θ₇"), strict=True)):
         scale = 1e3 if k == 0 else 1.0
         for variant, each in found.items():
-            refitted = each["estimate"][:, k].reindex(run=differences(first).run)
+            refitted = each["estimate"][:, k].reindex(run=runs)
             axes.plot(refitted.run, scale * refitted, looks[variant], ms=4, lw=1, label=variant)
-        gap = differences(first)[:, k]
-        own = first["estimate"][:, k].reindex(run=gap.run)
-        printed = own / (1 + gap) if k == 0 else own - gap
-        axes.plot(printed.run, scale * printed, "k*", ms=11, label="table 6.2")
+        axes.plot(runs, scale * printed[:, k], "k*", ms=11, label="table 6.2")
         axes.set_ylabel(title)
     panels[0].legend(frameon=False, ncols=2)
     panels[-1].set_xlabel("run")
