@@ -1,7 +1,8 @@
 """Periodic orbits of a model under a planned motion, by any of the package's solvers.
 
-One question, four ways to answer it: on an equidistant mesh, on a mesh of its own, by shooting, and
-by shooting with derivatives from a mesh. Answers can be held against each other.
+One question, five ways to answer it: on an equidistant mesh, on a mesh of its own, by shooting, by
+shooting with derivatives from a mesh, and by shooting with a library's integrator. Answers can be
+held against each other.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, record_of
 from bayesoleo.solvers.continuation import solve_from_guess
 from bayesoleo.solvers.hybrid import differentiate_on_mesh
+from bayesoleo.solvers.library import shoot_by_library
 from bayesoleo.solvers.mesh import Mesh
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities
 from bayesoleo.solvers.schemes import DEFAULT_SCHEME
 from bayesoleo.solvers.shooting import Shot, solve_shooting
+from bayesoleo.solvers.state_space import StateSpace
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.switched import crossings_of
 from bayesoleo.solvers.tableau import tableau
@@ -37,7 +40,7 @@ from bayesoleo.solvers.tableau import tableau
 Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]
 
-METHODS = ("discretisation", "adaptive", "shooting", "hybrid")
+METHODS = ("discretisation", "adaptive", "shooting", "hybrid", "library")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +147,15 @@ def periodic_orbit(
     values : mapping of str to float or array_like, shape (L,), optional
         Parameters that are not at their nominal value. Each vector starts from the model's own
         guess: what is found for it does not depend on the others.
-    method : {"discretisation", "adaptive", "shooting", "hybrid"}
+    method : {"discretisation", "adaptive", "shooting", "hybrid", "library"}
         On a mesh of equal steps; on a mesh with error control; by shooting, with derivatives by the
-        second, linear problem; by shooting, with derivatives on a mesh made of its steps.
+        second, linear problem; by shooting, with derivatives on a mesh made of its steps; by
+        shooting with SciPy's LSODA, the slow and independent check.
     steps, scheme : int and str
-        Of the mesh of equal steps; the hybrid's has at least so many. All but shooting use the
-        scheme; only equal steps can use ``thesis``.
+        Of the mesh of equal steps; the hybrid's has at least so many. Shooting does
+        without; only equal steps can use ``thesis``.
     tolerance : float
-        Of the adaptive mesh and of shooting.
+        Of the adaptive mesh and of shooting; of LSODA the local error.
     backend : {"numba", "numpy"}
         Kernels; NumPy's need no compilation, but are called back from compiled shooting slowly.
     jobs : int, optional
@@ -195,6 +199,7 @@ def periodic_orbit(
         "adaptive": partial(way.adaptive, lanes),
         "shooting": way.shot,
         "hybrid": way.hybrid,
+        "library": way.by_library,
     }
     orbits, motions, slopes = zip(*ways[method](p), strict=True)
     return PeriodicOrbits(orbits, motions, slopes, compiled, run.record, p)
@@ -323,3 +328,21 @@ class _Way:
 
         shots = self.shots(p, by_parameter=False)
         return thread_map(one, list(zip(p, shots, strict=True)), self.jobs)
+
+    def by_library(self, p: Array) -> list[Found]:
+        derived, run = self.run.kernels.derived, self.run
+        space = StateSpace(
+            run.kernels,
+            derived.orders,
+            lambda t: input_rows(run.record, derived.inputs, t / run.period),
+            len(derived.active),
+            len(derived.admissible),
+        )
+
+        def one(row: Array) -> Found:
+            shot = shoot_by_library(
+                space, row, run.period, self._start(row), tolerance=self.tolerance
+            )
+            return shot.orbit, shot.sample, shot.sample_theta
+
+        return thread_map(one, list(p), self.jobs)

@@ -109,6 +109,11 @@ class _Switching:
             own = switched(self.switches, z[lane], u, p[lane])
             self.equations.jacobian(z, own, p, np.array([lane]), *out)
 
+    def residual(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
+        for lane in lanes:
+            own = switched(self.switches, z[lane], u, p[lane])
+            self.equations.residual(z, own, p, np.array([lane]), *out)
+
     def parameters(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
         for lane in lanes:
             own = switched(self.switches, z[lane], u, p[lane])

@@ -1,4 +1,4 @@
-"""Four ways to one orbit: its motion, its outputs, and their derivatives by the parameters."""
+"""Five ways to one orbit: its motion, its outputs, and their derivatives by the parameters."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,13 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo import system
 from bayesoleo.errors import InputError, ModelError
+from bayesoleo.model.kernels import kernels
+from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.orbits import METHODS, periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.solvers.library import shoot_by_library
+from bayesoleo.solvers.state_space import StateSpace
 from bayesoleo.solvers.status import Status
 
 DUFFING = system("duffing")
@@ -55,7 +60,10 @@ def exact():
     return np.stack([q for q, _ in found]), np.stack([slope for _, slope in found])
 
 
-@pytest.mark.parametrize("method", METHODS)
+OWN = METHODS[:-1]
+
+
+@pytest.mark.parametrize("method", [*OWN, pytest.param("library", marks=pytest.mark.slow)])
 def test_all_ways_agree_with_another_code_in_motion_and_derivatives(method, exact):
     """Three parameter vectors at once."""
     found = periodic_orbit(
@@ -80,7 +88,8 @@ def test_all_ways_agree_with_another_code_in_motion_and_derivatives(method, exac
 
 def test_states_of_an_orbit_are_those_of_its_motion():
     for method in METHODS:
-        found = periodic_orbit(DUFFING, PLAN, None, method, backend="numpy", steps=64)
+        options = {"backend": "numpy", "steps": 64, "tolerance": 1e-6}
+        found = periodic_orbit(DUFFING, PLAN, None, method, **options)
         orbit = found.orbits[0]
         rows = found.rows(orbit.phases)[0]
         np.testing.assert_allclose(orbit.states.T, rows[:2], atol=1e-9)
@@ -90,7 +99,7 @@ def test_states_of_an_orbit_are_those_of_its_motion():
 
 
 def test_a_vector_does_not_know_the_others():
-    for method in METHODS:
+    for method in OWN:
         options = {"backend": "numpy", "steps": 64, "method": method}
         together = periodic_orbit(DUFFING, PLAN, {"stiffness": STIFFNESSES}, **options, jobs=2)
         alone = periodic_orbit(DUFFING, PLAN, {"stiffness": STIFFNESSES[1]}, **options, jobs=1)
@@ -122,6 +131,43 @@ def test_derivatives_across_a_stiff_contact_are_differences_of_motions():
     difference = (q[2] - q[0]) / (2 * part * stiffness)
     # Central differences err by the square of the part.
     np.testing.assert_allclose(by_stiffness, difference, atol=1e-5 * np.abs(difference).max())
+
+
+@pytest.mark.slow
+@pytest.mark.reference
+@pytest.mark.parametrize("integrator", ["LSODA", "Radau"])
+def test_a_library_integrates_the_stiff_contact_too(integrator):
+    """Steps are chosen by the error alone; digits are fewer, and derivatives have three."""
+    model, stiff = system("end_stop"), {"stop_stiffness": 2500.0}
+    shot = periodic_orbit(model, END_STOP, stiff, "shooting", backend="numpy")
+    run = RunPredictor(model, shot.kernels, shot.record, 64, "radau3")
+    space = StateSpace(
+        run.kernels, (2,), lambda t: input_rows(run.record, shot.kernels.derived.inputs, t), 1, 1
+    )
+    found = shoot_by_library(
+        space, shot.p[0], 1.0, np.array([0.5, 0.0]), integrator=integrator, tolerance=1e-8
+    )
+    assert found.orbit.status is Status.CONVERGED
+    np.testing.assert_allclose(found.sample(PHASES)[0], shot.rows(PHASES)[0, 0], atol=2e-6)
+    there = shot.rows_by_parameter(PHASES)[0, 0]
+    np.testing.assert_allclose(
+        found.sample_theta(PHASES)[0], there, atol=2e-3 * np.abs(there).max()
+    )
+
+
+def test_a_library_says_why_it_failed():
+    model = system("end_stop")
+    run = RunPredictor(
+        model, kernels(model, model.estimated(), "numpy"), record_of(model, END_STOP), 64, "radau3"
+    )
+    space = StateSpace(
+        run.kernels, (2,), lambda t: input_rows(run.record, (("force", 0),), t), 1, 1
+    )
+    outside = shoot_by_library(space, run.base_constants(), 1.0, np.array([1.2, 0.0]))
+    assert outside.orbit.status is Status.INADMISSIBLE
+    assert np.isnan(outside.orbit.multipliers).all()
+    with pytest.raises(InputError, match=r"no such integrator.*use LSODA, Radau"):
+        shoot_by_library(space, run.base_constants(), 1.0, np.zeros(2), integrator="RK45")
 
 
 def test_failures_have_a_status_and_no_numbers():
