@@ -62,6 +62,8 @@ class Trajectory:
         At the samples; measured less predicted.
     gap : float
         Largest jump between a step's end and the next node, over the spread of that component.
+    names : tuple of str, length D
+        Of the states: ``x``, or ``dot(x)`` for the velocity of a second-order dof.
     """
 
     label: str
@@ -72,6 +74,7 @@ class Trajectory:
     predicted: Array
     residual: Array
     gap: float
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +292,7 @@ def _trajectory(
     predicted = run.predict(x, problem.constants(outcome.theta, r))
     states = np.concatenate([x[:, :D], run.segments.ends(x[..., None])[-1:, :, 0]])
     spread = np.maximum(states.std(axis=0), np.finfo(float).tiny)
-    own = problem.layout.columns[r]
+    own, derived = problem.layout.columns[r], run.kernels.derived
     sd = np.full(D, np.nan)
     if outcome.local is not None:
         sd = outcome.local.normal[r].initial_sd(covariance[np.ix_(own, own)])
@@ -302,4 +305,9 @@ def _trajectory(
         predicted=predicted,
         residual=run.measured - predicted,
         gap=float(np.max(np.abs(run.segments.gaps(x)) / spread, initial=0.0)),
+        names=tuple(
+            name if k == 0 else f"dot({name})"
+            for name, order in zip(derived.dofs, derived.orders, strict=True)
+            for k in range(order)
+        ),
     )

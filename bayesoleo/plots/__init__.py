@@ -5,6 +5,7 @@ machines without a display, and are saved with ``figure.savefig(path)``.
 """
 
 from bayesoleo.plots.assessments import assessment
+from bayesoleo.plots.branches import branch
 from bayesoleo.plots.corners import corner
 from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
@@ -20,11 +21,13 @@ from bayesoleo.plots.residual_tests import residual_tests
 from bayesoleo.plots.residuals import residual
 from bayesoleo.plots.sensitivities import sensitivity
 from bayesoleo.plots.traces import trace
+from bayesoleo.plots.trajectories import trajectory
 from bayesoleo.plots.units import Scale, engineering, format_unit, format_value
 
 __all__ = [
     "Scale",
     "assessment",
+    "branch",
     "corner",
     "engineering",
     "error",
@@ -44,4 +47,5 @@ __all__ = [
     "sampling_distribution",
     "sensitivity",
     "trace",
+    "trajectory",
 ]

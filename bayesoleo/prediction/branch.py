@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 
 #: What a branch can be followed along besides a parameter.
 FREQUENCY, AMPLITUDE = "frequency", "amplitude"
+UNITS = {FREQUENCY: "Hz", AMPLITUDE: ""}
+#: Steps of the longest kind after which a branch that does not leave its span is given up.
+MOST = 40
 #: Of the motion towards a limit cycle, which only has to start Newton's method.
 RELATIVE_TOLERANCE = 1e-8
 
@@ -47,11 +50,14 @@ class AnswerBranch:
         The orbits, the special ones among them, and how the branch ended.
     answers : Answers
         Turns an orbit into outputs.
+    units : mapping of str to str
+        SI units of what is followed and of the outputs.
     """
 
     along: str
     branch: Branch
     answers: _Answers
+    units: Mapping[str, str]
 
     @property
     def values(self) -> Array:
@@ -65,8 +71,11 @@ class AnswerBranch:
 
     def swing(self, output: str) -> Array:
         """Half the difference between largest and least value of an output, shape (K,)."""
-        swings = (np.ptp(self.answers.output(point, output)) for point in self.branch.points)
-        return np.array([0.5 * swing for swing in swings])
+        return np.array([self.swing_of(point, output) for point in self.branch.points])
+
+    def swing_of(self, point: BranchPoint, output: str) -> float:
+        """The same at one orbit."""
+        return 0.5 * float(np.ptp(self.answers.output(point, output)))
 
     def output(self, point: BranchPoint, output: str) -> Array:
         """An output over the points of one period, shape (N,); SI."""
@@ -81,6 +90,7 @@ def follow_branch(
     values: Mapping[str, float] | None = None,
     *,
     downward: bool = False,
+    longest: float = 0.1,
     steps: int = 128,
     scheme_name: str = DEFAULT_SCHEME,
     backend: str = "numpy",
@@ -101,6 +111,8 @@ def follow_branch(
         Parameters that are not at their nominal value.
     downward : bool
         Whether to set out from the span's upper end.
+    longest : float
+        Longest step from orbit to orbit, in parts of the span and of the largest motion.
     steps : int
         Of the mesh.
     scheme_name : str
@@ -129,10 +141,20 @@ def follow_branch(
     start = np.zeros((1, steps, problem.scheme.width))
     start[:, :, : problem.scheme.state_size] = answers.rest
     found = solve_from_guess(problem, p[None], start)
-    if found.status[0] != Status.CONVERGED.value:
-        return AnswerBranch(along, Branch((), (), Status(int(found.status[0]))), answers)
-    branch = follow(answers.at, found.x[0], first, span, forward=not downward)
-    return AnswerBranch(along, branch, answers)
+    branch = Branch((), (), Status(int(found.status[0])))
+    if branch.status.ok:
+        branch = follow(
+            answers.at,
+            found.x[0],
+            first,
+            span,
+            forward=not downward,
+            longest=longest,
+            most=int(MOST / longest),
+        )
+    units = {name: output.unit for name, output in model.outputs.items()}
+    units[along] = model.parameters[along].unit if along in model.parameters else UNITS[along]
+    return AnswerBranch(along, branch, answers, units)
 
 
 @dataclass(frozen=True, eq=False)
