@@ -13,13 +13,25 @@ from functools import cache
 
 from threadpoolctl import ThreadpoolController
 
+_limit: int | None = None
+
+
+def limit_threads(count: int | None) -> None:
+    """Let this process use so many threads at most, whatever is asked for; None lifts it.
+
+    For a worker that shares its machine with others like it.
+    """
+    global _limit
+    _limit = count
+
 
 def available_cores() -> int:
     """Number of cores that this process may use."""
     try:
-        return len(os.sched_getaffinity(0))
+        cores = len(os.sched_getaffinity(0))
     except AttributeError:  # macOS and Windows have no affinity call
-        return os.cpu_count() or 1
+        cores = os.cpu_count() or 1
+    return cores if _limit is None else min(cores, _limit)
 
 
 @cache
@@ -60,6 +72,7 @@ def thread_map[T, R](
     """
     work = list(items)
     jobs = available_cores() if jobs is None else jobs
+    jobs = jobs if _limit is None else min(jobs, _limit)
     if jobs <= 1 or len(work) <= 1:
         return [function(item) for item in work]
     # Threads of ours that each call a linear algebra library with threads of its own would crowd

@@ -29,7 +29,6 @@ from bayesoleo.estimation.problem import Array, Problem
 from bayesoleo.estimation.redraw import DataSource, NoiseBlock, data_source
 from bayesoleo.estimation.replicate import estimate_many
 from bayesoleo.estimation.shown import Shown, columns
-from bayesoleo.parallel import thread_map
 from bayesoleo.solvers.status import Status, count
 from bayesoleo.storage.slots import Arrays, Slots
 
@@ -106,6 +105,7 @@ def sampling_distribution(
     block: int = 100,
     out: str | os.PathLike[str] | None = None,
     jobs: int | None = None,
+    scheduler: str | None = None,
     progress: bool = False,
 ) -> Shown:
     """Simulate an experiment again and again, estimate from each, and compare with theory.
@@ -137,6 +137,9 @@ def sampling_distribution(
         Folder in which finished blocks are kept; the same call goes on where it was stopped.
     jobs : int, optional
         Threads over blocks; by default the cores this process may use.
+    scheduler : str, optional
+        Other processes or machines that make the blocks instead: ``local:4``, or the address of a
+        Dask scheduler; see :func:`bayesoleo.machines.connected`.
     progress : bool, optional
         Whether to show a bar.
 
@@ -174,13 +177,19 @@ def sampling_distribution(
     find_method(method)
     work = _Work(source, theta, method, seed, tolerance, max_iterations)
     slots = Slots(out, _fingerprint(problem, work, blocks, block))
-    parts = _all_blocks(work, slots, replications, block, jobs, progress)
+    parts = _all_blocks(work, slots, replications, block, jobs, scheduler, progress)
     data = _summarise(problem, work, blocks, parts)
     return Shown(data, sampling_text(data))
 
 
 def _all_blocks(
-    work: _Work, slots: Slots, replications: int, block: int, jobs: int | None, progress: bool
+    work: _Work,
+    slots: Slots,
+    replications: int,
+    block: int,
+    jobs: int | None,
+    scheduler: str | None,
+    progress: bool,
 ) -> Arrays:
     """Blocks that are stored, and those that had to be made."""
     from tqdm.auto import tqdm
@@ -189,19 +198,31 @@ def _all_blocks(
         range(first, min(first + block, replications)) for first in range(0, replications, block)
     ]
     with tqdm(total=replications, unit="fit", desc="replications", disable=not progress) as bar:
-
-        def get(index: int) -> Arrays:
-            wanted = numbers[index]
-            arrays = slots.read(index)
+        parts = slots.fill(
+            _Blocks(work, numbers),
+            len(numbers),
             # The last block of a shorter calculation is made again in full by a longer one.
-            if arrays is None or len(arrays["status"]) < len(wanted):
-                arrays = work.block(wanted)
-                slots.write(index, arrays)
-            bar.update(len(wanted))
-            return {name: values[: len(wanted)] for name, values in arrays.items()}
+            whole=lambda index, arrays: len(arrays["status"]) >= len(numbers[index]),
+            scheduler=scheduler,
+            jobs=jobs,
+            done=lambda index: bar.update(len(numbers[index])) and None,
+        )
+    wanted = [
+        {name: values[: len(block)] for name, values in part.items()}
+        for part, block in zip(parts, numbers, strict=True)
+    ]
+    return {name: np.concatenate([part[name] for part in wanted]) for name in wanted[0]}
 
-        parts = thread_map(get, range(len(numbers)), jobs)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Makes a block of replications by its number, wherever it is sent."""
+
+    work: _Work
+    numbers: Sequence[range]
+
+    def __call__(self, index: int) -> Arrays:
+        return self.work.block(self.numbers[index])
 
 
 def _fingerprint(problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], block: int) -> str:

@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from bayesoleo.errors import ResultsError
 from bayesoleo.posterior.mixture import Mixture
 from bayesoleo.posterior.segment import Phase, Segment
+from bayesoleo.storage.lock import only_writer
 
 _NAME = "segment-{:06d}.npz"
 _COUNTERS = ("failures", "proposed", "accepted")
@@ -268,29 +269,5 @@ def open_store(folder: Path | None, fingerprint: str) -> Iterator[Store]:
     if folder is None:
         yield MemoryStore()
         return
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "lock", "a+b") as file:
-        if not _lock(file):
-            raise ResultsError(
-                "another process is writing draws here",
-                file=folder,
-                hint="wait for it, or give another folder",
-            )
-        # Closing the file releases the lock, and so does the end of the process, however it comes.
-        yield FolderStore(folder, fingerprint)
-
-
-def _lock(file: IO[bytes]) -> bool:
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+    with only_writer(folder):
+        yield FolderStore(Path(folder), fingerprint)

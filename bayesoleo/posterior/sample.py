@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from bayesoleo.errors import InputError
+from bayesoleo.machines import connected
 from bayesoleo.posterior.checkpoint import Store, open_store
 from bayesoleo.posterior.density import Density
-from bayesoleo.posterior.diagnostics import (
-    autocorrelation_time,
-    nested_rhat,
-    rhat_limit,
-)
+from bayesoleo.posterior.diagnostics import autocorrelation_time, nested_rhat
 from bayesoleo.posterior.diagnostics import (
     effective_size as effective_size_of,
 )
@@ -27,79 +24,10 @@ from bayesoleo.posterior.ensembles import Ensembles, MoveWeights, default_walker
 from bayesoleo.posterior.mixture import Mixture
 from bayesoleo.posterior.samples import Samples
 from bayesoleo.posterior.segment import Segment
+from bayesoleo.posterior.spread import SpreadDensity
+from bayesoleo.posterior.stopping import Quality, Schedule
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """When to adapt, how long to keep, when to stop.
-
-    Parameters
-    ----------
-    effective_size : float
-        Effective draws asked for, of every quantity.
-    max_evaluations : int
-        No segment begins that would take more rows of the log density than this.
-    warm_up : int
-        Draws of the first warm-up round; each later one has twice as many.
-    most_rounds : int
-        Warm-up rounds at most.
-    least : int
-        Kept draws of each walker before anything is decided.
-    times : float
-        Kept draws in autocorrelation times before the estimates are believed.
-    segment : int
-        Draws of the longest segment: what a kill can cost.
-    """
-
-    effective_size: float
-    max_evaluations: int
-    warm_up: int
-    most_rounds: int
-    least: int
-    times: float
-    segment: int
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Diagnostics of the draws kept so far.
-
-    Parameters
-    ----------
-    times, sizes, rhat : ndarray, shape (d,)
-        Autocorrelation time, effective size, nested R-hat.
-    draws : int
-        Kept draws of each walker.
-    """
-
-    times: Array
-    sizes: Array
-    rhat: Array
-    draws: int
-
-    def shortfalls(self, schedule: Schedule, ensembles: int) -> list[str]:
-        """What is not yet good enough, in words; empty if everything is."""
-        if not np.all(np.isfinite(self.times)):
-            return ["a quantity never moved"]
-        short = []
-        if self.sizes.min() < schedule.effective_size:
-            short.append(
-                f"the effective size is {self.sizes.min():.0f}"
-                f" of {schedule.effective_size:.0f} asked for"
-            )
-        if self.draws < schedule.times * self.times.max():
-            short.append(
-                f"{self.draws} draws are fewer than {schedule.times:.0f}"
-                f" autocorrelation times of {self.times.max():.1f}"
-            )
-        limit = rhat_limit(ensembles, schedule.effective_size)
-        if self.rhat.max() > limit:
-            short.append(
-                f"the ensembles disagree: nested R-hat {self.rhat.max():.3f} above {limit:.3f}"
-            )
-        return short
 
 
 def sample(
@@ -117,6 +45,7 @@ def sample(
     weights: MoveWeights | None = None,
     segment: int = 100,
     quick: bool = False,
+    scheduler: str | None = None,
 ) -> Samples:
     """Draw from a density until every quantity has the effective size asked for.
 
@@ -152,6 +81,9 @@ def sample(
         Draws of the longest checkpointed segment.
     quick : bool
         Shorter warm-up and an effective size of at most 200, for a first look.
+    scheduler : str, optional
+        Other processes or machines that evaluate the density: ``local:4``, or the address of a Dask
+        scheduler; see :func:`bayesoleo.machines.connected`. The draws are the same.
 
     Returns
     -------
@@ -185,7 +117,10 @@ def sample(
     )
     schedule = _schedule(effective_size, max_evaluations, segment, quick)
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule)
-    with open_store(None if out is None else Path(out), print_of_run) as store:
+    place = None if out is None else Path(out)
+    with open_store(place, print_of_run) as store, connected(scheduler) as client:
+        if client is not None:
+            group = replace(group, log_density=SpreadDensity(log_density, client))
         bar = _Bar(schedule.effective_size, progress)
         try:
             _warm_up(store, group, schedule, start, seed, bar)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,25 @@ class Predictor:
 
         self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
         self._base = np.stack([run.base_constants() for run in self.runs])
+
+    def __copy__(self) -> Predictor:
+        """A copy that shares everything, and not one made anew of a state."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs to make the same predictor: compiled code stays here."""
+        names = ("model", "records", "steps", "scheme", "backend", "jobs")
+        return {name: getattr(self, name) for name in names} | {
+            "found": [run.found() for run in self.runs]
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        found, model, records = (state.pop(name) for name in ("found", "model", "records"))
+        Predictor.__init__(self, model, records, **state)
+        for run, known in zip(self.runs, found, strict=True):
+            run.restore(known)
 
     def constants(self, theta: Array, run: int) -> Array:
         """Model constants of a run, shape (L, np), from unknowns of shape (L, l)."""

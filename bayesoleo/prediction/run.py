@@ -139,6 +139,14 @@ class RunPredictor:
                     "under [runs.conditions]",
                 )
 
+    def found(self) -> dict[str, Any]:
+        """What does not follow from model, record and mesh, to be given to :meth:`restore`."""
+        return {"anchor": self.anchor, "measured": self.measured}
+
+    def restore(self, found: dict[str, Any]) -> None:
+        """Take over what :meth:`found` gave of the same run, here or in another process."""
+        vars(self).update(found)
+
     def base_constants(self) -> Array:
         """Nominal parameters and this run's conditions, shape (np,)."""
         values = []

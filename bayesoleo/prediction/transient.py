@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +137,16 @@ class TransientRun(RunPredictor):
             mesh, lambda position: self._inputs(position * self.period), self.method, shortest
         )
         self._adopt(self.chosen)
+
+    def found(self) -> dict[str, Any]:
+        """As of a periodic run, and the mesh."""
+        return {**super().found(), "chosen": self.chosen}
+
+    def restore(self, found: dict[str, Any]) -> None:
+        """Take over what :meth:`found` gave."""
+        super().restore(found)
+        if self.chosen is not None:
+            self._adopt(self.chosen)
 
     # -- solving ---------------------------------------------------------------------------
 

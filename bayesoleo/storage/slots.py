@@ -7,7 +7,7 @@ that was stopped goes on to the same result in any order and with any number of 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import ResultsError
+from bayesoleo.machines import connected, each_done
 from bayesoleo.storage.atomic import replacing
+from bayesoleo.storage.lock import only_writer
 
 Arrays = dict[str, NDArray]
 _FINGERPRINT = "fingerprint"
@@ -86,3 +88,59 @@ class Slots:
         named: Arrays = {**arrays, _FINGERPRINT: np.array(self.fingerprint)}
         with replacing(path) as draft:
             np.savez(draft, **named)  # type: ignore[arg-type]
+
+    def fill(
+        self,
+        make: Callable[[int], Arrays],
+        count: int,
+        *,
+        whole: Callable[[int, Arrays], bool] = lambda _number, _arrays: True,
+        scheduler: str | None = None,
+        jobs: int | None = None,
+        done: Callable[[int], None] = lambda _number: None,
+    ) -> list[Arrays]:
+        """Make the pieces that are missing, and return all.
+
+        Workers only make them; this process alone writes, each piece as soon as it is there.
+
+        Parameters
+        ----------
+        make : callable
+            Piece by number; a function of the number alone. With a scheduler it is sent to others.
+        count : int
+            Pieces ``0 … count - 1`` are wanted.
+        whole : callable, optional
+            Whether a stored piece is all of what is wanted.
+        scheduler : str, optional
+            See :func:`bayesoleo.machines.connected`.
+        jobs : int, optional
+            Threads, where there is no scheduler.
+        done : callable, optional
+            Told the number of each piece that is there.
+
+        Returns
+        -------
+        list of dict
+            By number.
+
+        Raises
+        ------
+        ResultsError
+            If another process writes to the folder, or a stored piece is damaged.
+        """
+        with only_writer(self.folder):
+            pieces: dict[int, Arrays] = {}
+            for number in range(count):
+                stored = self.read(number)
+                if stored is not None and whole(number, stored):
+                    pieces[number] = stored
+                    done(number)
+            missing = [number for number in range(count) if number not in pieces]
+            if missing:
+                with connected(scheduler) as client:
+                    for index, arrays in each_done(make, missing, client=client, jobs=jobs):
+                        number = missing[index]
+                        self.write(number, arrays)
+                        pieces[number] = arrays
+                        done(number)
+        return [pieces[number] for number in range(count)]

@@ -113,7 +113,7 @@ def test_stopped_calculation_goes_on_to_the_same_result(line, tmp_path, monkeypa
     stopped = sampling_distribution(
         problem, TRUTH, out=tmp_path, **(options | {"replications": 25})
     )
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.glob("slot-*.npz"))) == 3
     made = []
     block = module._Work.block
     monkeypatch.setattr(
@@ -213,3 +213,12 @@ def test_gas_spring_with_ten_thousand_replications(gas_spring):
     # most; a variance of 10 000 draws is good to 1.4 %
     assert abs(float(found["bias"][0])) < 0.05 * float(found["sd"][0])
     assert float(found["efficiency"][0]) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_other_processes_make_the_same_replications(line, tmp_path):
+    problem, _ = line
+    options = {"variance": [NOISE**2], "replications": 30, "block": 7}
+    here = sampling_distribution(problem, TRUTH, jobs=1, **options)
+    there = sampling_distribution(problem, TRUTH, out=tmp_path, scheduler="local:2", **options)
+    np.testing.assert_array_equal(there["replicate"], here["replicate"])

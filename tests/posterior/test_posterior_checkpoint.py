@@ -96,7 +96,7 @@ def test_another_fingerprint_is_refused(tmp_path):
 def test_two_writers_are_refused(tmp_path):
     with (
         checkpoint.open_store(tmp_path, "x"),
-        pytest.raises(ResultsError, match="another process is writing"),
+        pytest.raises(ResultsError, match="another process is writing here"),
         checkpoint.open_store(tmp_path, "x"),
     ):
         pass

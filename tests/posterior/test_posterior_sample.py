@@ -180,3 +180,16 @@ def test_draws_are_chosen_once_each():
     assert variance.shape == (50, 0)
     again, _ = choose_draws(samples, 50, seed=0)
     np.testing.assert_array_equal(theta, again)
+
+
+@pytest.mark.slow
+def test_other_processes_draw_the_same():
+    target = LogDensity(gas_spring(relative_sd=0.1, seed=1))
+    start = laplace_mixture(target, np.array([[1.2]]))
+    options = {"effective_size": 200, "seed": 3, "progress": False, "quick": True}
+    here = sample(target, start, **options)
+    there = sample(LogDensity(target.problem), start, scheduler="local:2", **options)
+    np.testing.assert_array_equal(there.draws, here.draws)
+    np.testing.assert_array_equal(there.log_likelihood, here.log_likelihood)
+    assert there.acceptance == here.acceptance
+    assert there.failures == here.failures

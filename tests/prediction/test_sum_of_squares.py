@@ -1,13 +1,16 @@
 """The misfit of a vector depends on that vector alone, bit for bit."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
-from synthetic_runs import answered, oleo_runs
+from synthetic_runs import answered, harmonics, oleo_runs, run, stroke
 
 from bayesoleo.model.drive import driven_by
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.solvers.status import Status, count
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.systems.oleo import mechanical_oleo, thermomechanical_oleo
 
 STEPS = 64
 
@@ -68,9 +71,9 @@ def test_row_position_changes_nothing(predictor, vectors, whole):
 
 
 def test_sums_are_those_of_the_predicted_outputs(predictor, vectors, whole):
-    for r, run in enumerate(predictor.runs):
+    for r, one in enumerate(predictor.runs):
         samples = predictor.simulate(vectors[:4], r)
-        expected = np.sum((run.measured - samples.y) ** 2, axis=2)
+        expected = np.sum((one.measured - samples.y) ** 2, axis=2)
         # The same numbers summed in another order.
         np.testing.assert_allclose(whole[0][:4, r], expected, rtol=1e-12)
 
@@ -92,3 +95,37 @@ def test_without_an_anchor_nothing_converges(model, predictor):
     squares, status = fresh.sum_of_squares(fresh.layout.start(model)[None])
     assert Status(status[0]) is Status.NO_CONVERGENCE
     assert np.isnan(squares).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "channel", "signal"),
+    [
+        (driven_by(thermomechanical_oleo(2), "displacement"), "displacement", stroke(0.13, 0.03)),
+        (thermomechanical_oleo(2), "force", harmonics([0, 1], [2500.0, 500.0])),
+        (mechanical_oleo(2), "force", harmonics([0, 1], [2500.0, 500.0])),
+    ],
+)
+def test_comparing_block_by_block_is_comparing_predictions(model, channel, signal):
+    """First- and second-order dofs, with a last block that is not full."""
+    others = tuple({"force", "displacement", "pressure"} - {channel})
+    blank = [run("a", {channel: signal}, 0.5, others=others)]
+    records = answered(model, blank, noise=0.01, steps=STEPS)
+    predictor = Predictor(model, records, steps=STEPS, jobs=1)
+    start = predictor.layout.start(model)
+    predictor.set_anchor(start)
+    theta = start * (1 + 0.003 * np.random.default_rng(1).standard_normal((5, start.size)))
+    squares, status = predictor.sum_of_squares(theta)
+    assert (status == Status.CONVERGED).all()
+    for r, one in enumerate(predictor.runs):
+        assert one._fused_squares() is not None
+        found = one.predict(predictor.constants(theta, r))
+        expected = np.sum((one.measured - found.y) ** 2, axis=2)
+        np.testing.assert_allclose(squares[:, r], expected, rtol=1e-12)
+
+
+def test_a_predictor_sent_to_another_process_is_the_same(predictor, vectors, whole):
+    sent = pickle.loads(pickle.dumps(predictor))
+    squares, status = sent.sum_of_squares(vectors)
+    assert squares.tobytes() == whole[0].tobytes()
+    np.testing.assert_array_equal(status, whole[1])
+    assert copy.copy(predictor).runs is predictor.runs
