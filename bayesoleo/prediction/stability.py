@@ -148,9 +148,12 @@ class Stability:
 
     def together(self, other: Stability) -> Stability:
         """These runs and others, of one model."""
+        rows = np.full((len(other.runs), self.multipliers.shape[1]), complex(np.nan, np.nan))
+        if other.multipliers.size:
+            rows[:] = other.multipliers
         return Stability(
             self.runs + other.runs,
-            np.concatenate([self.multipliers, other.multipliers]),
+            np.concatenate([self.multipliers, rows]),
             np.concatenate([self.jumps, other.jumps]),
         )
 
