@@ -13,7 +13,8 @@ from scipy.integrate import solve_bvp, solve_ivp
 
 from bayesoleo.model import Model
 
-RELATIVE = 1e-6
+#: Absolute tolerances are a part of the relative one, over the states' sizes: that one rules.
+RELATIVE, ABSOLUTE = 1e-6, 1e-9
 MOST_PERIODS = 200
 NAMES = ("lsoda", "lsoda_compiled", "bvp")
 #: First mesh of ``solve_bvp``, as fine as the discretisation's; and where it may give up.
@@ -63,7 +64,7 @@ def plain(explicit: Explicit, case: Case) -> Callable[[float, Array], list[float
 def integrated(case: Case, rates: Callable) -> tuple[float, float]:
     """Seconds until the state repeats to 1e-6 of its sizes, and the error then."""
     period, scale = case.run.period, case.scale
-    options = {"method": "LSODA", "rtol": RELATIVE, "atol": RELATIVE * scale}
+    options = {"method": "LSODA", "rtol": RELATIVE, "atol": ABSOLUTE * scale}
     s = case.begin(np.zeros(1))[:, 0]
     begin, repeats = time.thread_time(), False
     for k in range(MOST_PERIODS):
