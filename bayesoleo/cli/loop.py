@@ -113,6 +113,8 @@ def close(
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
+    error_model: options.ErrorModel = "independent",
+    between_runs: options.BetweenRuns = "",
 ) -> None:
     """Close the loop: estimate, find what is missing, add it, compare before and after.
 
@@ -149,6 +151,8 @@ def close(
         drive=drive,
         effects=effects,
         nuisance=nuisance,
+        error_model=error_model,
+        between_runs=between_runs,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)

@@ -125,6 +125,26 @@ Nuisance = Annotated[
         "(accuracy).",
     ),
 ]
+ErrorModel = Annotated[
+    str,
+    typer.Option(
+        "--error-model",
+        metavar="NAME",
+        rich_help_panel=SOLVING,
+        help="What errors have in common: independent (one variance an output), per-run, full "
+        "(outputs correlated), correlated (in time), discrepancy (repeats every period).",
+    ),
+]
+BetweenRuns = Annotated[
+    str,
+    typer.Option(
+        "--between-runs",
+        metavar="NAME,…",
+        show_default=False,
+        rich_help_panel=SOLVING,
+        help="Parameters that scatter between runs: mean and spread are estimated with them.",
+    ),
+]
 MaxEffects = Annotated[
     int,
     typer.Option(
@@ -159,15 +179,18 @@ def settings(
     drive: str | None = None,
     effects: str | None = None,
     nuisance: str = "",
+    error_model: str = "independent",
+    between_runs: str = "",
 ) -> Settings:
     """Settings of the workflow from options.
 
     Raises
     ------
     InputError
-        If there is no such scheme, or the file of effects cannot be used.
+        If there is no such scheme or error model, or the file of effects cannot be used.
     """
     from bayesoleo.modelfile import load_effects
+    from bayesoleo.posterior.error_models import check_word
     from bayesoleo.workflow import Settings
 
     if scheme not in SCHEMES:
@@ -185,6 +208,13 @@ def settings(
         max_effects=max_effects,
         drive=drive,
         effects=None if effects is None else load_effects(effects),
-        nuisance=tuple(word.strip() for word in nuisance.split(",") if word.strip()),
+        nuisance=_words(nuisance),
+        error_model=check_word(error_model),
+        between_runs=_words(between_runs),
         command=shlex.join(["bayesoleo", *sys.argv[1:]]),
     )
+
+
+def _words(text: str) -> tuple[str, ...]:
+    """What stands between commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())

@@ -160,6 +160,8 @@ def estimate(
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
+    error_model: options.ErrorModel = "independent",
+    between_runs: options.BetweenRuns = "",
     each: by_run.Each = False,
     as_json: options.Json = False,
 ) -> None:
@@ -179,20 +181,34 @@ def estimate(
 
     if out is not None:
         shell.check_writable(out)
-    chosen = options.settings(jobs=jobs, scheme=scheme, steps=steps, drive=drive, nuisance=nuisance)
+    chosen = options.settings(
+        jobs=jobs,
+        scheme=scheme,
+        steps=steps,
+        drive=drive,
+        nuisance=nuisance,
+        error_model=error_model,
+        between_runs=between_runs,
+    )
     declared = load_model(model)
     if each:
         by_run.estimate_each(campaign, declared, chosen, out, quiet, as_json)
         return
     with shell.stoppable(out):
         tree = workflow.estimate(campaign, declared, chosen, out=out, say=shell.teller(quiet))
+    quantities = _error_quantities(tree)
     if as_json:
-        shell.print_json(tables.plain({"parameters": _point(tree), "status": _status(tree)}))
+        facts = {"parameters": _point(tree), "status": _status(tree)}
+        facts |= {"error_model": quantities} if quantities else {}
+        shell.print_json(tables.plain(facts))
         return
     console = shell.console()
     names = ("unit", "start", "mbe", "estimate", "sd")
     rows = [[name, *(row[key] for key in names)] for name, row in _point(tree).items()]
     console.print(tables.table(["parameter", *names], rows, words=2))
+    if quantities:
+        rows = [[name, row["estimate"], row["sd"]] for name, row in quantities.items()]
+        console.print(tables.table(["of the errors and runs", "mode", "sd"], rows, words=1))
     for line in _how_it_went(_status(tree)):
         console.print(line, style="dim", markup=False, highlight=False)
     _print_written(out, console)
@@ -205,6 +221,17 @@ def _point(tree: xr.DataTree) -> dict[str, dict[str, Any]]:
         str(name): {"unit": str(point[schema.UNIT].values[k])}
         | {key: float(point[key].values[k]) for key in keys}
         for k, name in enumerate(point[schema.PARAMETER].values)
+    }
+
+
+def _error_quantities(tree: xr.DataTree) -> dict[str, dict[str, float]]:
+    """Mode and standard deviation of what is not a parameter of the model; empty if nothing is."""
+    if schema.ERROR_MODEL not in tree.children:
+        return {}
+    found = tree[schema.ERROR_MODEL].to_dataset()
+    return {
+        str(name): {key: float(found[key].values[k]) for key in (schema.ESTIMATE, schema.SD)}
+        for k, name in enumerate(found[schema.QUANTITY].values)
     }
 
 
@@ -241,6 +268,8 @@ def sample(
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
+    error_model: options.ErrorModel = "independent",
+    between_runs: options.BetweenRuns = "",
 ) -> None:
     """Sample the posterior from the estimate until the effective size asked for is reached.
 
@@ -255,6 +284,7 @@ def sample(
     Examples:
       bayesoleo sample shaker --model f16n2d2 --quick
       bayesoleo sample shaker --model model.py:model --effective-size 4000
+      bayesoleo sample shaker --model f16n2d2 --error-model discrepancy
     """
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
@@ -269,6 +299,8 @@ def sample(
         steps=steps,
         drive=drive,
         nuisance=nuisance,
+        error_model=error_model,
+        between_runs=between_runs,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)

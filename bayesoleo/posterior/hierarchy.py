@@ -11,19 +11,21 @@ one with two bounds that of the logit.
 
 Sampled as they stand, the runs' values and the mean would have to move together whenever :math:`s`
 shrinks; their deviations from it would, whenever :math:`s` grows. So the coordinates follow what
-the runs say for themselves: where run :math:`\kappa` alone puts its value at
-:math:`\hat u_\kappa \pm \sigma_\kappa`,
+the runs say for themselves: where run :math:`\kappa` alone, given the parameters that all runs have
+in common, puts its value at :math:`\hat u_\kappa \pm \sigma_\kappa`,
 
 .. math::
 
     u_\kappa = \frac{s^2 \hat u_\kappa + \sigma_\kappa^2 \mu}{s^2 + \sigma_\kappa^2}
                + \frac{s \sigma_\kappa}{\sqrt{s^2 + \sigma_\kappa^2}}\, z_\kappa ,
 
-and likewise :math:`\mu` is its own mean and spread given :math:`s`, plus so many of them. For a
+and likewise :math:`\mu` is its own mean given :math:`s` plus so many of its own spreads. For a
 linear model with normal errors all :math:`z` are then independent and standard normal whatever
 :math:`s` is: centred where the data are strong, not centred where they are weak, and anything
-between. The posterior does not depend on the numbers :math:`\hat u` and :math:`\sigma`, only the
-work does.
+between. The spread itself may be anything from nothing to far more than was seen; its coordinate
+is the normal quantile of a half-Cauchy distribution function, in which both of its tails, flat at
+nothing and a power far out, are like a normal's. The posterior does not depend on the numbers
+:math:`\hat u` and :math:`\sigma`, only the work does.
 
 References
 ----------
@@ -42,11 +44,14 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problem import Problem
 from bayesoleo.model.priors import Prior
+from bayesoleo.posterior.error_models import ErrorModel, error_model
+from bayesoleo.posterior.information import information_at, residuals_at
 from bayesoleo.posterior.transforms import Transform
 from bayesoleo.posterior.unknowns import Array, PlainUnknowns, Unknowns
 
@@ -72,6 +77,10 @@ class Population:
         Of the mean, in the parameter's unit.
     centres, sds : ndarray, shape (N,)
         What each run says of its value by itself, in coordinates without bounds.
+    slopes : ndarray, shape (N, k)
+        How the centres move with the coordinates of the ``k`` shared unknowns ...
+    common : ndarray, shape (k,)
+        ... from these.
     """
 
     name: str
@@ -79,6 +88,17 @@ class Population:
     prior: Prior
     centres: Array
     sds: Array
+    slopes: Array
+    common: Array
+
+    def told(self, shared: Array) -> Array:
+        """Centres, shape (W, N), given coordinates of the shared unknowns, shape (W, k)."""
+        centres = np.repeat(self.centres[None], len(shared), axis=0)
+        for k, place in enumerate(self.common):
+            away = shared[:, k] - place
+            for run, slope in enumerate(self.slopes[:, k]):
+                centres[:, run] += slope * away
+        return centres
 
     @cached_property
     def transform(self) -> Transform:
@@ -91,48 +111,78 @@ class Population:
         return float(self.transform.unbounded(np.array([self.prior.mean]))[0])
 
     @cached_property
+    def typical(self) -> float:
+        """The spread that the runs' own words suggest, or how small a one they could tell."""
+        noise = float(np.mean(self.sds**2))
+        seen = float(np.var(self.centres, ddof=1)) - noise
+        # A variance from N values has a relative error of sqrt(2 / N).
+        return float(np.sqrt(max(seen, noise * np.sqrt(2 / self.centres.size))))
+
+    def spread_of(self, w: Array) -> tuple[Array, Array]:
+        """Spread, shape (W,), and logarithm of its derivative, from its coordinate."""
+        # From the nearer end, so that neither tail is lost to rounding.
+        angle = 0.5 * np.pi * ndtr(-np.abs(w))
+        tangent = np.tan(angle)
+        ratio = np.where(w < 0, tangent, 1.0 / tangent)
+        log_normal = -0.5 * w * w - _LOG_SQRT_2_PI
+        slope = log_normal + np.log(0.5 * np.pi * self.typical) + np.log1p(ratio * ratio)
+        return self.typical * ratio, slope
+
+    def coordinate_of(self, spread: Array) -> Array:
+        """Coordinate of spreads, shape (W,)."""
+        ratio = spread / self.typical
+        tail = 2 / np.pi * np.arctan(np.minimum(ratio, 1.0 / ratio))
+        return np.asarray(np.where(ratio < 1, 1.0, -1.0) * ndtri(tail))
+
+    @cached_property
     def scale(self) -> float:
         """Scale of the spread's prior: the parameter's prior sd, in coordinates without bounds."""
         slope = self.transform.derivative(np.array([self.middle]))[0]
         return float(self.prior.sd / abs(slope))
 
-    def mean_given(self, spread: Array) -> tuple[Array, Array]:
-        """Mean of ``mu`` given spreads (W,), and its standard deviation."""
+    def mean_given(self, spread: Array, told: Array) -> tuple[Array, Array]:
+        """Mean of ``mu`` given spreads (W,) and centres (W, N), and its standard deviation."""
         precision = np.full(spread.shape, self.scale**-2.0)
         weighted = precision * self.middle
-        for centre, sd in zip(self.centres, self.sds, strict=True):
+        for centre, sd in zip(told.T, self.sds, strict=True):
             weight = 1.0 / (sd * sd + spread * spread)
             precision += weight
             weighted += weight * centre
         return weighted / precision, 1.0 / np.sqrt(precision)
 
-    def run_given(self, k: int, mean: Array, spread: Array) -> tuple[Array, Array]:
+    def run_given(self, k: int, mean: Array, spread: Array, told: Array) -> tuple[Array, Array]:
         """Mean of run ``k``'s value given ``mu`` and spreads (W,), and its standard deviation."""
         own, common = self.sds[k] * self.sds[k], spread * spread
         total = own + common
-        middle = (common * self.centres[k] + own * mean) / total
+        middle = (common * told[:, k] + own * mean) / total
         return middle, self.sds[k] * spread / np.sqrt(total)
 
-    def values(self, z: Array, zeta: Array, log_spread: Array) -> tuple[Array, Array, Array, Array]:
+    def values(
+        self, z: Array, zeta: Array, w: Array, shared: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Runs' values (W, N), mean, spread and log Jacobian (W,) from coordinates."""
-        spread = np.exp(log_spread)
-        middle, width = self.mean_given(spread)
-        mean, jacobian = middle + width * zeta, np.log(width)
+        told = self.told(shared)
+        spread, stretch = self.spread_of(w)
+        middle, width = self.mean_given(spread, told)
+        mean, jacobian = middle + width * zeta, stretch + np.log(width)
         u = np.empty(z.shape)
         for k in range(z.shape[1]):
-            middle, width = self.run_given(k, mean, spread)
+            middle, width = self.run_given(k, mean, spread, told)
             u[:, k] = middle + width * z[:, k]
             jacobian = jacobian + np.log(width)
         return u, mean, spread, jacobian
 
-    def coordinates(self, u: Array, mean: Array, spread: Array) -> tuple[Array, Array]:
-        """``z (W, N)`` and ``zeta (W,)`` of values, mean and spread."""
-        middle, width = self.mean_given(spread)
+    def coordinates(
+        self, u: Array, mean: Array, spread: Array, shared: Array
+    ) -> tuple[Array, Array, Array]:
+        """``z (W, N)``, ``zeta (W,)`` and ``w (W,)`` of values, mean and spread."""
+        told = self.told(shared)
+        middle, width = self.mean_given(spread, told)
         zeta, z = (mean - middle) / width, np.empty(u.shape)
         for k in range(u.shape[1]):
-            middle, width = self.run_given(k, mean, spread)
+            middle, width = self.run_given(k, mean, spread, told)
             z[:, k] = (u[:, k] - middle) / width
-        return z, zeta
+        return z, zeta, self.coordinate_of(spread)
 
     def log_prior(self, u: Array, mean: Array, spread: Array) -> Array:
         """Log density, shape (W,), of values and mean without bounds, and of the spread."""
@@ -202,7 +252,9 @@ class HierarchicalUnknowns(Unknowns):
         mean, spread = (np.ascontiguousarray(block[:, i]) for i in self._places(k))
         population = self.populations[k]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return population.values(block[:, population.members], mean, spread)
+            return population.values(
+                block[:, population.members], mean, spread, block[:, self._shared]
+            )
 
     def theta(self, block: Array) -> Array:
         u = np.array(block[:, : len(self.plain.labels)], dtype=float)
@@ -227,8 +279,9 @@ class HierarchicalUnknowns(Unknowns):
             mean = population.transform.unbounded(natural[:, first])
             spread = np.ascontiguousarray(natural[:, second])
             u = out[:, population.members]
-            z, out[:, first] = population.coordinates(u, mean, spread)
-            out[:, population.members], out[:, second] = z, np.log(spread)
+            shared = out[:, self._shared]
+            z, out[:, first], out[:, second] = population.coordinates(u, mean, spread, shared)
+            out[:, population.members] = z
         return out
 
     def log_prior(self, block: Array) -> Array:
@@ -238,8 +291,7 @@ class HierarchicalUnknowns(Unknowns):
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for k, population in enumerate(self.populations):
                 u, mean, spread, jacobian = self._values(block, k)
-                # The spread's coordinate is its logarithm.
-                total += population.log_prior(u, mean, spread) + jacobian + np.log(spread)
+                total += population.log_prior(u, mean, spread) + jacobian
         return total
 
     def natural_log_prior(self, natural: Array) -> dict[str, Array]:
@@ -289,7 +341,7 @@ class HierarchicalUnknowns(Unknowns):
             ahead, behind = (self._deviations(block + sign * steps, k) for sign in (1, -1))
             slope = (ahead - behind) / (2 * _STEP)
             matrix += slope @ slope.T
-            # Of the logarithm of a spread hardly anything is known.
+            # The spread's coordinate is about standard normal.
             place = self._places(k)[1]
             matrix[place, place] += 1.0
         return matrix
@@ -307,20 +359,23 @@ def hierarchical(
     names: Sequence[str],
     *,
     theta: Array | None = None,
-    sd: Array | None = None,
+    errors: ErrorModel | str = "independent",
 ) -> HierarchicalUnknowns:
     """Let parameters that vary by run scatter about a mean that is estimated.
 
     Parameters
     ----------
     problem : Problem
-        With unknowns ``name[run]`` for every name.
+        With unknowns ``name[run]`` for every name. It is evaluated once: freeze its anchor
+        afterwards.
     names : sequence of str
         Parameters that scatter.
-    theta, sd : ndarray, shape (l,), optional
-        What the runs say by themselves: an estimate with its standard deviations, infinite or
-        large where a run says nothing. The posterior does not depend on them, only how many
-        evaluations it takes. By default the problem's start and the priors' spread.
+    theta : ndarray, shape (l,), optional
+        An estimate with a value of each run's own, from which it is learnt what the runs say by
+        themselves. The posterior does not depend on it, only how many evaluations it takes. By
+        default the problem's start.
+    errors : ErrorModel or str, optional
+        Says how much the data are worth there.
 
     Returns
     -------
@@ -329,20 +384,43 @@ def hierarchical(
     Raises
     ------
     InputError
-        If a parameter does not vary by run, or there are fewer than three runs.
+        If a parameter does not vary by run, there are fewer than three runs, or the problem cannot
+        be evaluated.
     """
     plain = PlainUnknowns(tuple(problem.names), tuple(problem.priors))
-    centres = plain.start(np.asarray(problem.start if theta is None else theta, dtype=float))
-    widths = np.array([prior.sd for prior in plain.priors])
-    widths = widths if sd is None else np.minimum(sd, widths)
-    slopes = np.abs(plain.transforms.derivative(centres[None])[0])
-    populations = []
-    for name in dict.fromkeys(names):
-        members = _members(problem, name)
-        prior = plain.priors[int(members[0])]
-        own = (centres[members], widths[members] / slopes[members])
-        populations.append(Population(name, members, prior, *own))
-    return HierarchicalUnknowns(plain, tuple(populations))
+    members = {name: _members(problem, name) for name in dict.fromkeys(names)}
+    theta = np.asarray(problem.start if theta is None else theta, dtype=float)
+    model = error_model(errors, problem) if isinstance(errors, str) else errors
+    eta = model.start(residuals_at(problem, model, theta))
+    units = plain.transforms.derivative(plain.start(theta)[None])[0]
+    information = information_at(problem, model, theta, eta) * np.outer(units, units)
+    # A run that says nothing of a value leaves it to the prior.
+    widths = np.array([prior.sd for prior in plain.priors]) / np.abs(units)
+    information += np.diag(widths**-2.0)
+    centres = plain.start(theta)
+    taken = np.concatenate(list(members.values()))
+    shared = np.setdiff1d(np.arange(len(plain.labels)), taken)
+    table = np.stack(list(members.values()))  # population, run
+    sds, slopes = np.empty(table.shape), np.empty((*table.shape, shared.size))
+    for run, own in enumerate(table.T):
+        inverse = np.linalg.inv(information[np.ix_(own, own)])
+        sds[:, run] = np.sqrt(np.diag(inverse))
+        slopes[:, run] = -inverse @ information[np.ix_(own, shared)]
+    return HierarchicalUnknowns(
+        plain,
+        tuple(
+            Population(
+                name,
+                places,
+                plain.priors[int(places[0])],
+                centres[places],
+                sds[k],
+                slopes[k],
+                centres[shared],
+            )
+            for k, (name, places) in enumerate(members.items())
+        ),
+    )
 
 
 def _members(problem: Problem, name: str) -> NDArray[np.int64]:

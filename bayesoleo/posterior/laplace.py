@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.residuals import ResidualProblem
 from bayesoleo.posterior.density import LogDensity
+from bayesoleo.posterior.information import information_at, residuals_at
 from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM, Mixture
 from bayesoleo.solvers.status import Status
 
@@ -76,20 +75,11 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
     ----------
     Verbeek (1993), eq. 3.19 (the matrix) and Appendix A (``H_vv`` at ``v = M / n``).
     """
-    problem, unknowns, errors = log_density.problem, log_density.unknowns, log_density.errors
+    unknowns, errors = log_density.unknowns, log_density.errors
     block, eta = (part[0] for part in log_density.split(phi[None]))
-    precision = unknowns.precision(block)
-    evaluation = problem.evaluate(unknowns.theta(block[None])[0])
-    if evaluation.status.ok:
-        chain = unknowns.jacobian(block)
-        ends = np.cumsum(np.asarray(problem.counts), axis=0)
-        starts = ends - np.asarray(problem.counts)
-        for run in range(len(ends)):
-            rows = [
-                jacobian[starts[run, b] : ends[run, b]].T
-                for b, jacobian in enumerate(evaluation.sensitivity)
-            ]
-            precision += chain.T @ errors.products(run, rows, eta) @ chain
+    theta, chain = unknowns.theta(block[None])[0], unknowns.jacobian(block)
+    information = information_at(log_density.problem, errors, theta, eta)
+    precision = unknowns.precision(block) + chain.T @ information @ chain
     size = len(block)
     covariance = np.zeros((len(phi), len(phi)))
     covariance[:size, :size] = np.linalg.inv(precision)
@@ -227,31 +217,9 @@ def start_coordinates(log_density: LogDensity, theta: Array) -> Array:
     Verbeek (1993), eq. 3.17.
     """
     theta = np.asarray(theta, dtype=float)
-    eta = log_density.errors.start(_residuals(log_density, theta))
+    errors = log_density.errors
+    eta = errors.start(residuals_at(log_density.problem, errors, theta))
     return np.concatenate([log_density.unknowns.start(theta), eta])
-
-
-def _residuals(log_density: LogDensity, theta: Array) -> list[Array]:
-    """Residuals (s, n) of every run; of a problem that has sums only, columns of equal squares."""
-    problem, parts = log_density.problem, []
-    status = Status.CONVERGED
-    if log_density.errors.by_sums:
-        misfit = problem.misfit(theta[None])
-        status = Status(int(misfit.status[0]))
-        if status.ok:
-            counts = np.asarray(problem.counts)
-            size = np.sqrt(misfit.sum_of_squares[0] / counts)
-            parts = [
-                np.repeat(row[:, None], n[0], axis=1) for row, n in zip(size, counts, strict=True)
-            ]
-    else:
-        for run in range(len(problem.runs)):
-            residual, found = cast(ResidualProblem, problem).residuals(theta[None], run)
-            status = max(status, Status(int(found[0])))
-            parts.append(residual[0])
-    if not status.ok:
-        raise InputError(f"a start cannot be evaluated: {status.message}", value=theta.tolist())
-    return parts
 
 
 def laplace_mixture(

@@ -73,13 +73,12 @@ class Inference:
     def density(self, fit: Fit, jobs: int | None = None) -> LogDensity:
         """The log posterior density of a fitted model; the solver starts from the estimate."""
         problem, point = fit.problem, fit.point
-        problem.freeze(point.theta)
         unknowns = None
         if self.between_runs:
-            # How well the runs by themselves know their values: without the prior.
-            variances = np.diag(point.covariance_likelihood)
-            sd = np.sqrt(np.where(variances > 0, variances, np.inf))
-            unknowns = hierarchical(problem, self.between_runs, theta=point.theta, sd=sd)
+            unknowns = hierarchical(
+                problem, self.between_runs, theta=point.theta, errors=self.error_model
+            )
+        problem.freeze(point.theta)
         return LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
 
 
