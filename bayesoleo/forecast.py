@@ -226,8 +226,9 @@ def _one_run(
     mean = y.mean(axis=0)
     spread = np.sqrt(y.var(axis=0) + np.mean(noise**2, axis=0)[:, None])
     half = stats.norm.isf(0.5 * (1 - level)) * spread
+    kept = slice(None) if record.kept is None else record.kept
     scores = [
-        score_draws(record.samples[name], y[:, b], noise[:, b, None], level=level)
+        score_draws(record.samples[name][kept], y[:, b, kept], noise[:, b, None], level=level)
         for b, name in enumerate(predictor.outputs)
     ]
     failed = {key: n for key, n in count(found.status).items() if key != "converged"}
@@ -254,7 +255,8 @@ def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> 
         shown = _shown(record)
         time[r, : shown.size] = record.time[shown] - record.time[0]
         for b, name in enumerate(outputs):
-            error, score = record.samples[name] - run.mean[b], run.scores[b]
+            kept = slice(None) if record.kept is None else record.kept
+            error, score = (record.samples[name] - run.mean[b])[kept], run.scores[b]
             numbers = {
                 "rms": np.sqrt(np.mean(error**2)),
                 "bias": error.mean(),

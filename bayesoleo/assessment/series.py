@@ -139,7 +139,8 @@ def _of_campaign(problem: CampaignProblem, theta: Array) -> list[Series]:
         variables = {"time": record.time - record.time[0], **dict(record.samples)}
         units = {"time": "s"} | dict(predictor.model.inputs)
         units |= {name: output.unit for name, output in predictor.model.outputs.items()}
-        periodic = bool(np.isfinite(record.frequency))
+        # With samples missing periods cannot be compared sample by sample.
+        periodic = bool(np.isfinite(record.frequency)) and record.kept is None
         if periodic:
             variables["phase"], units["phase"] = record.phase % 1.0, "cycle"
             for name in predictor.model.inputs:
@@ -155,10 +156,15 @@ def _of_campaign(problem: CampaignProblem, theta: Array) -> list[Series]:
                     role=record.role,
                     group=record.group,
                     unit=units.get(output, ""),
-                    residual=record.samples[output] - y[b],
+                    residual=problem.kept(r, record.samples[output] - y[b]),
                     time_step=step,
                     frequency=record.frequency if periodic else np.nan,
-                    variables=_without(variables, output) | {f"predicted {output}": y[b]},
+                    variables={
+                        name: problem.kept(r, values)
+                        for name, values in (
+                            _without(variables, output) | {f"predicted {output}": y[b]}
+                        ).items()
+                    },
                     units=units | {f"predicted {output}": units.get(output, "")},
                     input_noise=float(spread[b]),
                 )

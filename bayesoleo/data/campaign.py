@@ -20,6 +20,7 @@ from bayesoleo.data.declaration import (
     read_declaration,
 )
 from bayesoleo.data.files import read_columns
+from bayesoleo.data.gaps import Stretches, masked
 from bayesoleo.data.registry import dataset_folder
 from bayesoleo.data.sampling import uniform_time, window
 from bayesoleo.errors import CampaignError
@@ -47,6 +48,8 @@ class Run:
         Known constants and, where declared, their standard deviations, SI.
     condition_units : mapping of str to str
         SI unit of each condition.
+    mask : tuple of (float, float)
+        Stretches that do not count, from and to, s on the file's own clock.
     """
 
     label: str
@@ -60,6 +63,7 @@ class Run:
     conditions: Mapping[str, float] = field(default_factory=dict)
     condition_units: Mapping[str, str] = field(default_factory=dict)
     condition_sd: Mapping[str, float] = field(default_factory=dict)
+    mask: Stretches = ()
 
     @property
     def time_step(self) -> float:
@@ -178,6 +182,7 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
             name: _samples(channel, columns, whole, part) for name, channel in channels.items()
         }
         _check_periods(declared, time)
+        masked(time, declared.mask)
     except CampaignError as error:
         raise CampaignError(
             error.problem,
@@ -200,6 +205,7 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         conditions=dict(declared.conditions),
         condition_units=dict(declared.condition_units),
         condition_sd=dict(declared.condition_sd),
+        mask=declared.mask,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesoleo.data.gaps import Stretches, read_stretches
 from bayesoleo.data.units import Unit, check_kind, parse_unit
 from bayesoleo.errors import CampaignError
 
@@ -34,6 +35,7 @@ _RUN = (
     "sample_rate",
     "start",
     "stop",
+    "mask",
     "delimiter",
     "header_delimiter",
     "conditions",
@@ -91,6 +93,7 @@ class RunDeclaration:
     sample_rate: float | None
     start: float | None
     stop: float | None
+    mask: Stretches
     delimiter: str | None
     header_delimiter: str | None
     conditions: Mapping[str, float]
@@ -333,6 +336,7 @@ def _run(table: Mapping[str, Any], place: str) -> RunDeclaration:
         sample_rate=number("sample_rate", positive=True),
         start=number("start"),
         stop=number("stop"),
+        mask=read_stretches(table.get("mask", []), label, FILE),
         delimiter=text("delimiter", default=None),
         header_delimiter=text("header_delimiter", default=None),
         **_conditions(table, label),

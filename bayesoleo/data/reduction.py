@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesoleo.data.averaging import average_on
 from bayesoleo.data.campaign import Campaign, Run
 from bayesoleo.data.declaration import choose
+from bayesoleo.data.gaps import bridged, masked
 from bayesoleo.data.harmonics import significant_harmonics
 from bayesoleo.data.period import Frequency, find_frequency
 from bayesoleo.data.settling import sample_count, settled_start, whole_periods
@@ -124,8 +125,13 @@ def reduce_run(run: Run) -> Record:
     if run.frequency is None:
         return _transient(run)
     names, values = list(run.samples), np.array(list(run.samples.values()))
+    away = masked(run.time, run.mask)
     try:
-        found, first, dropped = _settle(values, run.time_step, run.frequency)
+        found, first, dropped = _settle(bridged(values, away), run.time_step, run.frequency)
+        if away.any():
+            # Only now is it known what the masked samples have to be bridged with.
+            values = bridged(values, away, found.value * run.time_step)
+            found, first, dropped = _settle(values, run.time_step, found.value)
     except CampaignError as error:
         raise CampaignError(
             error.problem,
@@ -139,16 +145,21 @@ def reduce_run(run: Run) -> Record:
     step = found.value * run.time_step
     basis = HarmonicBasis(time.size, step)
     kept = {name: channel[first:] for name, channel in zip(names, values, strict=True)}
+    # Bridged samples have no noise.
+    noisy = 1.0 / np.sqrt(1.0 - away[first:].sum() / (time.size - basis.size))
     return _record(
         run,
         time,
-        kept,
+        {name: values[first:] for name, values in run.samples.items()},
         frequency=found.value,
         frequency_sd=found.sd,
         periods=int(np.floor(time.size * step + 0.5)),
         harmonics={name: significant_harmonics(basis, channel) for name, channel in kept.items()},
-        signal_noise={name: average_on(basis, channel).sigma for name, channel in kept.items()},
+        signal_noise={
+            name: noisy * average_on(basis, channel).sigma for name, channel in kept.items()
+        },
         dropped_periods=dropped,
+        kept=~away[first:] if away[first:].any() else None,
     )
 
 
@@ -188,7 +199,8 @@ def _record(run: Run, time: Array, samples: Mapping[str, Array], **reduced: Any)
 
 
 def _transient(run: Run) -> Record:
-    step = run.time_step
+    step, away = run.time_step, masked(run.time, run.mask)
+    whole = bridged(np.array(list(run.samples.values())), away)
     return _record(
         run,
         run.time,
@@ -197,6 +209,10 @@ def _transient(run: Run) -> Record:
         frequency_sd=float("nan"),
         periods=0,
         harmonics={},
-        signal_noise={name: innovation_noise(values) for name, values in run.samples.items()},
-        smoothed={name: smooth_signal(np.array(x), step) for name, x in run.samples.items()},
+        signal_noise={name: innovation_noise(x[~away]) for name, x in run.samples.items()},
+        smoothed={
+            name: smooth_signal(np.array(x), step)
+            for name, x in zip(run.samples, whole, strict=True)
+        },
+        kept=~away if away.any() else None,
     )

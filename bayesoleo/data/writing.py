@@ -42,6 +42,8 @@ class SimulatedRun:
         As in ``campaign.toml``.
     conditions : mapping of str to tuple
         ``(value, unit)`` or ``(value, unit, sd)`` of each known constant, in that unit.
+    mask : sequence of (float, float)
+        Stretches that are not to count, from and to, s.
     """
 
     label: str
@@ -54,6 +56,7 @@ class SimulatedRun:
     conditions: Mapping[str, tuple[float, str] | tuple[float, str, float]] = field(
         default_factory=dict
     )
+    mask: Sequence[tuple[float, float]] = ()
 
 
 def write_campaign(
@@ -170,6 +173,8 @@ def _run_table(run: SimulatedRun, file: str) -> str:
     if run.frequency is not None:
         lines.append(f"frequency = {float(run.frequency)!r}")
     lines += [f"group = {_string(run.group)}", f"role = {_string(run.role)}"]
+    if run.mask:
+        lines.append(f"mask = {[[float(first), float(last)] for first, last in run.mask]}")
     if run.conditions:
         lines.append("[runs.conditions]")
     for name, (value, unit, *sd) in run.conditions.items():

@@ -15,6 +15,7 @@ from bayesoleo.estimation.residuals import RunSamples
 from bayesoleo.model import Prior
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
@@ -49,8 +50,13 @@ class CampaignProblem:
         self.outputs = predictor.outputs
         self.runs = layout.runs
         self.counts = np.array(
-            [[record.time.size] * len(self.outputs) for record in predictor.records]
+            [[_count(record)] * len(self.outputs) for record in predictor.records]
         )
+
+    def kept(self, run: int, values: Array) -> Array:
+        """Of samples along the last axis of one run's arrays, those that count."""
+        kept = self.predictor.records[run].kept
+        return values if kept is None else values[..., kept]
 
     def holding(self, values: dict[str, float]) -> CampaignProblem:
         """The same problem with some unknowns held, e.g. the shared ones on a hold-out run."""
@@ -99,14 +105,17 @@ class CampaignProblem:
         full = self.full(theta[None])[0]
         runs = self.predictor.evaluate(full)
         residual: Sequence[Sequence[Array]] = [
-            list(record.measured - run.y)
-            for record, run in zip(self.predictor.runs, runs, strict=True)
+            list(self.kept(r, record.measured - run.y))
+            for r, (record, run) in enumerate(zip(self.predictor.runs, runs, strict=True))
         ]
         outputs = range(len(self.outputs))
         return Evaluation(
             residual=tuple(np.concatenate([r[b] for r in residual]) for b in outputs),
             sensitivity=tuple(
-                np.concatenate([run.sensitivity[b][self._free].T for run in runs]) for b in outputs
+                np.concatenate(
+                    [self.kept(r, run.sensitivity[b][self._free]).T for r, run in enumerate(runs)]
+                )
+                for b in outputs
             ),
             status=max((run.status for run in runs), default=Status.CONVERGED),
             monodromy=tuple(run.monodromy for run in runs),
@@ -114,20 +123,42 @@ class CampaignProblem:
 
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors, shape (L, l), from the frozen anchor."""
-        return Misfit(*self.predictor.sum_of_squares(self.full(theta)))
+        if all(record.kept is None for record in self.predictor.records):
+            return Misfit(*self.predictor.sum_of_squares(self.full(theta)))
+        return self._misfit_of_the_kept(theta)
+
+    def _misfit_of_the_kept(self, theta: Array) -> Misfit:
+        """The same where some samples do not count: by way of the residuals."""
+        sums = np.full((len(theta), len(self.runs), len(self.outputs)), np.nan)
+        status = np.zeros((len(theta), len(self.runs)), dtype=np.int64)
+        blocks = [
+            (r, slice(k, min(k + _LANES, len(theta))))
+            for r in range(len(self.runs))
+            for k in range(0, len(theta), _LANES)
+        ]
+
+        def work(block: tuple[int, slice]) -> None:
+            r, rows = block
+            residual, status[rows, r] = self.residuals(theta[rows], r)
+            sums[rows, r] = np.sum(residual**2, axis=2)
+
+        thread_map(work, blocks, self.predictor.jobs)
+        worst = status.max(axis=1)
+        sums[worst != Status.CONVERGED] = np.nan
+        return Misfit(sums, worst)
 
     @property
     def samples(self) -> tuple[RunSamples, ...]:
         """When the samples of each run were taken, s."""
         return tuple(
-            RunSamples(record.time, record.frequency if record.periodic else None)
-            for record in self.predictor.records
+            RunSamples(self.kept(r, record.time), record.frequency if record.periodic else None)
+            for r, record in enumerate(self.predictor.records)
         )
 
     def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
         """Residuals (L, s, n) of one run at vectors (L, l) and statuses (L,), from the anchor."""
         samples = self.predictor.simulate(self.full(theta), run)
-        return self.predictor.runs[run].measured - samples.y, samples.status
+        return self.kept(run, self.predictor.runs[run].measured - samples.y), samples.status
 
     def freeze(self, theta: Array) -> Status:
         """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""
@@ -141,7 +172,8 @@ class CampaignProblem:
     @property
     def data(self) -> tuple[Array, ...]:
         """Measured samples of each output, runs one after the other, SI."""
-        columns = zip(*(run.measured for run in self.predictor.runs), strict=True)
+        rows = (self.kept(r, run.measured) for r, run in enumerate(self.predictor.runs))
+        columns = zip(*rows, strict=True)
         return tuple(np.concatenate(column) for column in columns)
 
     def with_data(self, data: Sequence[Array]) -> CampaignProblem:
@@ -164,9 +196,13 @@ class CampaignProblem:
         predictor, first = copy(self.predictor), 0
         predictor.runs = []
         for run in self.predictor.runs:
-            last = first + run.measured.shape[1]
+            last = first + _count(run.record)
             other = copy(run)
-            other.measured = np.stack([np.asarray(column[first:last]) for column in data])
+            fresh = np.stack([np.asarray(column[first:last]) for column in data])
+            if run.record.kept is not None:
+                fresh, counting = run.measured.copy(), fresh
+                fresh[:, run.record.kept] = counting
+            other.measured = fresh
             predictor.runs.append(other)
             first = last
         return CampaignProblem(predictor, self._free, self._full)
@@ -179,7 +215,7 @@ class CampaignProblem:
         if self.predictor.model.dofs and any(run.anchor is None for run in self.predictor.runs):
             self.freeze(self.start)
         full = self.full(theta)
-        ends = np.cumsum([run.measured.shape[1] for run in self.predictor.runs])
+        ends = np.cumsum(self.counts[:, 0])
         shape = (len(theta), len(self.outputs), full.shape[1])
 
         def of_run(r: int) -> NormalEquations:
@@ -190,9 +226,10 @@ class CampaignProblem:
             columns = self.predictor.layout.columns[r]
             gram, slope = np.zeros((*shape, full.shape[1])), np.zeros(shape)
             sums = np.empty(shape[:2])
-            cut = slice(ends[r] - samples.y.shape[2], ends[r])
+            cut = slice(ends[r] - self.counts[r, 0], ends[r])
+            y, y_p = self.kept(r, samples.y), self.kept(r, samples.y_p)
             for b, column in enumerate(data):
-                rows = reduce_rows(column[:, cut] - samples.y[:, b], samples.y_p[:, b].mT)
+                rows = reduce_rows(column[:, cut] - y[:, b], y_p[:, b].mT)
                 gram[:, b, columns[:, None], columns], slope[:, b, columns], sums[:, b] = rows
             return NormalEquations(gram, slope, sums, samples.status)
 
@@ -203,3 +240,8 @@ class CampaignProblem:
             np.sum([part.sums for part in parts], axis=0),
             np.stack([part.status for part in parts]).max(axis=0),
         )
+
+
+def _count(record: Record) -> int:
+    """Samples that count."""
+    return record.time.size if record.kept is None else int(record.kept.sum())

@@ -249,6 +249,7 @@ class CampaignSource:
 
     def outputs(self, rng: np.random.Generator) -> tuple[Array, ...]:
         drawn = [self._outputs(r, rng) for r in range(len(self.records))]
+        drawn = [self.problem.kept(r, run) for r, run in enumerate(drawn)]
         return tuple(np.concatenate([run[b] for run in drawn]) for b in range(self.sd.shape[1]))
 
     def _outputs(self, r: int, rng: np.random.Generator) -> Array:
@@ -289,7 +290,9 @@ class CampaignSource:
             ny, samples = self.truth[r].y.shape
             p = predictor.constants(full, r)[0]
             columns = input_columns(run, p) if self.input_noise else np.zeros((ny, 0, samples))
-            sensitivity = np.moveaxis(self.truth[r].sensitivity[:, self.free], 1, 2)
+            columns = self.problem.kept(r, columns)
+            kept = self.problem.kept(r, self.truth[r].sensitivity[:, self.free])
+            sensitivity, samples = np.moveaxis(kept, 1, 2), kept.shape[2]
             blocks.append(
                 NoiseBlock(
                     sensitivity=sensitivity.reshape(ny * samples, -1),

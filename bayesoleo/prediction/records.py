@@ -105,6 +105,8 @@ class Record:
         Leading periods left out because they had not settled.
     smoothed : mapping of str to Smoothed
         The smooth curve behind each channel (transient runs).
+    kept : ndarray of bool, shape (N,), optional
+        Which samples count; None where all do.
     """
 
     label: str
@@ -122,6 +124,7 @@ class Record:
     condition_sd: Mapping[str, float] = field(default_factory=dict)
     dropped_periods: int = 0
     smoothed: Mapping[str, Smoothed] = field(default_factory=dict)
+    kept: NDArray[np.bool_] | None = None
 
     @property
     def phase(self) -> Array:
