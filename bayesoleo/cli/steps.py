@@ -168,7 +168,8 @@ def estimate(
     """Estimate the parameters from the runs with role fit: MBE, then the mode of the posterior.
 
     Prints start, MBE point, mode and linearised standard deviation. Writes nothing without --out;
-    with it, results.nc in that folder; with --each, each.nc.
+    with it, results.nc in that folder; with --each, each.nc. A transient is predicted from its
+    start: for chaotic records use bayesoleo.estimation.multiple_shooting in Python.
 
     \b
     Examples:

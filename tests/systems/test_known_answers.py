@@ -224,7 +224,7 @@ def test_lorenz_loses_its_fixed_points_where_hopf_says():
         # Viswanath (2003), Physica D 190: the orbit AB, once round each wing.
         ("lorenz", (-13.763610682134, -19.578751942452, 27.0), 1.558652210716),
         # Once round; the period agrees with integration by order eight at rtol 1e-12.
-        ("rossler", (-4.26834953, 5.37547247, 0.02157057), 5.8810884),
+        ("rossler", (-4.26834953, 5.37547247, 0.02157057), 5.8810884556),
     ],
 )
 def test_an_unstable_periodic_orbit(name, start, period):
