@@ -14,7 +14,9 @@ _PART = 0.9
 _ON_LIMIT = 1e-8
 
 
-def bounded_step(rows: Array, target: Array, room: tuple[Array, Array]) -> Array:
+def bounded_step(
+    rows: Array, target: Array, room: tuple[Array, Array], rank: float | None = None
+) -> Array:
     """Solve ``rows @ d = target`` by least squares with ``d`` inside the room that is left.
 
     Unknowns whose step would leave are taken part of the way to their limit and the others are
@@ -26,13 +28,15 @@ def bounded_step(rows: Array, target: Array, room: tuple[Array, Array]) -> Array
     target : ndarray, shape (k,)
     room : tuple of ndarray, each shape (l,)
         Distances down and up to the limits, infinite where there is none.
+    rank : float, optional
+        See :func:`~bayesoleo.estimation.linearise.least_squares`.
 
     Returns
     -------
     ndarray, shape (l,)
     """
     lowest, highest = (-_reach(room[0]), _reach(room[1]))
-    step = least_squares(rows, target)
+    step = least_squares(rows, target, rank)
     stopped = np.zeros(step.size, dtype=bool)
     while True:
         beyond = ~stopped & ((step < lowest) | (step > highest))
@@ -43,7 +47,7 @@ def bounded_step(rows: Array, target: Array, room: tuple[Array, Array]) -> Array
         free = ~stopped
         if free.any():
             left = target - rows[:, stopped] @ step[stopped]
-            step[free] = least_squares(rows[:, free], left)
+            step[free] = least_squares(rows[:, free], left, rank)
 
 
 def _reach(distance: Array) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from bayesoleo.estimation.bounded import bounded_step, on_limit
-from bayesoleo.estimation.linearise import inverse_gram
+from bayesoleo.estimation.linearise import RANK, inverse_gram
 from bayesoleo.estimation.problem import Array
 
 
@@ -64,7 +64,9 @@ class Equations:
         pulls = len(rows) == len(self.slope) and self.slope.any()
         pull = solve_triangular(rows, self.slope, trans="T") if pulls else np.zeros(len(rows))
         target = np.concatenate((self.residual, pull))
-        return bounded_step(np.vstack((self.jacobian, rows)), target, self.room)
+        # without a weight, what the data leave open must not follow the derivatives' rounding
+        rank = None if len(rows) else RANK
+        return bounded_step(np.vstack((self.jacobian, rows)), target, self.room, rank)
 
     def expected_gain(self, step: Array) -> float:
         """Rise of the merit function that the linearisation promises for a step, shape (l,)."""

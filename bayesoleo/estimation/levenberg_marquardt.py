@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from bayesoleo.estimation.equations import Equations
+from bayesoleo.estimation.linearise import RANK
 from bayesoleo.estimation.problem import Array
 from bayesoleo.estimation.steps import Step
 
@@ -101,7 +102,7 @@ def _weight(jacobian: Array, residual: Array, radius: float) -> float:
     left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
     turned = singular * (left.T @ residual)
     squares = singular**2
-    kept = singular > np.finfo(float).eps * max(jacobian.shape) * singular[0]
+    kept = singular > RANK * singular[0]
 
     def length(weight: float) -> tuple[float, float]:
         """Length of the step and its derivative with respect to the weight."""

@@ -15,6 +15,9 @@ from bayesoleo.estimation.problem import Array, Evaluation
 
 # Rows of one block of a tall matrix.
 _BLOCK = 1024
+#: Singular values below this part of the largest are zero but for the derivatives' rounding, which
+#: reaches 1e-13 of a column where they are differences. Certified sets need down to 1e-9.
+RANK = 1e-11
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def triangle(matrix: Array) -> Array:
     return np.linalg.qr(matrix, mode="r")
 
 
-def least_squares(rows: Array, target: Array) -> Array:
+def least_squares(rows: Array, target: Array, rank: float | None = None) -> Array:
     """Solution of ``rows @ x = target`` in the least-squares sense, of minimum norm if not unique.
 
     Columns are brought to unit length first, so that the rank is judged without regard to units.
@@ -73,6 +76,9 @@ def least_squares(rows: Array, target: Array) -> Array:
     ----------
     rows : ndarray, shape (k, l)
     target : ndarray, shape (k,)
+    rank : float, optional
+        Singular values below this part of the largest are taken for zero; by default those that the
+        factorisation's own rounding would leave.
 
     Returns
     -------
@@ -85,7 +91,7 @@ def least_squares(rows: Array, target: Array) -> Array:
     """
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
-    solution = np.linalg.lstsq(rows / length, target, rcond=None)[0]
+    solution = np.linalg.lstsq(rows / length, target, rcond=rank)[0]
     return solution / length
 
 
