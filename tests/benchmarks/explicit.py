@@ -8,7 +8,7 @@ contestants solve the same equations, each in its own fast form.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -147,10 +147,3 @@ def _spread(function: Callable, states: int, constants: int) -> Callable:
     scope: dict[str, object] = {"function": function}
     exec(f"def spread(s, u, p):\n    return function({', '.join(arguments)})", scope)
     return numba.njit(scope["spread"])
-
-
-def constants_of(model: Model, conditions: Mapping[str, float]) -> Array:
-    """Nominal constants of a run in the order of :class:`Explicit`."""
-    nominal = {str(k): v for k, v in model.nominal().items()} | dict(conditions)
-    names = (*model.parameters, *model.conditions)
-    return np.array([nominal[name] for name in names])

@@ -30,6 +30,8 @@ from bayesoleo.solvers.status import Status
 CASADI_BATCH, DIFFRAX_BATCH = 8, 4
 #: Newton's method ends at a residual, CasADi, or a step, Diffrax, over the states' sizes.
 RESIDUAL, STEP = 1e-10, 1e-6
+#: Strokes of the same equations that differ by more are of different solutions.
+SAME = 1e-6
 TOLERANCE = 1e-6
 MOST_STEPS, MOST_ITERATIONS = 20_000, 12
 
@@ -63,14 +65,13 @@ def with_casadi(
         p = predictor.constants(theta, r)
         z, given = _casadi_arguments(run, p, scale)
         seconds += best(lambda z=z, given=given: many(z, given), 3)
-        found = np.array(many(z, given)).reshape(z.shape[0], -1, vectors, order="F")
-        found = found.reshape(predictor.steps, -1, vectors)[:, 0] * scale[0]
+        found = np.array(many(z, given)).reshape(predictor.steps, -1, vectors)[:, 0] * scale[0]
         ours = solve(run, p)
         assert np.all(ours.status == Status.CONVERGED)
         strokes = ours.x[:, :, 0].T
         apart = np.abs(found - strokes).max(axis=0) / (np.ptp(strokes, axis=0) / 2)
-        failures += int(np.count_nonzero(~(apart < 1e-6)))
-        gap = max(gap, float(apart[apart < 1e-6].max(initial=0.0)))
+        failures += int(np.count_nonzero(~(apart < SAME)))
+        gap = max(gap, float(apart[apart < SAME].max(initial=0.0)))
     solves = vectors * len(cases)
     return {
         "casadi_ms": 1e3 * seconds / solves,

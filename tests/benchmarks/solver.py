@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -138,7 +139,8 @@ def main() -> None:
             for key, value in found.items():
                 print(f"    {key:45s} {value:.4g}", flush=True)
     if asked.json:
-        print(json.dumps(result))
+        known = {key: value if math.isfinite(value) else None for key, value in result.items()}
+        print(json.dumps(known))
 
 
 if __name__ == "__main__":
