@@ -15,6 +15,9 @@ from bayesoleo.solvers.library import shoot_by_library
 from bayesoleo.solvers.state_space import StateSpace
 from bayesoleo.solvers.status import Status
 
+#: Compiling the integrator takes longer than all of its tests: one worker does.
+pytestmark = pytest.mark.xdist_group("integrator")
+
 DUFFING = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.1, [3.0, 0.0, 0.5])})
 PHASES = np.linspace(0.0, 1.0, 41)
