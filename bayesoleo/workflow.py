@@ -61,6 +61,9 @@ class Settings:
         Everything random follows from it.
     jobs : int, optional
         Threads; by default all cores. Results do not depend on it.
+    scheduler : str, optional
+        Other processes or machines that take part: ``local:4``, or the address of a Dask scheduler;
+        see :func:`bayesoleo.machines.connected`. Results do not depend on them either.
     quick : bool
         Draw enough for two-digit intervals only.
     effective_size : int
@@ -101,6 +104,7 @@ class Settings:
     nuisance: tuple[str, ...] = ()
     error_model: str = ERROR_MODELS[0]
     between_runs: tuple[str, ...] = ()
+    scheduler: str | None = None
 
     @property
     def inference(self) -> Inference:
@@ -110,7 +114,7 @@ class Settings:
     @property
     def numerics(self) -> Numerics:
         """How models are solved."""
-        return Numerics(self.scheme, self.steps, self.jobs)
+        return Numerics(self.scheme, self.steps, self.jobs, scheduler=self.scheduler)
 
 
 def _silent(_: str) -> None:
@@ -498,6 +502,7 @@ def _sample(
         fingerprint=fingerprint,
         progress=progress,
         quick=settings.quick,
+        scheduler=settings.scheduler,
     )
     return samples, density
 

@@ -220,6 +220,7 @@ def replicate(
     ] = False,
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
@@ -235,6 +236,7 @@ def replicate(
     \b
     Examples:
       bayesoleo replicate shaker --model f16n2d2 --runs d -n 1000 --out scatter
+      bayesoleo replicate shaker --model f16n2d2 --out scatter --scheduler tcp://10.0.0.1:8786
     """
     from bayesoleo import workflow
     from bayesoleo.errors import CampaignError
@@ -264,6 +266,7 @@ def replicate(
             seed=seed,
             out=out,
             jobs=jobs,
+            scheduler=scheduler,
             progress=shell.progress_shown(quiet),
         )
     shell.console().print(str(found), markup=False, soft_wrap=True)

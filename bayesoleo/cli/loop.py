@@ -105,6 +105,7 @@ def close(
     quick: options.Quick = False,
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
     effective_size: options.EffectiveSize = 1000,
     max_effects: options.MaxEffects = 4,
     effects: options.Effects = None,
@@ -143,6 +144,7 @@ def close(
     chosen = options.settings(
         seed=seed,
         jobs=jobs,
+        scheduler=scheduler,
         quick=quick,
         effective_size=effective_size,
         scheme=scheme,

@@ -67,6 +67,16 @@ Jobs = Annotated[
         help="Threads.",
     ),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS|local:N",
+        show_default="threads of this process",
+        rich_help_panel=RUNNING,
+        help="Other machines that take part, by the address of a Dask scheduler, or N processes of "
+        "this one. The result is the same.",
+    ),
+]
 Quiet = Annotated[
     bool,
     typer.Option("--quiet", "-q", rich_help_panel=RUNNING, help="No progress, only the result."),
@@ -181,6 +191,7 @@ def settings(
     nuisance: str = "",
     error_model: str = "independent",
     between_runs: str = "",
+    scheduler: str | None = None,
 ) -> Settings:
     """Settings of the workflow from options.
 
@@ -201,6 +212,7 @@ def settings(
     return Settings(
         seed=seed,
         jobs=jobs,
+        scheduler=scheduler,
         quick=quick,
         effective_size=effective_size,
         scheme=scheme,

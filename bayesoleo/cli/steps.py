@@ -263,6 +263,7 @@ def sample(
     quick: options.Quick = False,
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
     effective_size: options.EffectiveSize = 1000,
     quiet: options.Quiet = False,
     drive: options.Drive = None,
@@ -294,6 +295,7 @@ def sample(
     chosen = options.settings(
         seed=seed,
         jobs=jobs,
+        scheduler=scheduler,
         quick=quick,
         effective_size=effective_size,
         scheme=scheme,

@@ -135,7 +135,7 @@ def sample(
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
     if quick:
         return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 25, 10.0, segment)
-    return Schedule(effective_size, evaluations, 20, 7, 50, 20.0, segment)
+    return Schedule(effective_size, evaluations, 20, 6, 50, 20.0, segment)
 
 
 def _fingerprint(
@@ -171,7 +171,7 @@ def _warm_up(
         store.append(group.start(start, seed))
     while not _is_warm(store.segments, schedule):
         rounds = sum(s.phase == "warm-up" for s in store.segments)
-        steps = schedule.warm_up * 2 ** max(rounds - 1, 0)
+        steps = schedule.warm_up * 2**rounds
         bar.show("warm-up", 0.0, store.segments)
         store.append(group.advance(store.segments[-1], steps, "warm-up"))
 
@@ -181,7 +181,7 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
     if any(s.phase == "kept" for s in segments) or len(rounds) >= schedule.most_rounds:
         return True
     spent = sum(s.evaluations for s in segments)
-    following = schedule.warm_up * 2 ** max(len(rounds) - 1, 0) * segments[0].coords.shape[1]
+    following = schedule.warm_up * 2 ** len(rounds) * segments[0].coords.shape[1]
     if spent + following > schedule.max_evaluations / 2:  # leave half for draws that are kept
         return True
     if len(rounds) < 2:

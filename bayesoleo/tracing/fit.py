@@ -46,12 +46,16 @@ class Numerics:
         Threads.
     backend : str
         ``numba`` or ``numpy``.
+    scheduler : str or None
+        Other processes or machines for fits that do not depend on each other; see
+        :func:`bayesoleo.machines.connected`.
     """
 
     scheme: str = DEFAULT_SCHEME
     steps: int | None = None
     jobs: int | None = None
     backend: str = "numba"
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesoleo.machines import connected, each_done
+from bayesoleo.model import Model
+from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.errors_table import ErrorTable, error_table
@@ -109,16 +112,29 @@ def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
 
 def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:
     """Each run predicted by a fit to all the others, from the joint estimate."""
-    predictions = []
-    for record in roles.held_out:
-        others = [other for other in fit.records if other.label != record.label]
-        keep = [
-            k for k, name in enumerate(fit.problem.names) if not name.endswith(f"[{record.label}]")
-        ]
-        numerics = replace(fit.numerics, steps=fit.steps)
-        partial = fit_model(fit.model, others, numerics, start=fit.point.theta[keep])
-        predictions += predict_held_out(partial, [record])
-    return predictions
+    numerics = replace(fit.numerics, steps=fit.steps, scheduler=None)
+    left_out = _LeftOut(fit.model, fit.records, numerics, fit.problem.names, fit.point.theta)
+    with connected(fit.numerics.scheduler) as client:
+        # Here each fit has all threads for itself.
+        found = dict(each_done(left_out, roles.held_out, client=client, jobs=1))
+    return [found[index] for index in range(len(roles.held_out))]
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """One run predicted by the others, wherever it is sent."""
+
+    model: Model
+    records: tuple[Record, ...]
+    numerics: Numerics
+    names: tuple[str, ...]
+    theta: np.ndarray
+
+    def __call__(self, record: Record) -> Prediction:
+        others = [other for other in self.records if other.label != record.label]
+        keep = [k for k, name in enumerate(self.names) if not name.endswith(f"[{record.label}]")]
+        partial = fit_model(self.model, others, self.numerics, start=self.theta[keep])
+        return predict_held_out(partial, [record])[0]
 
 
 def fit_state(
