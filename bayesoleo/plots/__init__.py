@@ -6,6 +6,7 @@ machines without a display, and are saved with ``figure.savefig(path)``.
 
 from bayesoleo.plots.assessments import assessment
 from bayesoleo.plots.branches import branch
+from bayesoleo.plots.by_run import by_run
 from bayesoleo.plots.corners import corner
 from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
@@ -28,6 +29,7 @@ __all__ = [
     "Scale",
     "assessment",
     "branch",
+    "by_run",
     "corner",
     "engineering",
     "error",

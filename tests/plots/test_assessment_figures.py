@@ -12,7 +12,10 @@ from bayesoleo import plots
 from bayesoleo.assessment import assess, series_of_problem
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import (
+    FunctionProblem,
+    between_runs,
     estimate,
+    estimate_each,
     indifference,
     local_sensitivity,
     profile,
@@ -98,3 +101,29 @@ def test_outliers_are_ringed(fitted):
     axes = plots.residual_tests(replace(series, residual=residual)).axes[0]
     # the farthest first; the jump of the friction makes some of its own
     assert axes.lines[-1].get_xdata()[0] == 50 * series.time_step
+
+
+def test_runs_stand_beside_their_mean_and_spread():
+    rng = np.random.default_rng(4)
+    x = np.linspace(-1, 1, 40)
+    problems = {
+        run: FunctionProblem(
+            lambda x, t: t[0] * x + t[1],
+            x,
+            slope * x + 0.1 * rng.standard_normal(40),
+            [Normal(1, 5), Normal(0, 1)],
+            ["slope", "level"],
+        )
+        for run, slope in {"a": 1.0, "b": 1.5, "c": 0.7, "d": 1.2}.items()
+    }
+    each = estimate_each(problems)
+    each["status"].values[3] = "no_convergence"
+    first, second = plots.by_run(each).axes
+    view = between_runs(each)
+    assert first.lines[0].get_ydata()[0] == pytest.approx(view.mean[0])
+    assert first.get_title("right") == "p equal < 0.001"
+    assert f"{view.p_value[1]:.2g}" in second.get_title("right")
+    points = next(line for line in first.lines if line.get_marker() == "o")
+    np.testing.assert_allclose(points.get_ydata(), each["estimate"][:3, 0])
+    failed = next(line for line in first.lines if line.get_marker() == "x")
+    assert list(failed.get_xdata()) == [3]
