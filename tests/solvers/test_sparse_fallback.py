@@ -50,6 +50,17 @@ def test_a_motion_that_repels_is_found_with_its_derivatives(kind, name, n):
     np.testing.assert_allclose(x_theta[0, :, 0, 0], exact, atol=tolerance * np.abs(exact).max())
 
 
+def test_the_compiled_iteration_hands_over():
+    """It sees the growth itself; the answer is that of the general iteration."""
+    found = []
+    for backend in ("numpy", "numba"):
+        boundary, p = problem(repelled("second order"), FORCE, 0.125, "radau3", 400, backend)
+        found.append(solve_periodic(boundary, p, rest(boundary, 400)))
+    assert boundary.arranged is not None
+    assert found[1].status[0] == Status.CONVERGED
+    np.testing.assert_allclose(found[1].x, found[0].x, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["radau3", "gauss2", "thesis"])
 @pytest.mark.parametrize("model", [duffing(), coupled()], ids=lambda model: model.name)
 def test_both_ways_take_the_same_step(model, name, monkeypatch):
