@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimate import estimate, polish
 from bayesoleo.estimation.point import PointEstimate
 from bayesoleo.estimation.problem import Array, Problem
+from bayesoleo.estimation.shown import columns
 from bayesoleo.model.correlated import sample_of
 from bayesoleo.parallel import thread_map
-from bayesoleo.solvers.status import count
+from bayesoleo.solvers.status import count, counted
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Modes:
     """Distinct modes of the posterior, the highest first.
 
@@ -44,6 +49,45 @@ class Modes:
 
     def __getitem__(self, index: int) -> PointEstimate:
         return self.modes[index]
+
+    def to_dataset(self) -> xr.Dataset:
+        """``estimate`` and ``sd`` (mode, parameter), ``objective`` and ``hits`` (mode)."""
+        names = self.modes[0].names if self.modes else ()
+        shape, both = (len(self), len(names)), ("mode", schema.PARAMETER)
+        theta = np.array([mode.theta for mode in self]).reshape(shape)
+        sd = np.array([mode.sd for mode in self]).reshape(shape)
+        unit = {"units": "unit of each parameter"}
+        height = np.array([mode.objective for mode in self])
+        return xr.Dataset(
+            {
+                schema.ESTIMATE: (both, theta, {"long_name": "mode of the posterior", **unit}),
+                schema.SD: (both, sd, {"long_name": "linearised standard deviation", **unit}),
+                schema.OBJECTIVE: ("mode", height, {"long_name": "log posterior"}),
+                "hits": (
+                    "mode",
+                    np.array(self.hits, dtype=np.int64),
+                    {"long_name": "estimates that ended there"},
+                ),
+            },
+            coords={schema.PARAMETER: list(names)},
+            attrs={"status": json.dumps(self.status)},
+        )
+
+    def __str__(self) -> str:
+        if not self.modes:
+            return f"no mode was found: {counted(self.status)}"
+        head = ["mode", *self.modes[0].names, "log posterior", "hits"]
+        rows = [
+            [str(number), *(f"{v:.6g}" for v in mode.theta), f"{mode.objective:.2f}", str(hits)]
+            for number, (mode, hits) in enumerate(zip(self, self.hits, strict=True), start=1)
+        ]
+        return columns(head, rows)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>{self.to_dataset()._repr_html_()}"
 
 
 def multistart(

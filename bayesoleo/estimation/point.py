@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PointEstimate:
     """Result of an estimator.
 
@@ -120,6 +121,12 @@ class PointEstimate:
         from bayesoleo.estimation.table import as_text
 
         return as_text(self)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>{self.to_dataset()._repr_html_()}"
 
     def to_dataset(self, **options: object) -> xr.Dataset:
         """Labelled arrays; see :func:`bayesoleo.estimation.to_dataset`."""

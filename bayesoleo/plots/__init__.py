@@ -12,6 +12,7 @@ from bayesoleo.plots.errors import error
 from bayesoleo.plots.fits import fit
 from bayesoleo.plots.forecasts import forecast
 from bayesoleo.plots.forest import point_against_posterior
+from bayesoleo.plots.histories import history
 from bayesoleo.plots.period_search import period_search
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.rankings import ranking
@@ -37,6 +38,7 @@ __all__ = [
     "forecast",
     "format_unit",
     "format_value",
+    "history",
     "indifference",
     "period_search",
     "point_against_posterior",
