@@ -285,7 +285,8 @@ def assessment_text(data: xr.Dataset) -> str:
             one = data.sel(output=output, run=run)
             if np.isfinite(float(one["rms"])):
                 rows.append([str(output), str(run), *_cells(one, data.attrs["series"])])
-    end = f"* less than {MARKED:g} by chance, over all {data.attrs['series']} series together"
+    number = data.attrs["series"]
+    end = f"* less than {MARKED:g} by chance over all {number} series, each test by itself"
     lines = [columns(head, rows), end]
     for output in data[schema.OUTPUT].values:
         one = data.sel(output=output)
