@@ -51,6 +51,10 @@ Source = str | os.PathLike[str] | Campaign | ReducedCampaign
 RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
 
 
+#: Starts drawn from the priors that look for other modes than the estimate before sampling.
+STARTS = 4
+
+
 @dataclass(frozen=True)
 class Settings:
     """What a run of the workflow depends on besides data and model.
@@ -488,7 +492,8 @@ def _sample(
 ) -> tuple[Samples, LogDensity]:
     settings = task.settings
     density = settings.inference.density(fit, settings.jobs)
-    start = mixture_at(density, fit.point.theta)
+    starts = 0 if settings.quick else STARTS
+    start = mixture_at(density, fit.point.theta, starts=starts, seed=settings.seed)
     # Another seed or quality is another run, with a folder of its own.
     parts = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
     parts += [settings.seed, settings.quick, settings.error_model, settings.between_runs]

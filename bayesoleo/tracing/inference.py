@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo.errors import ModelError
+from bayesoleo.estimation import multistart
+from bayesoleo.estimation.campaign_problem import CampaignProblem
 from bayesoleo.model import Model
-from bayesoleo.posterior import LogDensity, Mixture
+from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.posterior.error_models import ERROR_MODELS, check_word
 from bayesoleo.posterior.hierarchy import hierarchical
-from bayesoleo.posterior.laplace import Mode, find_mode, mixture_of, start_coordinates
+from bayesoleo.posterior.laplace import Mode, find_mode, start_coordinates
 from bayesoleo.tracing.fit import Fit
 
 Array = NDArray[np.float64]
@@ -87,9 +89,33 @@ def mode_of(density: LogDensity, theta: Array) -> Mode:
     return find_mode(density, start_coordinates(density, theta))
 
 
-def mixture_at(density: LogDensity, theta: Array) -> Mixture:
-    """Where walkers start."""
-    return mixture_of([mode_of(density, theta)])
+def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int = 0) -> Mixture:
+    """Where walkers begin: the modes next to an estimate, and those that other starts lead to.
+
+    Parameters
+    ----------
+    density : LogDensity
+    theta : ndarray, shape (l,)
+        The estimate.
+    starts : int
+        Starts drawn from the priors, from which MBE and BE look for other modes.
+    seed : int
+        Seeds them.
+
+    Returns
+    -------
+    Mixture
+        The solver is anchored at its heaviest mode, whatever was visited on the way.
+    """
+    begins = [theta]
+    if starts:
+        rng = np.random.default_rng(seed)
+        begins += [mode.theta for mode in multistart(density.problem, starts, rng)]
+    mixture = laplace_mixture(density, np.array(begins))
+    heaviest = density.split(mixture.centres[:1])[0]
+    if isinstance(density.problem, CampaignProblem):
+        density.problem.freeze(density.unknowns.theta(heaviest)[0])
+    return mixture
 
 
 def at_mode(fit: Fit, density: LogDensity, mode: Mode, word: str) -> Fit:
