@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from bayesoleo.solvers.orbit import floquet_multipliers
 
+__all__ = ["Stability", "count_unstable"]
+
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 

@@ -81,6 +81,8 @@ def test_lanes_of_a_batch_are_told_apart(fold):
     np.testing.assert_array_equal(found.jumped[good], truth[good])
     assert 0 < truth.sum() < 30
     assert made.runs[0].jumps == truth.sum()
+    made.sum_of_squares(vectors)
+    assert made.runs[0].jumps == 2 * truth.sum()
 
 
 def walked(made: Predictor, theta: np.ndarray, end: np.ndarray) -> np.ndarray | None:
