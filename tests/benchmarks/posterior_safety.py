@@ -73,7 +73,8 @@ def same(one: Samples, other: Samples) -> bool:
 
 def safety_figures() -> dict[str, float]:
     """Each run is killed once, at a moment drawn from its whole length, and then goes on."""
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver" if os.name == "posix" else "spawn")
+    context.set_forkserver_preload(["posterior_safety"])  # so that children need not import
     begin = time.perf_counter()
     whole = run(None, Slow)
     length = time.perf_counter() - begin
