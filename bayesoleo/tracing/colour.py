@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 #: Probability with which stationary noise may be taken for one that is not.
 UNSTEADY = 0.05
+#: Degrees of freedom of a variance that is not measured.
+ASSUMED = 1e9
 
 
 def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
@@ -40,14 +42,13 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     parts = [_by_spectrum(run, d) for run, d in zip(base.runs, directions, strict=True)]
     variance = sum(value for value, _ in parts)
     scatter = sum(value**2 / free for value, free in parts if free > 0)
-    freedom = variance**2 / scatter if scatter > 0 else np.inf
+    freedom = variance**2 / scatter if scatter > 0 else ASSUMED
     between, degrees = _between_periods(base.runs, directions)
     # Against the spectrum's own uncertainty: neither is exact.
     unsteady = degrees > 0 and between / variance > stats.f.isf(UNSTEADY, degrees, freedom)
     if unsteady:
         variance, freedom = between, degrees
-    known = int(min(freedom, 10**9)) if np.isfinite(freedom) else 0
-    return max(1.0, variance / white), known
+    return max(1.0, variance / white), 0 if freedom >= ASSUMED else max(1, int(freedom))
 
 
 def _by_spectrum(run: RunBase, direction: Array) -> tuple[float, float]:

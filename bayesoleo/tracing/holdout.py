@@ -4,7 +4,7 @@ run itself."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fit import Fit
+from bayesoleo.tracing.roles import halves
 
 Array = NDArray[np.float64]
 
@@ -107,3 +108,54 @@ def _held_out(fit: Fit, record: Record) -> Prediction:
         status if status is not Status.CONVERGED else Status(int(samples.status[0])),
         predictor,
     )
+
+
+def crossed(prediction: Prediction) -> Prediction | None:
+    """Predict each half of a held-out run with what was estimated on its other half.
+
+    No sample is then compared with parameters that it took part in estimating.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Of a run with parameters of its own.
+
+    Returns
+    -------
+    Prediction or None
+        The same with other outputs; ``None`` where a run has no halves that repeat, or one of them
+        could not be solved.
+    """
+    record = prediction.record
+    if not record.periodic or record.periods < 2 or not prediction.status.ok:
+        return None
+    parts = [replace(part, label=record.label) for part in halves(record)]
+    outputs = []
+    for estimated, predicted in zip(reversed(parts), parts, strict=True):
+        vector = _own_estimate(prediction, estimated)
+        predictor = _like(prediction, predicted)
+        if vector is None or predictor.set_anchor(vector)[0] is not Status.CONVERGED:
+            return None
+        samples = predictor.simulate(vector[None], 0)
+        if samples.status[0] != Status.CONVERGED.value:
+            return None
+        outputs.append(samples.y[0])
+    return replace(prediction, y=np.concatenate(outputs, axis=1), re_estimated=0)
+
+
+def _like(prediction: Prediction, record: Record) -> Predictor:
+    old = prediction.predictor
+    return Predictor(
+        old.model, [record], steps=old.steps, scheme=old.scheme, backend=old.backend, jobs=1
+    )
+
+
+def _own_estimate(prediction: Prediction, record: Record) -> Array | None:
+    """All unknowns, those of the run estimated on part of it."""
+    predictor = _like(prediction, record)
+    shared = {n: v for n, v in prediction.theta.items() if n in predictor.model.parameters}
+    problem = CampaignProblem(predictor).holding(shared)
+    start = np.array([prediction.theta[name] for name in problem.names])
+    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
+    point = estimate(problem, method, start=start)
+    return problem.full(point.theta[None])[0] if point.status.ok else None

@@ -11,8 +11,11 @@ from scipy import stats
 
 from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
 from bayesoleo.prediction.layout import Layout
+from bayesoleo.prediction.predictor import RunPrediction
+from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.robust import clustered_variance
 from bayesoleo.tracing.score import Base, Score, replicate
 from bayesoleo.tracing.significance import SAME
 
@@ -146,22 +149,47 @@ def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
         return score.inflation, 0
     free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
     own = [k for k, name in enumerate(fit.problem.names) if name in score.names]
+    parts = [
+        _stretches(run, predicted, replicate(record), fit, free, own)
+        for run, predicted, record in zip(
+            fit.predictor.runs, fit.predictions, fit.records, strict=True
+        )
+    ]
+    pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
+    worst, freedom = score.inflation, 0
+    if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
+        return worst, freedom
+    for k, row in enumerate(own):
+        overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
+        variance, degrees = clustered_variance(pulls[k], sizes[k], overlap)
+        ratio = variance / fit.point.covariance[row, row]
+        if degrees > 0 and ratio > worst:
+            worst, freedom = ratio, max(1, int(degrees))
+    return worst, freedom
+
+
+def _stretches(
+    run: RunPredictor,
+    predicted: RunPrediction,
+    stretch: NDArray[np.int64],
+    fit: Fit,
+    free: NDArray[np.int64],
+    own: list[int],
+) -> tuple[Array, Array, Array]:
+    """By new unknown and stretch: pull ``a @ r``, ``a @ a`` and ``a @ J``, in noise units."""
     unit = np.sqrt(fit.point.variance)[:, None]
-    total, count = np.zeros(len(own)), 0
-    for run, predicted, record in zip(
-        fit.predictor.runs, fit.predictions, fit.records, strict=True
-    ):
-        columns = predicted.sensitivity[:, free] / unit[:, None]
-        influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
-        pulls = np.einsum("kyn,yn->kn", influence, (run.measured - predicted.y) / unit)
-        stretch = replicate(record)
-        sums = np.stack([np.bincount(stretch, row) for row in pulls])
-        total += np.sum(sums**2, axis=1)
-        count += sums.shape[1]
-    white = np.diag(fit.point.covariance)[own]
-    if count < 2 or not np.isfinite(total).all():
-        return score.inflation, 0
-    return max(1.0, float(np.max(total / white)) * count / (count - 1)), count - 1
+    columns = predicted.sensitivity[:, free] / unit[:, None]
+    influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
+    residual = (run.measured - predicted.y) / unit
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1])
+
+    def summed(values: Array) -> Array:
+        return np.add.reduceat(values, edges, axis=-1)
+
+    pulls = summed(np.einsum("kyn,yn->kn", influence, residual))
+    sizes = summed(np.einsum("kyn,kyn->kn", influence, influence))
+    mixed = summed(np.einsum("kyn,yln->kln", influence, columns))
+    return pulls, sizes, np.moveaxis(mixed, 1, 2)
 
 
 def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:

@@ -58,7 +58,7 @@ def assign(records: Sequence[Record]) -> Roles:
         return Roles(fitted, fitted, "leave-one-run-out", text)
     (only,) = fitted
     if only.periods >= FEWEST_PERIODS_TO_SPLIT:
-        first, second = _halves(only)
+        first, second = halves(only)
         text = (
             "one run and no hold-out: fitted to the first half of its periods, held out the second"
         )
@@ -67,7 +67,8 @@ def assign(records: Sequence[Record]) -> Roles:
     return Roles(fitted, (), "none", f"{what}: nothing could be held out")
 
 
-def _halves(record: Record) -> tuple[Record, Record]:
+def halves(record: Record) -> tuple[Record, Record]:
+    """The first and the second half of a periodic record's periods, as records of their own."""
     half = record.periods // 2
     middle = int(np.searchsorted(record.phase, half - 1e-9))
     return (

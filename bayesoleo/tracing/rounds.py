@@ -4,7 +4,7 @@ not used."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from bayesoleo.effects import Effect
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.fit import Numerics
+from bayesoleo.tracing.holdout import crossed
 from bayesoleo.tracing.refit import Refit, refit
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.scales import scales_of
@@ -241,17 +242,35 @@ def _choose(
             continue
         say(f"confirm {item.effect} on runs that were not used")
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
-        fall, error = fall_on_hold_out(state, after)
-        # Parameters estimated on the held-out run itself fit its noise: each lowers the sum by one
-        # on average, and by more where noise is coloured, which scatters the sum more too.
-        more = sum(p.re_estimated for p in after.held_out)
-        more -= sum(p.re_estimated for p in state.held_out)
+        old, new = judged(state, after)
+        fall, error = fall_on_hold_out(old, new)
+        # Parameters estimated on the very samples that they are judged by fit their noise: each
+        # lowers the sum by one on average, and by more where noise is coloured, which scatters the
+        # sum more too.
+        more = sum(p.re_estimated for p in new.held_out)
+        more -= sum(p.re_estimated for p in old.held_out)
         error *= float(np.sqrt(item.score.inflation))
         if after.hold_errors.entries and not fall - item.score.inflation * more > error:
             reasons.append(f"{item.effect} does not lower the error on hold-out runs")
             continue
         return item, after, _accepted_reason(state, after, item, fall, error)
     return None, None, "; ".join(reasons) or "no candidate could be estimated"
+
+
+def judged(before: State, after: State) -> tuple[State, State]:
+    """Both states as an effect is judged by them: where it brings parameters of single runs, with
+    each half of a run predicted by what the other half says, alike before and after."""
+    pairs = []
+    for old, new in zip(before.held_out, after.held_out, strict=True):
+        if new.re_estimated > old.re_estimated:
+            across = crossed(old) if old.re_estimated else old, crossed(new)
+            if across[0] is not None and across[1] is not None:
+                old, new = across[0], across[1]
+        pairs.append((old, new))
+    return (
+        replace(before, held_out=[old for old, _ in pairs]),
+        replace(after, held_out=[new for _, new in pairs]),
+    )
 
 
 def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:

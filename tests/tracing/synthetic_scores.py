@@ -10,7 +10,7 @@ from bayesoleo.tracing.score import Base, RunBase
 PER_PERIOD = 50
 
 
-def base_of_noise(rng, *, shared, periods):
+def base_of_noise(rng, *, shared, periods, measured=True):
     """One run with two outputs of unit noise, the same in both or not, and a direction."""
     size = periods * PER_PERIOD
     first = rng.standard_normal(size)
@@ -23,7 +23,7 @@ def base_of_noise(rng, *, shared, periods):
         np.zeros((0, 2 * size)),
         np.zeros((0, 2 * size)),
         np.tile(np.floor(phase + 1e-9).astype(np.int64), 2),
-        spectra,
+        spectra if measured else (),
     )
     wave = 1e-3 * np.sin(2 * np.pi * phase)
     empty = np.zeros((0, 0))

@@ -37,12 +37,13 @@ def test_p_values_under_slow_noise_are_what_they_say(tmp_path):
     assert above <= 1
 
 
-def test_noise_that_outputs_share_shows_between_periods():
+@pytest.mark.parametrize("measured", [True, False], ids=["spectrum", "assumed white"])
+def test_noise_that_outputs_share_shows_between_periods(measured):
     """Two outputs with the same noise: a direction along both varies twice as much as apart."""
     found = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        base, direction = base_of_noise(rng, shared=True, periods=60)
+        base, direction = base_of_noise(rng, shared=True, periods=60, measured=measured)
         found.append(inflation_of(base, [direction])[0])
     assert np.mean(found) == pytest.approx(2.0, rel=0.15)
 
