@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many, log_prior
+from bayesoleo.model import Model, Output, Parameter, with_joint_prior
 from bayesoleo.model.correlated import JointNormal, log_density_of, sample_of
 from bayesoleo.model.priors import Normal
 from bayesoleo.posterior import LogDensity
@@ -125,3 +126,38 @@ def test_what_is_no_density_is_refused(mean, covariance, message):
 def test_a_name_it_does_not_have_is_named(joint):
     with pytest.raises(ModelError, match=r"not in the joint prior.*level, slope"):
         joint.prior("curve")
+
+
+@pytest.fixture
+def spring():
+    return Model(
+        "spring",
+        inputs={"displacement": "m"},
+        parameters={
+            "level": Parameter(1.0, "N", sd=1.0),
+            "slope": Parameter(2.0, "N/m", fixed=True),
+            "offset": Parameter(0.0, "N", sd=1.0, by_run=True),
+        },
+        outputs={"force": Output("level + slope*displacement + offset", unit="N")},
+    )
+
+
+def test_an_earlier_campaign_is_the_prior_of_a_model(spring, joint):
+    later = with_joint_prior(spring, joint)
+    assert later.estimated() == ("level", "slope", "offset")
+    assert [later.parameters[name].value for name in joint.names] == list(joint.mean)
+    members = [later.parameters[name].prior for name in joint.names]
+    away = MEAN + np.array([0.1, -0.2])
+    expected = multivariate_normal(joint.mean, joint.covariance)
+    fall = log_density_of(members, [away])[0] - log_density_of(members, [joint.mean])[0]
+    assert fall == pytest.approx(expected.logpdf(away) - expected.logpdf(joint.mean))
+    assert later.parameters["offset"] == spring.parameters["offset"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("mass", r"no such parameter.*level"), ("offset", r"by run.*leave it out")],
+)
+def test_a_parameter_without_an_earlier_value_is_named(spring, name, message):
+    with pytest.raises(ModelError, match=message):
+        with_joint_prior(spring, JointNormal.of([name], [1.0], [[1.0]]))
