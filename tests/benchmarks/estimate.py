@@ -1,9 +1,11 @@
 """Certified regressions beside lmfit and SciPy, the joint estimate of a campaign, replications.
 
-Run as ``python tests/benchmarks/estimate.py [--json] [--table]``. The data are found through
-``BAYESOLEO_DATA``; lmfit comes with the group ``bench``. A set counts if parameters and standard
-deviations agree with the certified ones to six digits. Everybody has the same exact derivatives
-where the settings say so, and tolerances near rounding; times are CPU time of this machine now.
+Run as ``python tests/benchmarks/estimate.py [--json] [--table] [--optimisers]``. The data are found
+through ``BAYESOLEO_DATA``; lmfit comes with the group ``bench``. A set counts if all its parameters
+and all their standard deviations agree with the certified ones to six digits, for everybody alike.
+Everybody has the same exact derivatives where the settings say so, and tolerances near rounding; of
+each package its best settings count. Times are CPU time of this machine now, but for ``_s`` of a
+joint estimate, which is wall time on all cores. Of a joint estimate the least of five is told.
 """
 
 from __future__ import annotations
@@ -29,9 +31,11 @@ from bayesoleo.workflow import Settings, prepare, reduce
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "estimation"))
 from nist_models import FUNCTIONS, Certified, complex_step, read
+from optimisers import table as optimiser_table
 
 DIGITS = 6
 FINE = 1e-15
+REPEATS = 5
 #: Truth of the simulated campaign over the nominal values, where the data identify it.
 TRUTH = {"piston_area": -0.020, "solubility": 0.118, "heat_conduction": 0.304}
 Found = tuple[np.ndarray, np.ndarray]
@@ -135,6 +139,16 @@ def nist() -> tuple[dict[str, dict[str, float]], dict[str, float]]:
     return table, seconds
 
 
+def missed(table: dict[str, dict[str, float]]) -> int:
+    """Fits that another package gets, and ours by default settings or by LM does not."""
+    ours = [row for who, row in table.items() if who in ("bayesoleo, default", "bayesoleo, LM")]
+    others = [row for who, row in table.items() if not who.startswith("bayesoleo")]
+    return sum(
+        any(row[name] >= DIGITS for row in others) and any(row[name] < DIGITS for row in ours)
+        for name in ours[0]
+    )
+
+
 def _rest(data: Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return data.starts, data.theta, data.sd
 
@@ -155,17 +169,19 @@ def joint(drive: str) -> dict[str, float]:
     task = prepare(reduced, system("f16n2d2"), Settings(drive=drive))
     model = task.assembly.model()
     steps = first_steps(model, reduced.records)
-    for _ in range(2):  # the first time compiles
+    walls, cpus = [], []
+    for _ in range(REPEATS):  # the first time compiles; the least is that of an undisturbed machine
         problem = CampaignProblem(Predictor(model, reduced.records, steps=steps))
         wall, cpu = time.perf_counter(), time.process_time()
         robust = estimate(problem, "mbe", resolution=RESOLUTION)
         mode = polish(problem, robust, resolution=RESOLUTION)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        walls.append(time.perf_counter() - wall)
+        cpus.append(time.process_time() - cpu)
     nominal = {name: item.value for name, item in model.parameters.items()}
     worst = max(abs(mode[n] / (nominal[n] * (1 + change)) - 1) for n, change in TRUTH.items())
     return {
-        "s": wall,
-        "cpu_s": cpu,
+        "s": min(walls),
+        "cpu_s": min(cpus),
         "evaluations": robust.evaluations + mode.evaluations,
         "converged": bool(robust.status.ok and mode.status.ok),
         "largest_error_pct": 100 * worst,
@@ -190,7 +206,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--table", action="store_true", help="print digits side by side")
+    parser.add_argument(
+        "--optimisers", action="store_true", help="compare SciPy's optimisers instead"
+    )
     options = parser.parse_args()
+    if options.optimisers:
+        print(optimiser_table())
+        return
     table, seconds = nist()
     counts = {who: sum(d >= DIGITS for d in row.values()) for who, row in table.items()}
 
@@ -201,6 +223,8 @@ def main() -> None:
         "nist_sets_6_digits": best("bayesoleo"),
         "lmfit_sets_6_digits": best("lmfit"),
         "scipy_sets_6_digits": best("scipy"),
+        "nist_default_sets_6_digits": counts["bayesoleo, default"],
+        "nist_sets_only_others_get": missed(table),
         **{f"nist_{who.replace(', ', '_').replace(' ', '_')}": n for who, n in counts.items()},
     }
     for drive, name in (("displacement", "joint_estimate"), ("model", "joint_estimate_by_force")):
