@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from cases import Case, batch, solve, start, states
 from explicit import Explicit
-from measuring import PHASES, Array, best, error
+from measuring import PHASES, Array, cpu, error
 
 from bayesoleo.model import Model
 from bayesoleo.parallel import available_cores
@@ -37,7 +37,8 @@ MOST_STEPS, MOST_ITERATIONS = 20_000, 12
 
 
 def measure(model: Model, cases: Sequence[Case], *, diffrax: bool = True) -> dict[str, float]:
-    """Milliseconds a solve, agreement or error, and failures of each peer that is installed."""
+    """CPU milliseconds a solve, their ratio to the default scheme's on the same vectors just after,
+    agreement or error, and failures, of each peer that is installed."""
     result: dict[str, float] = {}
     if importlib.util.find_spec("casadi"):
         result |= with_casadi(model, cases)
@@ -60,11 +61,12 @@ def with_casadi(
     assert isinstance(scheme, Collocation)
     root = _casadi_root(explicit, scheme, predictor.steps, scale)
     many = root.map(vectors, "thread", available_cores())
-    seconds, gap, failures = 0.0, 0.0, 0
+    seconds, own, gap, failures = 0.0, 0.0, 0.0, 0
     for r, run in enumerate(predictor.runs):
         p = predictor.constants(theta, r)
         z, given = _casadi_arguments(run, p, scale)
-        seconds += best(lambda z=z, given=given: many(z, given), 3)
+        seconds += cpu(lambda z=z, given=given: many(z, given), 3)
+        own += cpu(lambda run=run, p=p: solve(run, p), 3)
         found = np.array(many(z, given)).reshape(predictor.steps, -1, vectors)[:, 0] * scale[0]
         ours = solve(run, p)
         assert np.all(ours.status == Status.CONVERGED)
@@ -75,6 +77,7 @@ def with_casadi(
     solves = vectors * len(cases)
     return {
         "casadi_ms": 1e3 * seconds / solves,
+        "casadi_ratio": seconds / own,
         "casadi_gap": gap,
         "casadi_failures": failures,
     }
@@ -148,10 +151,12 @@ def with_diffrax(model: Model, case: Case, vectors: int = DIFFRAX_BATCH) -> dict
     newton, along = _diffrax_shooting(Explicit.of(model), case)
     many = jax.jit(jax.vmap(newton))
     y, steps = (np.array(item) for item in many(begin, p))  # compiles
-    seconds = best(lambda: jax.block_until_ready(many(begin, p)), 2)
+    seconds = cpu(lambda: jax.block_until_ready(many(begin, p)), 2)
+    own = cpu(lambda: solve(run, p), 7)
     stroke = np.array(jax.jit(along)(y[0], p[0]))[:, 0] * case.scale[0]
     return {
         "diffrax_ms": 1e3 * seconds / vectors,
+        "diffrax_ratio": seconds / own,
         "diffrax_error": error(stroke, case.exact[0]),
         "diffrax_failures": int(np.count_nonzero(~(steps < STEP))),
     }

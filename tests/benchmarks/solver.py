@@ -3,8 +3,8 @@
 Run as ``python tests/benchmarks/solver.py [--json] [--only PART ...]``. The campaign is found
 through ``BAYESOLEO_DATA``. What fails counts in keys that end in ``failures``; errors are of the
 stroke over its amplitude, against shooting at 1e-12. ``solve_us``, ``default_solve_us`` and
-``log_density_ms`` are wall time with all cores, best of several, and so are CasADi's and Diffrax's;
-those ending in ``cpu_us`` and SciPy's are one thread's CPU time.
+``log_density_ms`` are wall time with all cores, best of several; all other times of solves are CPU
+time, summed over threads.
 
 ==============  ====================================================================================
 ``headline``    time per solve and error: backward differences with n = 800, and the default scheme
@@ -89,12 +89,7 @@ class Benchmark:
         return found
 
     def peers(self) -> dict[str, float]:
-        found = peers.measure(self.model, self.cases)
-        for name in ("casadi", "diffrax"):
-            if f"{name}_ms" in found:
-                ratio = 1e3 * found[f"{name}_ms"] / self.solve_times["default_solve_us"]
-                found[f"{name}_ratio"] = ratio
-        return found
+        return peers.measure(self.model, self.cases)
 
     def shooting(self) -> dict[str, float]:
         return {f"shooting_{key}" if key != "shooting_ratio" else key: value
