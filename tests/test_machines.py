@@ -83,6 +83,12 @@ def test_only_missing_pieces_are_made(tmp_path):
     assert sorted(told) == list(range(7))
 
 
+def test_what_a_kill_left_half_written_is_removed(tmp_path):
+    (tmp_path / ".slot-000000.1234.npz").write_bytes(b"half")
+    Slots(tmp_path, "a").fill(Counting(), 1, jobs=1)
+    assert not list(tmp_path.glob(".slot-*"))
+
+
 def test_two_writers_of_pieces_are_refused(tmp_path):
     def second(_number: int) -> dict[str, np.ndarray]:
         Slots(tmp_path, "a").fill(Counting(), 1, jobs=1)

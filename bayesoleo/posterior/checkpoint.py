@@ -10,8 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
-import sys
 import zipfile
 import zlib
 from collections import Counter
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 from bayesoleo.errors import ResultsError
 from bayesoleo.posterior.mixture import Mixture
 from bayesoleo.posterior.segment import Phase, Segment
+from bayesoleo.storage.atomic import replacing
 from bayesoleo.storage.lock import only_writer
 
 _NAME = "segment-{:06d}.npz"
@@ -73,7 +72,7 @@ class FolderStore:
     def __init__(self, folder: Path, fingerprint: str) -> None:
         self.folder, self.fingerprint = folder, fingerprint
         self.segments: list[Segment] = []
-        for leftover in folder.glob("segment-*.tmp"):
+        for leftover in folder.glob(".segment-*"):  # of a run that was killed amid writing
             leftover.unlink()
         self._load_good_prefix()
 
@@ -82,11 +81,11 @@ class FolderStore:
 
         Raises
         ------
-        OSError
+        ResultsError
             If it cannot be written (a full disk); what was written before is untouched.
         """
-        path = self.folder / _NAME.format(len(self.segments))
-        write_durably(path, encode(segment, self.fingerprint, len(self.segments)))
+        with replacing(self.folder / _NAME.format(len(self.segments))) as draft:
+            draft.write_bytes(encode(segment, self.fingerprint, len(self.segments)))
         self.segments.append(segment)
 
     def _load_good_prefix(self) -> None:
@@ -131,44 +130,6 @@ def set_aside(path: Path) -> None:
     while (aside := path.with_suffix(f".broken-{number}")).exists():
         number += 1
     path.rename(aside)
-
-
-def write_durably(path: Path, content: bytes) -> None:
-    """Write a file that is either absent or whole, whatever happens meanwhile.
-
-    Parameters
-    ----------
-    path : Path
-        Where it will be.
-    content : bytes
-        What it will hold.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; no file of that name exists then.
-    """
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    _synchronise_folder(path.parent)
-
-
-def _synchronise_folder(folder: Path) -> None:
-    if sys.platform == "win32":  # Windows cannot open a folder; its rename is durable with the file
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def encode(segment: Segment, fingerprint: str, index: int) -> bytes:

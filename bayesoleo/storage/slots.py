@@ -129,6 +129,9 @@ class Slots:
             If another process writes to the folder, or a stored piece is damaged.
         """
         with only_writer(self.folder):
+            if self.folder is not None:  # what a process that was killed left half written
+                for draft in self.folder.glob(".slot-*"):
+                    draft.unlink()
             pieces: dict[int, Arrays] = {}
             for number in range(count):
                 stored = self.read(number)

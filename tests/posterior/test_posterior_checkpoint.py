@@ -13,6 +13,7 @@ from posterior_targets import Gaussian
 
 from bayesoleo.errors import ResultsError
 from bayesoleo.posterior import checkpoint
+from bayesoleo.storage import atomic
 
 CHILD = Path(__file__).with_name("kill_target.py")
 
@@ -106,7 +107,7 @@ def test_two_writers_are_refused(tmp_path):
 
 def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
     first = run(Gaussian(np.ones(2)), None)
-    real, calls = checkpoint.os.fsync, []
+    real, calls = atomic.os.fsync, []
 
     def full(descriptor):
         calls.append(descriptor)
@@ -114,8 +115,32 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
         real(descriptor)
 
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(atomic.os, "fsync", full)
+    with pytest.raises(ResultsError, match="cannot be written: No space left"):
         run(Gaussian(np.ones(2)), tmp_path)
-    assert not list(tmp_path.glob("*.tmp"))
+    assert not list(tmp_path.glob(".segment-*"))
     same(run(Gaussian(np.ones(2)), tmp_path), first)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no limit on the size of files")
+def test_a_disk_that_takes_no_more_ends_the_run_and_room_lets_it_go_on(tmp_path):
+    import resource
+
+    first = run(Gaussian(np.ones(2)), None)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Room for the first segment, of one draw, and not for one of the warm-up.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, hard))
+    try:
+        with pytest.raises(ResultsError, match="cannot be written: File too large"):
+            run(Gaussian(np.ones(2)), tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in tmp_path.glob("*.npz")] == ["segment-000000.npz"]
+    same(run(Gaussian(np.ones(2)), tmp_path), first)
+
+
+def test_what_a_kill_left_half_written_is_removed(tmp_path):
+    (tmp_path / ".segment-000000.1234.npz").write_bytes(b"half")
+    first = run(Gaussian(np.ones(2)), tmp_path)
+    assert not list(tmp_path.glob(".segment-*"))
+    same(first, run(Gaussian(np.ones(2)), None))
