@@ -137,7 +137,7 @@ def test_end_stop_moves_as_in_the_thesis(theta, first, least, fastest):
         (1.0, 6.6632868593),
         pytest.param(2.0, 7.6298744797, marks=pytest.mark.slow),
         pytest.param(3.0, 8.8590954997, marks=pytest.mark.slow),
-        (5.0, 11.6122306677),
+        pytest.param(5.0, 11.6122306677, marks=pytest.mark.slow),
         pytest.param(10.0, 19.0783695669, marks=pytest.mark.slow),
     ],
 )
