@@ -156,9 +156,9 @@ def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
         )
     ]
     pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
-    worst, freedom = score.inflation, 0
     if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
-        return worst, freedom
+        return score.inflation, 0
+    worst, freedom = 1.0, 0
     for k, row in enumerate(own):
         overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
         variance, degrees = clustered_variance(pulls[k], sizes[k], overlap)
