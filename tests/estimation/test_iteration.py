@@ -189,6 +189,21 @@ def test_overshooting_steps_are_shortened(method, curvature):
 
 
 @pytest.mark.parametrize("method", ["mbe", "gauss-newton"])
+def test_small_steps_that_overshoot_a_little_are_shortened_too(method):
+    """A sensitivity of seven eighths leaves -1/7 of the error: a tenth is noticed, nearby."""
+    x, y = np.ones(50), np.random.default_rng(1).normal(1.0, 5.0, 50)
+    problem = FunctionProblem(
+        lambda x, t: t[0] * x, x, y, [Normal(0.0, 1e4)], start=[y.mean() + 0.5],
+        jacobian=lambda x, _: 7 / 8 * x[:, None],
+    )  # fmt: skip
+    point = estimate(problem, method, tolerance=1e-10)
+    assert point.status is Status.CONVERGED
+    # one by one, 0.7 standard deviations fall to the tolerance in 12 iterations
+    assert point.iterations <= 5
+    assert point.theta[0] == pytest.approx(y.mean(), abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["mbe", "gauss-newton"])
 def test_creeping_steps_are_lengthened(method):
     """A sensitivity four times too large leaves 3/4 of the error in each iteration."""
     y = np.random.default_rng(1).normal(1.0, 5.0, 50)
