@@ -123,8 +123,14 @@ def test_multipliers_of_the_linear_oscillator_come_with_derivatives():
 
 def test_notes_say_what_would_happen_instead():
     table = np.array(
-        [[0.5, 0.1], [-1.7, 0.2], [1.4, 0.3], [1.1 + 0.5j, 1.1 - 0.5j], [np.nan, np.nan]]
-        + [[-0.97, 0.1]]
+        [
+            [0.5, 0.1],
+            [-1.7, 0.2],
+            [1.4, 0.3],
+            [1.1 + 0.5j, 1.1 - 0.5j],
+            [np.nan, np.nan],
+            [-0.97, 0.1],
+        ]
     )
     jumps = np.array([0, 0, 2, 0, 0, 0])
     found = Stability(tuple("abcdef"), table, jumps)
