@@ -17,7 +17,7 @@ from bayesoleo.estimation.sampling_distribution import _Blocks, _Work
 from bayesoleo.machines import connected, each_done
 
 #: Replications of the campaign of 14 runs, one a task.
-TASKS = 48
+TASKS = 96
 REPLICATIONS, BLOCK = 1000, 10
 
 
@@ -128,6 +128,6 @@ class _Watch:
             thread.join()
 
 
-def machine_figures() -> dict[str, float]:
+def machines_figures() -> dict[str, float]:
     """Both."""
     return efficiency() | killed_worker()

@@ -172,7 +172,7 @@ def pypesto_on_spring(case: Case) -> dict[str, float]:
     }
 
 
-def peer_figures() -> dict[str, float]:
+def peers_figures() -> dict[str, float]:
     """All that are installed."""
     case = gas_spring_case(0.1)
     return nutpie_on_oleo() | lmfit_on_spring(case) | pypesto_on_spring(case)
