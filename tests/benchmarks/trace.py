@@ -1,0 +1,81 @@
+"""How often the loop is right, and how long a round takes.
+
+Run as ``python tests/benchmarks/trace.py [--json] [--fraction 0.01] [--results FILE]``. It closes
+the loop on a sample of the campaigns of ``studies/identification.py`` - or takes the rows that a
+file of that study holds - and times one round with the whole catalogue: on six runs a second time,
+and on the fourteen of ``campaigns/shaker-wall`` where ``BAYESOLEO_DATA`` has them. Times are wall
+times of this machine now.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "studies"))
+
+import identification as study
+import numpy as np
+
+from bayesoleo.data import ReducedCampaign, dataset_folder, load_campaign, reduce_campaign
+from bayesoleo.systems import system
+from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.fit import Numerics
+from bayesoleo.tracing.roles import assign
+from bayesoleo.tracing.rounds import examine
+from bayesoleo.tracing.state import fit_state
+
+FOURTEEN_RUNS = "shaker-wall"
+
+
+def round_of(reduced: ReducedCampaign, model: str) -> tuple[float, int]:
+    """Seconds that one round takes after the first fit, and how many candidates it scores."""
+    numerics, roles = Numerics(), assign(reduced.records)
+    state = fit_state(Assembly(system(model), study.DRIVE), roles, numerics)
+    begin = time.perf_counter()
+    outcome = examine(state, roles, numerics, effects=None, seed=0, last=False, say=lambda _: None)
+    return time.perf_counter() - begin, len(outcome.ranking)
+
+
+def times() -> dict[str, Any]:
+    """Rounds on fourteen runs, the first thing done here, and on six, done before."""
+    found: dict[str, Any] = {}
+    if os.environ.get("BAYESOLEO_DATA"):
+        reduced = reduce_campaign(load_campaign(dataset_folder(FOURTEEN_RUNS)))
+        found["round_s"], found["candidates"] = round_of(reduced, study.SYSTEM)
+    wall = study.Campaign("wall_heat_capacity", "heat_loss", 10.0, 0)
+    model, values = study.truth(wall, np.random.default_rng(0))
+    six = study.simulated(model, values, 0)
+    round_of(six, study.SYSTEM)
+    found["round_six_runs_s"] = round_of(six, study.SYSTEM)[0]
+    found.setdefault("round_s", found["round_six_runs_s"])
+    return found
+
+
+def main() -> None:
+    """Time a round, close the loop on a sample, print one flat object."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--fraction", type=float, default=0.01, help="of the study's campaigns")
+    parser.add_argument("--results", type=Path, help="rows of a study instead of a sample")
+    options = parser.parse_args()
+    result = times()
+    if options.results is None:
+        chosen = study.planned()
+        rows = [study.run(item) for item in chosen[: round(options.fraction * len(chosen))]]
+    else:
+        rows = study.stored(options.results)
+    result |= study.summarise(rows)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print("\n".join(f"{name:26} {value}" for name, value in result.items()))
+
+
+if __name__ == "__main__":
+    main()
