@@ -114,11 +114,12 @@ def test_a_settled_filter_is_the_filter_itself():
     campaign = Campaign(outputs=("force",), runs=("a",), lengths=(400,))
     campaign.__class__ = type("Equal", (Campaign,), {"samples": (RunSamples(time, 1.0),)})
     model = error_model("correlated", campaign)
-    eta = np.array([[0.3, 1.0, np.log(0.05)], [0.3, 30.0, np.log(0.5)], [0.3, -30.0, 0.0]])
+    eta = np.array([[0.3, 1.0, np.log(0.05)], [0.3, 7.0, np.log(0.5)], [0.3, -7.0, 0.0]])
     residual = np.random.default_rng(0).normal(size=(3, 1, 400))
     found = model.of_run(0, residual, eta)
     for lane in range(3):
-        v, share, tau = np.exp(0.3), 1 / (1 + np.exp(-eta[lane, 1])), np.exp(eta[lane, 2])
+        log_v, share, tau = model.natural(eta[lane : lane + 1])[0]
+        v = np.exp(log_v)
         exact = stats.multivariate_normal(cov=covariance(time, v, share, tau))
         assert found[lane] == pytest.approx(exact.logpdf(residual[lane, 0]), rel=1e-10)
 

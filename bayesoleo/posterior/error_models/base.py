@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
@@ -28,6 +29,23 @@ Array = NDArray[np.float64]
 #: Spread of the logarithm of a variance before anything is known of it: walkers start from the
 #: residuals' own size, and Newton's method needs a scale only.
 _LOG_VARIANCE_SD = 0.3
+
+
+class Probit:
+    """Map of a share between zero and one: the normal quantile, whose tails at both ends fall as a
+    normal's do where those of a logit only fall exponentially."""
+
+    def natural(self, u: Array) -> Array:
+        """Share at the coordinate."""
+        return np.asarray(ndtr(u))
+
+    def unbounded(self, value: Array) -> Array:
+        """Coordinate of a share; infinite at zero and one."""
+        return np.asarray(ndtri(value))
+
+    def log_jacobian(self, u: Array) -> Array:
+        """Logarithm of the derivative."""
+        return -0.5 * u * u - 0.5 * float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -46,6 +64,8 @@ class Quantity:
         SI; ``"{}"`` stands for the output's own.
     long_name : str
         What it is.
+    share : bool
+        Whether it is a part of a whole.
     """
 
     name: str
@@ -54,11 +74,12 @@ class Quantity:
     prior: Prior | None = None
     unit: str = "1"
     long_name: str = ""
+    share: bool = False
 
     @property
-    def transform(self) -> Transform:
+    def transform(self) -> Transform | Probit:
         """Map from a coordinate without bounds."""
-        return Transform(self.low, self.high)
+        return Probit() if self.share else Transform(self.low, self.high)
 
     def log_prior(self, u: Array) -> Array:
         """Log density of the coordinate, shape (W,); zero where the prior is flat."""

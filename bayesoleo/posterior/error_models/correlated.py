@@ -23,17 +23,22 @@ and Williams (2006), *Gaussian Processes for Machine Learning*, eq. B.26 (the pr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numba
 import numpy as np
+from scipy.special import ndtr
 
 from bayesoleo import schema
 from bayesoleo.model.priors import LogNormal, Uniform
 from bayesoleo.posterior.error_models.base import Array, Frame, Quantity
 from bayesoleo.posterior.error_models.by_output import ByOutput
 
+SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
+# Steps of sampling that a correlation time is likely to exceed.
+_LEAST_STEPS = 4
 # Sampling steps that differ by less than this part of their median are the same.
 _EQUAL = 1e-6
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -45,8 +50,8 @@ def _log_likelihood(residual, kind, steps, eta, out):
     n = residual.shape[1]
     decay = np.empty(steps.size)
     for lane in range(residual.shape[0]):
-        share = 1.0 / (1.0 + np.exp(-eta[lane, 1]))
-        white = 1.0 / (1.0 + np.exp(eta[lane, 1]))
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        white = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
         rate = np.exp(-eta[lane, 2])
         for k in range(steps.size):
             decay[k] = np.exp(-steps[k] * rate)
@@ -80,7 +85,7 @@ def _log_likelihood(residual, kind, steps, eta, out):
 @jit
 def _whiten(columns, kind, steps, eta, out):
     """Rows ``(k, n)`` as innovations of unit variance."""
-    share, white = 1.0 / (1.0 + np.exp(-eta[1])), 1.0 / (1.0 + np.exp(eta[1]))
+    share, white = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
     rate, sd = np.exp(-eta[2]), np.exp(0.5 * eta[0])
     for row in range(columns.shape[0]):
         mean, power = 0.0, share
@@ -99,20 +104,23 @@ class CorrelatedErrors(ByOutput):
     """White noise and an Ornstein-Uhlenbeck process for each output; every run starts anew.
 
     Flat in the logarithm of the total variance, uniform in the share that is correlated, and
-    log-normal in its time with the sampling interval and the longest record two standard deviations
-    from the middle.
+    log-normal in its time, with four sampling intervals and the longest record two standard
+    deviations either side of the middle.
     """
 
     word = "correlated"
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
+        self._usual = float(np.median(np.concatenate([np.diff(r.time) for r in frame.sampled()])))
         self._steps = [_kinds(np.diff(run.time)) for run in frame.sampled()]
 
     def _declare(self) -> tuple[Quantity, ...]:
         outputs, samples = self.frame.outputs, self.frame.sampled()
         shortest = min(float(np.median(np.diff(run.time))) for run in samples)
         longest = max(float(run.time[-1] - run.time[0]) for run in samples)
+        # Shorter than a step it would be white noise once more, of a share that no data know.
+        shortest = min(_LEAST_STEPS * shortest, 0.5 * longest)
         reach = max(0.25 * float(np.log(longest / shortest)), 0.5)
         time = LogNormal(float(np.sqrt(shortest * longest)), reach)
         shares = tuple(
@@ -121,6 +129,7 @@ class CorrelatedErrors(ByOutput):
                 0.0,
                 1.0,
                 Uniform(0.0, 1.0),
+                share=True,
                 long_name=f"share of the error variance of {output} that is correlated in time",
             )
             for output in outputs
@@ -136,6 +145,17 @@ class CorrelatedErrors(ByOutput):
             for output in outputs
         )
         return (*self.frame.log_variances(), *shares, *times)
+
+    def log_new(self, share: Array, log_length: Array) -> Array:
+        """Of the filter that has settled, at the usual sampling interval."""
+        part, white = ndtr(share), ndtr(-share)
+        with np.errstate(over="ignore", under="ignore"):
+            left = -np.expm1(-2 * self._usual * np.exp(-log_length))  # 1 - a^2
+        # Predicted variance P: P^2 + P (1 - a^2) (white - part) = part (1 - a^2) white.
+        half, product = 0.5 * left * (white - part), part * left * white
+        root = np.sqrt(half * half + product)
+        power = np.where(half > 0, product / (root + np.abs(half)), root - half)
+        return np.asarray(np.log(power + white))
 
     def of_output(self, run: int, residual: Array, eta: Array) -> Array:
         out = np.empty(len(residual))

@@ -26,8 +26,11 @@ a periodic covariance).
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
+from scipy.special import log_ndtr, ndtr
 
 from bayesoleo import schema
 from bayesoleo.model.priors import LogNormal, Uniform
@@ -38,6 +41,7 @@ from bayesoleo.posterior.error_models.by_output import ByOutput
 HARMONICS = 24
 #: Prior of the length in cycles: within a factor of four of a tenth.
 _LENGTH = LogNormal(0.1, 0.7)
+SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
@@ -107,8 +111,8 @@ def _log_likelihood(projected, squares, count, gram, weight, eta, out):
     size = gram.shape[0]
     factor, root, answer = np.empty((size, size)), np.empty(size), np.empty(size)
     for lane in range(projected.shape[0]):
-        share = 1.0 / (1.0 + np.exp(-eta[lane, 1]))
-        noise = 1.0 / (1.0 + np.exp(eta[lane, 1]))
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        noise = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
         for j in range(size):
             root[j] = np.sqrt(share * weight[lane, j])
         logs = _factorise(gram, root, noise, factor)
@@ -146,6 +150,7 @@ class DiscrepancyErrors(ByOutput):
                 0.0,
                 1.0,
                 Uniform(0.0, 1.0),
+                share=True,
                 long_name=f"share of the error variance of {output} that repeats every period",
             )
             for output in outputs
@@ -162,6 +167,10 @@ class DiscrepancyErrors(ByOutput):
         )
         return (*self.frame.log_variances(), *shares, *lengths)
 
+    def log_new(self, share: Array, log_length: Array) -> Array:
+        """The white part: of a curve that repeats itself nothing is new for long."""
+        return np.asarray(log_ndtr(-share))
+
     def of_output(self, run: int, residual: Array, eta: Array) -> Array:
         table, gram = self._tables[run], self._grams[run]
         projected, squares = np.empty((len(residual), len(gram))), np.empty(len(residual))
@@ -172,7 +181,7 @@ class DiscrepancyErrors(ByOutput):
         return out
 
     def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
-        share, noise = 1 / (1 + np.exp(-eta[1])), 1 / (1 + np.exp(eta[1]))
+        share, noise = ndtr(eta[1]), ndtr(-eta[1])
         root = np.sqrt(share * spectrum(np.exp(eta[2:]))[0])
         inner = noise * np.eye(root.size) + root[:, None] * self._grams[run] * root
         projected = root[:, None] * (self._tables[run].T @ columns.T)
