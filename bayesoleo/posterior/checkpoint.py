@@ -149,6 +149,7 @@ def encode(segment: Segment, fingerprint: str, index: int) -> bytes:
         "coords": segment.coords,
         "log_density": segment.log_density,
         "by_run": segment.by_run,
+        "failed": segment.failed,
         "generator_keys": np.asarray(keys, dtype=np.uint32),
         "generator_cached": np.array(cached, dtype=float),
         "centres": segment.mixture.centres,
@@ -180,6 +181,7 @@ def decode(content: bytes, index: int) -> tuple[Segment, str]:
         coords=arrays["coords"],
         log_density=arrays["log_density"],
         by_run=arrays["by_run"],
+        failed=arrays["failed"],
         random_state=(
             name,
             arrays["generator_keys"],

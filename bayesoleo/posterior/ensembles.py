@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 
 import emcee
 import numpy as np
@@ -20,7 +21,7 @@ from bayesoleo.posterior.moves import (
     SnookerMove,
     differential_evolution,
 )
-from bayesoleo.posterior.segment import Phase, Segment
+from bayesoleo.posterior.segment import REASONS, Phase, Segment
 
 Array = NDArray[np.float64]
 
@@ -178,7 +179,7 @@ class Ensembles:
         # emcee wraps the function in one that prints the traceback and all rows of whatever passes
         # through, an interrupt too.
         sampler.log_prob_fn = self._rows
-        before = _Tally.of(self.log_density)
+        tallies = [_Tally.of(self.log_density)]
         state = State(
             last.coords[-1],
             log_prob=last.log_density[-1],
@@ -187,24 +188,26 @@ class Ensembles:
             random_state=last.random_state,
             copy=True,
         )
-        final = sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+        for _ in sampler.sample(state, iterations=steps, skip_initial_state_check=True):
+            tallies.append(_Tally.of(self.log_density))
         coords = sampler.get_chain()
         mixture = last.mixture
         if phase == "warm-up":
             mixture = mixture.refitted(coords.reshape(-1, mixture.dimension))
-        tally = _Tally.of(self.log_density) - before
+        tally = tallies[-1] - tallies[0]
         return Segment(
             phase,
             coords,
             sampler.get_log_prob(),
             sampler.get_blobs().reshape(steps, self.chains, -1),
-            final.random_state,
+            sampler.random_state,
             mixture,
             tally.evaluations,
             tally.failures,
             Counter({move.name: move.proposed for move, _ in moves}),
             Counter({move.name: move.accepted for move, _ in moves}),
             tally.branch_jumps,
+            np.array([(after - before).by_reason for before, after in pairwise(tallies)]),
         )
 
     @property
@@ -240,6 +243,11 @@ class _Tally:
     def of(cls, log_density: Density) -> _Tally:
         jumps = getattr(log_density, "branch_jumps", 0)  # of densities that solve something
         return cls(log_density.evaluations, Counter(log_density.failures), jumps)
+
+    @property
+    def by_reason(self) -> list[int]:
+        """Failures in the order of a segment's table."""
+        return [self.failures[reason] for reason in REASONS]
 
     def __sub__(self, other: _Tally) -> _Tally:
         return _Tally(

@@ -289,6 +289,7 @@ def _samples(
         evaluations=sum(s.evaluations for s in segments),
         failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
         branch_jumps=sum(s.branch_jumps for s in segments),
+        failed=np.concatenate([s.failed for s in kept]),
         reached=not short,
         warning="; ".join(short),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bayesoleo import schema
 from bayesoleo.posterior.density import LOG_VARIANCE
 from bayesoleo.posterior.mixture import Mixture
+from bayesoleo.posterior.segment import REASONS
 
 Array = NDArray[np.float64]
 
@@ -50,6 +51,9 @@ class Samples:
         Whether the effective size asked for was reached and the ensembles agree.
     warning : str
         What was not reached; empty otherwise.
+    failed : ndarray of int, shape (draws, reasons)
+        Proposals of density zero on the way to each kept draw, by
+        :data:`bayesoleo.posterior.segment.REASONS`.
     branch_jumps : int
         Solutions of runs, warm-up included, that left the branch of the one they started from.
         Where there are any, the density may be that of several answers of the model to one input.
@@ -72,6 +76,9 @@ class Samples:
     reached: bool
     warning: str
     branch_jumps: int = 0
+    failed: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
+    )
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.posterior.mixture import Mixture
+from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
+#: Reasons for a density of zero, in the order of :attr:`Segment.failed`.
+REASONS = tuple(status.name.lower() for status in Status if not status.ok)
 Phase = Literal["start", "warm-up", "kept"]
 #: ``numpy.random.RandomState.get_state()``
 RandomState = tuple[str, NDArray[np.uint32], int, int, float]
@@ -41,6 +44,8 @@ class Segment:
         Rows of density zero by reason.
     proposed, accepted : collections.Counter
         Proposals by kind of move.
+    failed : ndarray of int, shape (draws, reasons)
+        Proposals of density zero on the way to each draw, by :data:`REASONS`.
     branch_jumps : int
         Solutions of runs that left the branch of the one they started from.
     """
@@ -56,6 +61,9 @@ class Segment:
     proposed: Counter[str] = field(default_factory=Counter)
     accepted: Counter[str] = field(default_factory=Counter)
     branch_jumps: int = 0
+    failed: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
+    )
 
     @property
     def draws(self) -> int:

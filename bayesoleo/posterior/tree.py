@@ -13,6 +13,7 @@ from bayesoleo.model.correlated import sample_of
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.density import LOG_VARIANCE, LogDensity
 from bayesoleo.posterior.samples import Samples
+from bayesoleo.posterior.segment import REASONS
 
 #: Chains and draws of the prior's group.
 PRIOR_CHAINS, PRIOR_DRAWS = 4, 500
@@ -163,8 +164,13 @@ def _sample_stats(samples: Samples) -> xr.Dataset:
     attributes["reached"] = int(samples.reached)  # netCDF has no truth values
     attributes["warning"] = samples.warning
     about = {"units": "1", "long_name": "log posterior density over coordinates without bounds"}
-    variables = {"lp": (("chain", "draw"), samples.log_density, about)}
-    return xr.Dataset(variables, coords=_coordinates(samples), attrs=attributes)
+    variables: dict[str, object] = {"lp": (("chain", "draw"), samples.log_density, about)}
+    coordinates = _coordinates(samples)
+    if len(samples.failed):
+        about = {"units": "1", "long_name": "proposals of density zero on the way to a draw"}
+        variables["failed"] = (("draw", "reason"), samples.failed, about)
+        coordinates = {**coordinates, "reason": list(REASONS)}
+    return xr.Dataset(variables, coords=coordinates, attrs=attributes)
 
 
 def _log_likelihood(samples: Samples) -> xr.Dataset:

@@ -7,6 +7,7 @@ from posterior_targets import Banana, Gaussian
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
+from bayesoleo.posterior.segment import REASONS
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
@@ -144,6 +145,28 @@ class Nowhere(Gaussian):
         height, by_run = super().__call__(phi)
         self.failures["inadmissible"] += len(phi)
         return np.full_like(height, -np.inf), by_run
+
+
+class Fenced(Gaussian):
+    """Nothing is allowed beyond one standard deviation of the first coordinate."""
+
+    def __call__(self, phi):
+        height, by_run = super().__call__(phi)
+        beyond = phi[:, 0] > 1.0
+        self.failures["inadmissible"] += int(beyond.sum())
+        height[beyond] = -np.inf
+        return height, by_run
+
+
+def test_failures_are_kept_draw_by_draw():
+    target = Fenced(np.ones(2))
+    samples = sample(target, normal_mixture(np.ones(2)), seed=1, quick=True, progress=False)
+    assert samples.draws[:, :, 0].max() <= 1.0
+    assert samples.failures["inadmissible"] == target.failures["inadmissible"]
+    by_reason = dict(zip(REASONS, samples.failed.T, strict=True))
+    assert samples.failed.shape[0] == samples.draws.shape[1]
+    assert 0 < by_reason["inadmissible"].sum() < samples.failures["inadmissible"]
+    assert samples.failed.sum() == by_reason["inadmissible"].sum()
 
 
 def test_a_start_without_a_finite_walker_is_refused():
