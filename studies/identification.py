@@ -95,6 +95,8 @@ def planned() -> list[Campaign]:
     found = [Campaign(NONE, "", 0.0, k) for k in range(PLAIN)]
     for option in [*options(), *strangers()]:
         effect, target = option.key
+        if option.key not in limits():
+            continue  # the model can already do what it would: no data can show it
         found += [
             Campaign(effect, target, factor, k) for factor in FACTORS for k in range(REPLICATIONS)
         ]

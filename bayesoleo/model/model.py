@@ -6,6 +6,7 @@ import hashlib
 import keyword
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import sympy as sp
 
@@ -232,15 +233,18 @@ class Model:
 
     def order(self, dof: str) -> int:
         """Order of a dof: of its highest derivative in equations and outputs, at least one."""
+        return self._orders.get(dof, 1)
+
+    @cached_property
+    def _orders(self) -> dict[str, int]:
+        """Order of the highest derivative of every quantity that has one."""
         everything = [self.equation(name) for name in self.dofs]
         everything += [self.output(name) for name in self.outputs]
-        orders = [
-            split_derivative(item)[1]
-            for expression in everything
-            for item in expression.free_symbols
-            if split_derivative(item)[0] == dof
-        ]
-        return max([1, *orders])
+        found: dict[str, int] = {}
+        for item in {item for expression in everything for item in expression.free_symbols}:
+            name, order = split_derivative(item)
+            found[name] = max(1, order, found.get(name, 1))
+        return found
 
     def estimated(self) -> tuple[str, ...]:
         """Names of the parameters that are not fixed."""
@@ -266,6 +270,10 @@ class Model:
         These are the equations of dofs of second order, and the outputs that depend on an input (a
         force law), and - without velocity - the equations of dofs of first order.
         """
+        return self._coordinates
+
+    @cached_property
+    def _coordinates(self) -> tuple[Coordinate, ...]:
         places = []
         for dof in self.dofs:
             top = derivative_symbol(dof, self.order(dof))
