@@ -13,8 +13,10 @@ from bayesoleo.plots.fits import fit
 from bayesoleo.plots.forecasts import forecast
 from bayesoleo.plots.forest import point_against_posterior
 from bayesoleo.plots.histories import history
+from bayesoleo.plots.pairs import pairs
 from bayesoleo.plots.period_search import period_search
 from bayesoleo.plots.predictions import predictive
+from bayesoleo.plots.prior_sensitivities import prior_sensitivity
 from bayesoleo.plots.rankings import ranking
 from bayesoleo.plots.records import records
 from bayesoleo.plots.regions import indifference, profile
@@ -40,9 +42,11 @@ __all__ = [
     "format_value",
     "history",
     "indifference",
+    "pairs",
     "period_search",
     "point_against_posterior",
     "predictive",
+    "prior_sensitivity",
     "profile",
     "ranking",
     "records",

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from bayesoleo import schema
 from bayesoleo.plots import style
-from bayesoleo.plots.regions import MOST, _grid
+from bayesoleo.plots.regions import MOST, panel_grid
 
 
 def history(data: xr.Dataset) -> Figure:
@@ -30,7 +30,7 @@ def history(data: xr.Dataset) -> Figure:
     names = [str(name) for name in data[schema.PARAMETER].values][: MOST - 1]
     methods = [str(name) for name in data["method"].values]
     stages = list(dict.fromkeys(methods))
-    figure, panels = _grid(len(names) + 1)
+    figure, panels = panel_grid(len(names) + 1)
     for axes, name in zip(panels, names, strict=False):
         one = data.sel({schema.PARAMETER: name})
         estimate, sd = float(one[schema.ESTIMATE]), float(one[schema.SD])

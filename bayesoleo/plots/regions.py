@@ -33,19 +33,19 @@ def indifference(data: xr.Dataset) -> Figure:
         twelve are left out.
     """
     pairs = [str(pair) for pair in data["pair"].values][:MOST]
-    figure, panels = _grid(len(pairs))
+    figure, panels = panel_grid(len(pairs))
     colours = {"conditional": style.BEFORE, "profiled": style.AFTER}
     sections = [str(section) for section in data["section"].values]
     for axes, pair in zip(panels, pairs, strict=True):
         for section in sections:
             one = data.sel(pair=pair, section=section)
             colour = colours[section]
-            _closed(axes, one["ellipse"].values, colour, "--", 1.0)
-            _closed(axes, one["contour"].values, colour, "-", 1.8)
+            closed_curve(axes, one["ellipse"].values, colour, "--", 1.0)
+            closed_curve(axes, one["contour"].values, colour, "-", 1.8)
         names = [str(name) for name in data["name"].sel(pair=pair).values]
         centre = [float(data[schema.ESTIMATE].sel(parameter=name)) for name in names]
         axes.plot(*centre, "+", color=style.INK, ms=8)
-        _dress(axes, names)
+        panel_labels(axes, names)
     handles = [style.line(colours[s], f"{s}, exact", 1.8) for s in sections]
     handles += [style.line(style.FAINT, "second order (Taylor)", 1.0, "--")]
     remark = f"first {MOST} of {data.sizes['pair']} planes" if data.sizes["pair"] > MOST else ""
@@ -69,7 +69,7 @@ def profile(data: xr.Dataset) -> Figure:
     """
     names = [str(name) for name in data[schema.PARAMETER].values][:MOST]
     level = stats.chi2.isf(1 - float(data.attrs["level"]), 1) / 2
-    figure, panels = _grid(len(names))
+    figure, panels = panel_grid(len(names))
     for axes, name in zip(panels, names, strict=True):
         one = data.sel(parameter=name)
         value, fall = one["value"].values, one["fall"].values
@@ -86,7 +86,7 @@ def profile(data: xr.Dataset) -> Figure:
         low, high = value[keep].min(), value[keep].max()
         if high > low:
             axes.set_xlim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-        _dress(axes, [name, "fall"])
+        panel_labels(axes, [name, "fall"])
     handles = [
         style.line(style.AFTER, f"{data.attrs['kind']}, others re-estimated"),
         style.line(style.FAINT, "linearised", 1.0, "--"),
@@ -95,7 +95,7 @@ def profile(data: xr.Dataset) -> Figure:
     return figure
 
 
-def _closed(axes: Axes, curve: np.ndarray, colour: str, line: str, width: float) -> None:
+def closed_curve(axes: Axes, curve: np.ndarray, colour: str, line: str, width: float) -> None:
     """A closed curve; where it is open it breaks off."""
     finite = np.isfinite(curve).all(axis=1)
     loop = (
@@ -104,7 +104,8 @@ def _closed(axes: Axes, curve: np.ndarray, colour: str, line: str, width: float)
     axes.plot(*loop.T, line, color=colour, lw=width)
 
 
-def _dress(axes: Axes, names: list[str]) -> None:
+def panel_labels(axes: Axes, names: list[str]) -> None:
+    """Names below and beside, few numbers."""
     style.dress(axes, 3)
     axes.ticklabel_format(useOffset=False, style="sci", scilimits=(-3, 4), useMathText=True)
     axes.yaxis.get_offset_text().set_fontsize(style.SMALL)
@@ -113,7 +114,7 @@ def _dress(axes: Axes, names: list[str]) -> None:
     axes.set_ylabel(style.plain(names[1], 30), fontsize=style.TEXT)
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
+def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
     """Panels of one size in reading order."""
     columns = min(COLUMNS, max(count, 1))
     rows = math.ceil(max(count, 1) / columns)

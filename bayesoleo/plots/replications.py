@@ -9,7 +9,7 @@ from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo.plots import style
-from bayesoleo.plots.regions import MOST, _grid
+from bayesoleo.plots.regions import MOST, panel_grid
 
 BINS = 41
 WIDTHS = 4.5
@@ -31,7 +31,7 @@ def sampling_distribution(data: xr.Dataset) -> Figure:
     """
     names = [str(name) for name in data[schema.PARAMETER].values][:MOST]
     good = data["status"].values == 0
-    figure, panels = _grid(len(names))
+    figure, panels = panel_grid(len(names))
     bins = int(np.clip(2 * np.sqrt(good.sum()), 9, BINS))
     grid = np.linspace(-WIDTHS, WIDTHS, 200)
     for axes, name in zip(panels, names, strict=True):
