@@ -42,20 +42,21 @@ def run(folder: Path | None, kind: type[LogDensity] = LogDensity) -> Samples:
     )
 
 
-def child(folder: str, ready) -> None:
+def child(folder: str, ready: str) -> None:
     """In a process of its own."""
     case = gas_spring_case(0.01)  # the modes are found before the clock starts
     assert case.mixture.dimension == 2
-    ready.set()
+    Path(ready).touch()  # a killed process would leave a semaphore behind
     run(Path(folder), Slow)
 
 
 def killed(folder: Path, moment: float, context) -> None:
     """Start a run and kill it after a moment."""
-    ready = context.Event()
-    process = context.Process(target=child, args=(str(folder), ready))
+    ready = folder.with_suffix(".ready")
+    process = context.Process(target=child, args=(str(folder), str(ready)))
     process.start()
-    ready.wait(120)
+    while not ready.exists() and process.is_alive():
+        time.sleep(0.001)
     time.sleep(moment)
     if process.is_alive():
         os.kill(process.pid, signal.SIGKILL)
