@@ -20,13 +20,13 @@ from bayesoleo import schema
 from bayesoleo.assessment import Score, score_draws
 from bayesoleo.data import ReducedCampaign
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.nuisance import uncertain_conditions
+from bayesoleo.estimation.runs.nuisance import uncertain_conditions
 from bayesoleo.estimation.shown import Shown, columns
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.simulation import model_of, parameter_sets
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status, count, counted
 
 Array = NDArray[np.float64]

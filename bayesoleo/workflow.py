@@ -18,8 +18,8 @@ from bayesoleo.data import Campaign, ReducedCampaign, load_campaign, reduce_camp
 from bayesoleo.data.units import parse_unit
 from bayesoleo.effects import Effect
 from bayesoleo.errors import CampaignError, ModelError
-from bayesoleo.estimation.nuisance import declared_nuisance, uncertain_conditions
-from bayesoleo.estimation.per_run import by_run_dataset
+from bayesoleo.estimation.runs.nuisance import declared_nuisance, uncertain_conditions
+from bayesoleo.estimation.runs.per_run import by_run_dataset
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, compare
@@ -28,7 +28,7 @@ from bayesoleo.posterior.error_models import ERROR_MODELS
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.report import write_report
 from bayesoleo.simulation import merged, model_of, parameter_sets, simulate_like
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.storage import provenance, write_text_atomic, write_tree
 from bayesoleo.systems import equations, equations_latex
 from bayesoleo.tracing.assembly import Assembly
@@ -352,9 +352,9 @@ def estimate_each(
     Returns
     -------
     xarray.Dataset
-        MBE's estimates by run, see :func:`bayesoleo.estimation.per_run.by_run_dataset`, with the
-        coordinates ``group`` and ``role`` (run). A parameter that varies by run has one value a run
-        like any other. :func:`bayesoleo.estimation.between_runs` says how much the runs differ.
+        MBE's estimates by run, see :func:`~bayesoleo.estimation.runs.per_run.by_run_dataset`, with
+        the coordinates ``group`` and ``role`` (run). A parameter that varies by run has one value a
+        run like any other. :func:`bayesoleo.estimation.between_runs` says how much the runs differ.
     """
     task = prepare(campaign, model, settings)
     driven = task.assembly.model()

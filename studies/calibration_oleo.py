@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesoleo import LogNormal, Model, Normal, driven_by, system
 from bayesoleo.effects import Scales, find_effect
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
 from bayesoleo.systems.verbeek import SHAKER_RUNS

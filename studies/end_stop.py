@@ -16,9 +16,9 @@ from bayesoleo.prediction.dynamics import dynamics_of
 from bayesoleo.prediction.orbit import PeriodicAnswer, periodic_answer
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.periodic import solve_periodic
-from bayesoleo.solvers.shooting import solve_shooting
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import solve_periodic
+from bayesoleo.solvers.shooting.shoot import solve_shooting
 from bayesoleo.systems import system
 
 Array = NDArray[np.float64]

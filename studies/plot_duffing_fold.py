@@ -22,7 +22,7 @@ from bayesoleo import plots
 from bayesoleo.data.harmonics import significant_harmonics
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.branch import follow_branch
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of

@@ -20,9 +20,9 @@ from bayesoleo.prediction.dynamics import dynamics_of
 from bayesoleo.prediction.orbit import adaptive_problem
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.adaptive import solve_adaptive
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.shooting import solve_shooting
+from bayesoleo.solvers.adaptive.refine import solve_adaptive
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.shooting.shoot import solve_shooting
 from bayesoleo.systems import system
 
 Array = NDArray[np.float64]

@@ -19,8 +19,8 @@ from bayesoleo.assessment import residual_tests as tests
 from bayesoleo.assessment.means import ACROSS, between_means
 from bayesoleo.assessment.series import Array, Series, series_of_problem, series_of_tree
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.point import PointEstimate
-from bayesoleo.estimation.problem import Problem
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.shown import Shown, columns
 
 #: Outliers listed of each series, the farthest.

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from bayesoleo import schema
 from bayesoleo.data.averaging import PeriodicAverage, periodic_average
 from bayesoleo.errors import InputError, ResultsError
-from bayesoleo.estimation.campaign_problem import CampaignProblem
-from bayesoleo.estimation.point import PointEstimate
-from bayesoleo.estimation.problem import Problem
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.prediction.input_noise import input_columns
 
 Array = NDArray[np.float64]

@@ -169,7 +169,7 @@ def estimate(
 
     Prints start, MBE point, mode and linearised standard deviation. Writes nothing without --out;
     with it, results.nc in that folder; with --each, each.nc. A transient is predicted from its
-    start: for chaotic records use bayesoleo.estimation.multiple_shooting in Python.
+    start: for chaotic records use bayesoleo.estimation.trajectories.multiple_shooting in Python.
 
     \b
     Examples:

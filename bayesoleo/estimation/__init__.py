@@ -1,24 +1,13 @@
 """Which parameter values fit, and how sure is that, at a point."""
 
-from bayesoleo.estimation.axes import principal_axes
-from bayesoleo.estimation.estimate import estimate, polish
-from bayesoleo.estimation.function_problem import FunctionProblem
-from bayesoleo.estimation.hierarchy import Hierarchy, between_runs
-from bayesoleo.estimation.identifiability import data_against_prior
-from bayesoleo.estimation.indifference import indifference
-from bayesoleo.estimation.intervals import (
-    linearised_covariance,
-    linearised_intervals,
-    over_experiments,
-)
-from bayesoleo.estimation.iterate import Iteration
-from bayesoleo.estimation.laplace import mode_covariance
-from bayesoleo.estimation.methods import METHODS
-from bayesoleo.estimation.multiple_shooting import ShootingEstimate, Trajectory, multiple_shooting
-from bayesoleo.estimation.multistart import Modes, multistart
-from bayesoleo.estimation.nuisance import Nuisance, declared_nuisance
-from bayesoleo.estimation.objective import OBJECTIVES, Objective
-from bayesoleo.estimation.objectives import (
+from bayesoleo.estimation.estimators.estimate import estimate, polish
+from bayesoleo.estimation.estimators.iterate import Iteration
+from bayesoleo.estimation.estimators.methods import METHODS
+from bayesoleo.estimation.estimators.multistart import Modes, multistart
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.estimators.steps import Step
+from bayesoleo.estimation.estimators.table import as_text, to_dataset
+from bayesoleo.estimation.objectives.diagonal import (
     log_likelihood,
     log_posterior,
     log_prior,
@@ -26,16 +15,31 @@ from bayesoleo.estimation.objectives import (
     staged_variance,
     sums_of_squares,
 )
-from bayesoleo.estimation.per_run import estimate_each
-from bayesoleo.estimation.point import PointEstimate
-from bayesoleo.estimation.problem import Evaluation, Misfit, Problem
-from bayesoleo.estimation.profile import profile
-from bayesoleo.estimation.replicate import Replications, estimate_many
-from bayesoleo.estimation.sampling_distribution import sampling_distribution
-from bayesoleo.estimation.sensitivity import global_sensitivity, local_sensitivity, sobol
+from bayesoleo.estimation.objectives.objective import OBJECTIVES, Objective
+from bayesoleo.estimation.problems.function_problem import FunctionProblem
+from bayesoleo.estimation.problems.problem import Evaluation, Misfit, Problem
+from bayesoleo.estimation.runs.hierarchy import Hierarchy, between_runs
+from bayesoleo.estimation.runs.identifiability import data_against_prior
+from bayesoleo.estimation.runs.nuisance import Nuisance, declared_nuisance
+from bayesoleo.estimation.runs.per_run import estimate_each
+from bayesoleo.estimation.sensitivity.analyse import global_sensitivity, local_sensitivity, sobol
 from bayesoleo.estimation.shown import Shown
-from bayesoleo.estimation.steps import Step
-from bayesoleo.estimation.table import as_text, to_dataset
+from bayesoleo.estimation.trajectories.multiple_shooting import (
+    ShootingEstimate,
+    Trajectory,
+    multiple_shooting,
+)
+from bayesoleo.estimation.uncertainty.axes import principal_axes
+from bayesoleo.estimation.uncertainty.indifference import indifference
+from bayesoleo.estimation.uncertainty.intervals import (
+    linearised_covariance,
+    linearised_intervals,
+    over_experiments,
+)
+from bayesoleo.estimation.uncertainty.laplace import mode_covariance
+from bayesoleo.estimation.uncertainty.profile import profile
+from bayesoleo.estimation.uncertainty.replicate import Replications, estimate_many
+from bayesoleo.estimation.uncertainty.sampling_distribution import sampling_distribution
 
 __all__ = [
     "METHODS",

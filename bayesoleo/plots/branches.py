@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bayesoleo.plots import style
 from bayesoleo.plots.units import Scale, engineering, format_unit
 from bayesoleo.prediction.branch import AnswerBranch
-from bayesoleo.solvers.branches import BranchPoint
+from bayesoleo.solvers.branches.follow import BranchPoint
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from bayesoleo.estimation.multiple_shooting import Trajectory
+from bayesoleo.estimation.trajectories.multiple_shooting import Trajectory
 from bayesoleo.plots import style
 from bayesoleo.plots.units import engineering
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Misfit, Problem, jumps_of
-from bayesoleo.estimation.residuals import ResidualProblem
+from bayesoleo.estimation.problems.problem import Misfit, Problem, jumps_of
+from bayesoleo.estimation.problems.residuals import ResidualProblem
 from bayesoleo.parallel import thread_map
 from bayesoleo.posterior.error_models import ErrorModel, error_model
 from bayesoleo.posterior.transforms import Transforms

@@ -48,7 +48,7 @@ from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.error_models import ErrorModel, error_model
 from bayesoleo.posterior.information import information_at, residuals_at

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Problem
-from bayesoleo.estimation.residuals import ResidualProblem
+from bayesoleo.estimation.problems.problem import Problem
+from bayesoleo.estimation.problems.residuals import ResidualProblem
 from bayesoleo.posterior.error_models import ErrorModel
 from bayesoleo.solvers.status import Status
 

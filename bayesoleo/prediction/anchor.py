@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.prediction.stability import compared, count_unstable, is_jump, jumps, swings
 from bayesoleo.solvers.orbit import floquet_multipliers
-from bayesoleo.solvers.periodic import Boundary, solve_periodic
+from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]

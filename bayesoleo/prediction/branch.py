@@ -18,14 +18,14 @@ from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels, kernels
 from bayesoleo.prediction.records import Harmonics
 from bayesoleo.prediction.simulate import RunPlan
-from bayesoleo.solvers.autonomous import LimitCycle, solve_limit_cycle
-from bayesoleo.solvers.branches import Branch, BranchPoint, follow
-from bayesoleo.solvers.collocation import Collocation
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.periodic import Boundary
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME, scheme
-from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.solvers.branches.autonomous import LimitCycle, solve_limit_cycle
+from bayesoleo.solvers.branches.follow import Branch, BranchPoint, follow
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import Boundary
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME, scheme
+from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.transient.state_space import StateSpace
 
 Array = NDArray[np.float64]
 
@@ -204,7 +204,7 @@ class _Answers:
         )
 
     def at(self, value: float) -> tuple[Boundary, Array]:
-        """Problem and constants, as :data:`~bayesoleo.solvers.bordered.Family` has them."""
+        """Problem and constants, as a :data:`~bayesoleo.solvers.branches.bordered.Family` has."""
         derived, p = self.kernels.derived, self.constants.copy()
         frequency = value if self.along == FREQUENCY else self.plan.frequency
         if self.along in derived.constants:

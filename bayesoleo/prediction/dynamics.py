@@ -13,8 +13,8 @@ from bayesoleo.model.kernels import kernels
 from bayesoleo.model.switching import analytic_pieces
 from bayesoleo.prediction.inputs import harmonics_of
 from bayesoleo.prediction.records import Record
-from bayesoleo.solvers.initial_value import Dynamics
-from bayesoleo.solvers.signals import Signal, periodic_signal
+from bayesoleo.solvers.shooting.initial_value import Dynamics
+from bayesoleo.solvers.shooting.signals import Signal, periodic_signal
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.prediction.segmented import LinearRun, SegmentedRun
-from bayesoleo.solvers.constrained import ContinuousLeastSquares
+from bayesoleo.solvers.segments.constrained import ContinuousLeastSquares
 
 Array = NDArray[np.float64]
 

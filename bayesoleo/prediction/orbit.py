@@ -17,10 +17,10 @@ from bayesoleo.prediction.guess import guess_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.simulate import RunPlan, record_of
-from bayesoleo.solvers.adaptive import AdaptiveSolution, Motion, Start, solve_adaptive
+from bayesoleo.solvers.adaptive.refine import AdaptiveSolution, Motion, Start, solve_adaptive
+from bayesoleo.solvers.adaptive.stiffening import solve_stiffening
+from bayesoleo.solvers.adaptive.switched import PeriodicProblem, Switches
 from bayesoleo.solvers.orbit import Orbit
-from bayesoleo.solvers.stiffening import solve_stiffening
-from bayesoleo.solvers.switched import PeriodicProblem, Switches
 
 Array = NDArray[np.float64]
 

@@ -24,18 +24,18 @@ from bayesoleo.prediction.orbit import adaptive_problem, periodic_answer
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, record_of
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.hybrid import differentiate_on_mesh
-from bayesoleo.solvers.library import shoot_by_library
-from bayesoleo.solvers.mesh import Mesh
+from bayesoleo.solvers.adaptive.switched import crossings_of
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
-from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
-from bayesoleo.solvers.shooting import Shot, solve_shooting
-from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.mesh import Mesh
+from bayesoleo.solvers.schemes.tableau import tableau
+from bayesoleo.solvers.shooting.hybrid import differentiate_on_mesh
+from bayesoleo.solvers.shooting.library import shoot_by_library
+from bayesoleo.solvers.shooting.shoot import Shot, solve_shooting
 from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.switched import crossings_of
-from bayesoleo.solvers.tableau import tableau
+from bayesoleo.solvers.transient.state_space import StateSpace
 
 Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]

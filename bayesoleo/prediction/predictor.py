@@ -16,7 +16,7 @@ from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor, Samples
 from bayesoleo.prediction.transient import TransientRun
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Predictor:
     steps : int
         Steps of the mesh in a period; how finely the steps of transients are cut.
     scheme : str
-        Discretisation, see :func:`bayesoleo.solvers.schemes.scheme`.
+        Discretisation, see :func:`bayesoleo.solvers.schemes.choose.scheme`.
     backend : {"numba", "numpy"}
         Kernels; NumPy's are ready at once.
     jobs : int, optional

@@ -20,9 +20,9 @@ from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.squares import FusedSquares, squared_distances
 from bayesoleo.prediction.stability import unstable_of
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.periodic import Boundary, Solution, sensitivities, solve_periodic
-from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities, solve_periodic
+from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]

@@ -18,9 +18,9 @@ from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.arrays import FEWEST_SAMPLES
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.records import Record, Signal
-from bayesoleo.solvers.collocation import Collocation
-from bayesoleo.solvers.schemes import scheme
-from bayesoleo.solvers.segments import LinearSteps, Segments
+from bayesoleo.solvers.schemes.choose import scheme
+from bayesoleo.solvers.schemes.collocation import Collocation
+from bayesoleo.solvers.segments.segments import LinearSteps, Segments
 
 Array = NDArray[np.float64]
 

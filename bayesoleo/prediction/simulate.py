@@ -13,7 +13,7 @@ from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]

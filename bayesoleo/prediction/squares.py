@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from bayesoleo.compiled import BLOCK, BlockKernel, pointer
 from bayesoleo.model.derive import Derived
 from bayesoleo.model.kernels import Kernels
-from bayesoleo.solvers.collocation import Collocation, SamplePlan
-from bayesoleo.solvers.collocation_kernels import sample_block
-from bayesoleo.solvers.measures import total
-from bayesoleo.solvers.sweep import jit
+from bayesoleo.solvers.periodic.measures import total
+from bayesoleo.solvers.schemes.collocation import Collocation, SamplePlan
+from bayesoleo.solvers.schemes.collocation_kernels import sample_block
+from bayesoleo.solvers.schemes.sweep import jit
 
 Array = NDArray[np.float64]
 
 
 class Places(NamedTuple):
-    """A :class:`~bayesoleo.solvers.collocation.SamplePlan` in blocks: index and position (blocks,
-    BLOCK), weights (blocks, s, BLOCK)."""
+    """A :class:`~bayesoleo.solvers.schemes.collocation.SamplePlan` in blocks: index and position
+    (blocks, BLOCK), weights (blocks, s, BLOCK)."""
 
     index: Any
     position: Any

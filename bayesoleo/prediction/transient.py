@@ -15,15 +15,15 @@ from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import Anchor, RunPredictor, Samples
 from bayesoleo.prediction.start import InitialState
-from bayesoleo.solvers.collocation import Collocation
-from bayesoleo.solvers.integrate import halved, integrate, resolving
-from bayesoleo.solvers.mesh import Mesh, equidistant
-from bayesoleo.solvers.periodic import Boundary, Solution
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
-from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.solvers.periodic.solve import Boundary, Solution
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.collocation import Collocation
+from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
+from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.tableau import tableau
-from bayesoleo.solvers.transient import solve_transient, transient_sensitivities
+from bayesoleo.solvers.transient.integrate import halved, integrate, resolving
+from bayesoleo.solvers.transient.solve import solve_transient, transient_sensitivities
+from bayesoleo.solvers.transient.state_space import StateSpace
 
 Array = NDArray[np.float64]
 

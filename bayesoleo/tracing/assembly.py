@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from bayesoleo.effects import Candidate, Effect, Scales, candidates, catalogue
 from bayesoleo.errors import ModelError
-from bayesoleo.estimation.nuisance import Nuisance
+from bayesoleo.estimation.runs.nuisance import Nuisance
 from bayesoleo.model import Model, Parameter, driven_by
 from bayesoleo.model.initial import with_estimated_starts
 

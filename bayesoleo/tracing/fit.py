@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation import PointEstimate, estimate, polish
-from bayesoleo.estimation.campaign_problem import CampaignProblem
-from bayesoleo.estimation.nuisance import with_held
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation.runs.nuisance import with_held
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor, RunPrediction
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status

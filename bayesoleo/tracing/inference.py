@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesoleo import schema
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation import multistart
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.posterior.error_models import ERROR_MODELS, check_word

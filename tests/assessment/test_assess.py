@@ -13,7 +13,7 @@ from bayesoleo import schema
 from bayesoleo.assessment import assess, score_draws, score_normal, series_of_tree
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model.priors import Normal
 from bayesoleo.prediction.predictor import Predictor
 

@@ -20,8 +20,8 @@ from bayesoleo.prediction.dynamics import dynamics_of
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.periodic import Solution, solve_periodic
-from bayesoleo.solvers.shooting import solve_shooting
+from bayesoleo.solvers.periodic.solve import Solution, solve_periodic
+from bayesoleo.solvers.shooting.shoot import solve_shooting
 
 #: Parameter vectors in a batch, and their relative distance from the anchor.
 BATCH, SPREAD = 32, 0.01

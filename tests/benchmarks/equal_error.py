@@ -15,7 +15,7 @@ from measuring import cpu, error, time_at
 
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 #: Errors of the stroke over its amplitude.

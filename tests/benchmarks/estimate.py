@@ -22,7 +22,7 @@ import numpy as np
 
 from bayesoleo.data import dataset_folder
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many, polish
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model.priors import Normal
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.systems import system

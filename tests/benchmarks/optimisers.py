@@ -18,7 +18,7 @@ import numpy as np
 
 from bayesoleo.data import dataset_folder
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.scipy_methods import LEAST_SQUARES, MINIMISERS
+from bayesoleo.estimation.estimators.scipy_methods import LEAST_SQUARES, MINIMISERS
 from bayesoleo.model.priors import Normal
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "estimation"))

@@ -23,7 +23,7 @@ from bayesoleo.model import Model
 from bayesoleo.parallel import available_cores
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.collocation import Collocation
+from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
 
 #: Vectors of a batch: as many as the figures need, for the peers are slow.

@@ -12,8 +12,8 @@ import numpy as np
 from posterior_cases import gas_spring_case, oleo_case
 
 from bayesoleo.estimation import sampling_distribution
-from bayesoleo.estimation.redraw import data_source
-from bayesoleo.estimation.sampling_distribution import _Blocks, _Work
+from bayesoleo.estimation.uncertainty.redraw import data_source
+from bayesoleo.estimation.uncertainty.sampling_distribution import _Blocks, _Work
 from bayesoleo.machines import connected, each_done
 
 #: Replications of the campaign of 14 runs, one a task.

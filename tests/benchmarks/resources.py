@@ -31,7 +31,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from cases import batch, campaign
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.systems import system
 

@@ -21,10 +21,10 @@ from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.dynamics import dynamics_of
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.periodic import sensitivities, solve_periodic
-from bayesoleo.solvers.schemes import DEFAULT_SCHEME
-from bayesoleo.solvers.shooting import Shot, solve_shooting
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.shooting.shoot import Shot, solve_shooting
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 

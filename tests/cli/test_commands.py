@@ -11,7 +11,7 @@ from bayesoleo import schema, workflow
 from bayesoleo.cli import app, options
 from bayesoleo.cli.listing import readable
 from bayesoleo.effects import catalogue
-from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.storage import read_tree, write_tree
 from bayesoleo.systems import systems
 

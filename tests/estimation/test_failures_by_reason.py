@@ -8,7 +8,7 @@ import pytest
 
 from bayesoleo import driven_by, system
 from bayesoleo.estimation import estimate, multistart, to_dataset
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Parameter
 from bayesoleo.posterior import LogDensity
 from bayesoleo.prediction.predictor import Predictor

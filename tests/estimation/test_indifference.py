@@ -8,10 +8,10 @@ from scipy import stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.axes import as_product, in_words, principal_axes
-from bayesoleo.estimation.drop import Drop
-from bayesoleo.estimation.indifference import indifference
-from bayesoleo.estimation.profile import profile
+from bayesoleo.estimation.uncertainty.axes import as_product, in_words, principal_axes
+from bayesoleo.estimation.uncertainty.drop import Drop
+from bayesoleo.estimation.uncertainty.indifference import indifference
+from bayesoleo.estimation.uncertainty.profile import profile
 from bayesoleo.model.priors import Normal, Uniform
 
 SIZE = 30

@@ -8,14 +8,14 @@ from scipy import stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate, log_posterior, output_counts
-from bayesoleo.estimation.curvature import curvature, prior_precision
-from bayesoleo.estimation.held import Held
-from bayesoleo.estimation.intervals import (
+from bayesoleo.estimation.objectives.curvature import curvature, prior_precision
+from bayesoleo.estimation.problems.held import Held
+from bayesoleo.estimation.uncertainty.intervals import (
     linearised_covariance,
     linearised_intervals,
     over_experiments,
 )
-from bayesoleo.estimation.profile import profile
+from bayesoleo.estimation.uncertainty.profile import profile
 from bayesoleo.model.correlated import JointNormal
 from bayesoleo.model.priors import LogNormal, Normal, Uniform
 

@@ -15,7 +15,7 @@ from bayesoleo.estimation import (
     staged_variance,
     sums_of_squares,
 )
-from bayesoleo.estimation.problem import Evaluation
+from bayesoleo.estimation.problems.problem import Evaluation
 from bayesoleo.model.priors import LogNormal, Normal
 from bayesoleo.solvers.status import Status
 

@@ -8,7 +8,7 @@ from chaotic_records import Chaos
 from scipy.optimize import least_squares
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.multiple_shooting import multiple_shooting
+from bayesoleo.estimation.trajectories.multiple_shooting import multiple_shooting
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction.arrays import transient_record
 from bayesoleo.solvers.status import Status

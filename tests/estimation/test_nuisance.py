@@ -9,8 +9,8 @@ import pytest
 
 from bayesoleo.data import SimulatedRun, write_campaign
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.campaign_problem import CampaignProblem
-from bayesoleo.estimation.nuisance import Nuisance, declared_nuisance, uncertain_conditions
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation.runs.nuisance import Nuisance, declared_nuisance, uncertain_conditions
 from bayesoleo.model import Model, Output, Parameter, driven_by
 from bayesoleo.model.document import from_document, to_document
 from bayesoleo.prediction.predictor import Predictor

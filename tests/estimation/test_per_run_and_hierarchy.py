@@ -8,7 +8,7 @@ import scipy.stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, between_runs, estimate, estimate_each
-from bayesoleo.estimation.hierarchy import pooled
+from bayesoleo.estimation.runs.hierarchy import pooled
 from bayesoleo.model.priors import Normal
 
 #: Trials of a vaccine: cases and others, vaccinated and not (Colditz and others 1994, *JAMA* 271).

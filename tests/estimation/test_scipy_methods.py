@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.scipy_methods import LEAST_SQUARES, MINIMISERS
+from bayesoleo.estimation.estimators.scipy_methods import LEAST_SQUARES, MINIMISERS
 from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal
 from bayesoleo.solvers.status import Status
 

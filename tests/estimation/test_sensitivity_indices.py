@@ -9,8 +9,8 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem
-from bayesoleo.estimation.campaign_problem import CampaignProblem
-from bayesoleo.estimation.sensitivity import (
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation.sensitivity.analyse import (
     global_sensitivity,
     local_sensitivity,
     quantile,

@@ -10,7 +10,7 @@ import xarray as xr
 from scipy.integrate import solve_ivp
 
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record

@@ -22,7 +22,7 @@ from bayesoleo.estimation import (
     sampling_distribution,
     sobol,
 )
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model.priors import Normal
 from bayesoleo.prediction.predictor import Predictor
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo import plots
-from bayesoleo.estimation.multiple_shooting import Trajectory
+from bayesoleo.estimation.trajectories.multiple_shooting import Trajectory
 from bayesoleo.plots import style
 from bayesoleo.prediction.branch import follow_branch
 from bayesoleo.prediction.simulate import RunPlan, motion

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo.estimation.problem import Evaluation, Misfit
-from bayesoleo.estimation.residuals import RunSamples
+from bayesoleo.estimation.problems.problem import Evaluation, Misfit
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Normal
 from bayesoleo.solvers.status import Status
 

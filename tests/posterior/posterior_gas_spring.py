@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo.estimation.problem import Evaluation, Misfit
+from bayesoleo.estimation.problems.problem import Evaluation, Misfit
 from bayesoleo.model.priors import Normal
 from bayesoleo.solvers.status import Status
 

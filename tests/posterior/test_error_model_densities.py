@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate, stats
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.residuals import RunSamples
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
 from bayesoleo.posterior.error_models.correlated import covariance
 from bayesoleo.posterior.error_models.discrepancy import basis, spectrum

@@ -7,7 +7,7 @@ import pytest
 from posterior_gas_spring import GasSpring, gas_spring, measured
 from scipy import stats
 
-from bayesoleo.estimation.problem import Misfit
+from bayesoleo.estimation.problems.problem import Misfit
 from bayesoleo.model.priors import LogNormal, Normal
 from bayesoleo.posterior import LogDensity
 from bayesoleo.solvers.status import Status

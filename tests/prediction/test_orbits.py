@@ -11,9 +11,9 @@ from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.orbits import METHODS, periodic_orbit
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.library import shoot_by_library
-from bayesoleo.solvers.state_space import StateSpace
+from bayesoleo.solvers.shooting.library import shoot_by_library
 from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.transient.state_space import StateSpace
 
 #: Compiling the integrator takes longer than all of its tests: one worker does.
 pytestmark = pytest.mark.xdist_group("integrator")

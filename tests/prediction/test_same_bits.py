@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic_runs import answered, oleo_runs
 
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model.drive import driven_by
 from bayesoleo.posterior import LogDensity
 from bayesoleo.prediction.predictor import Predictor

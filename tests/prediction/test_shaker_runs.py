@@ -10,7 +10,7 @@ from bayesoleo.model.drive import driven_by
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems.oleo import thermomechanical_oleo
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Condition, Model, Output, Parameter, driven_by
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record

@@ -7,9 +7,9 @@ import numpy as np
 from bayesoleo.model import Condition, Model, Parameter
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.records import Harmonics
-from bayesoleo.solvers.mesh import Mesh
-from bayesoleo.solvers.periodic import Boundary
-from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.periodic.solve import Boundary
+from bayesoleo.solvers.schemes.choose import scheme
+from bayesoleo.solvers.schemes.mesh import Mesh
 
 
 def harmonics(**coefficients: complex) -> Harmonics:

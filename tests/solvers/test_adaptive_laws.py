@@ -9,11 +9,11 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction.orbit import periodic_answer
 from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.solvers.crossings import Crossings, find_crossings
-from bayesoleo.solvers.mesh import equidistant
+from bayesoleo.solvers.adaptive.crossings import Crossings, find_crossings
+from bayesoleo.solvers.adaptive.switched import state_rows
+from bayesoleo.solvers.adaptive.warp import SAME, extrapolate, warp_between
+from bayesoleo.solvers.schemes.mesh import equidistant
 from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.switched import state_rows
-from bayesoleo.solvers.warp import SAME, extrapolate, warp_between
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

@@ -7,12 +7,12 @@ from periodic_problems import duffing, friction_oscillator, harmonics
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.orbit import adaptive_problem, periodic_answer
 from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.solvers.adaptive import solve_adaptive
-from bayesoleo.solvers.mesh import Mesh, equidistant
-from bayesoleo.solvers.moving_edges import solve_on
+from bayesoleo.solvers.adaptive.moving_edges import solve_on
+from bayesoleo.solvers.adaptive.refine import solve_adaptive
+from bayesoleo.solvers.adaptive.switched import PeriodicProblem
+from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
+from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.switched import PeriodicProblem
-from bayesoleo.solvers.tableau import tableau
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

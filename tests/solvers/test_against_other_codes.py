@@ -6,7 +6,7 @@ from periodic_problems import coupled, duffing, friction_oscillator, harmonics, 
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.periodic import solve_periodic
+from bayesoleo.solvers.periodic.solve import solve_periodic
 from bayesoleo.solvers.status import Status
 
 pytestmark = pytest.mark.reference

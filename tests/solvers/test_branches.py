@@ -10,10 +10,10 @@ from periodic_problems import duffing, harmonics, problem, rest
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.autonomous import solve_limit_cycle
-from bayesoleo.solvers.branches import follow
-from bayesoleo.solvers.periodic import Boundary, solve_periodic
-from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.branches.autonomous import solve_limit_cycle
+from bayesoleo.solvers.branches.follow import follow
+from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
+from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 

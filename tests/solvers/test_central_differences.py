@@ -7,10 +7,10 @@ from periodic_problems import coupled, duffing, harmonics, problem, relaxation, 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.mesh import equidistant
-from bayesoleo.solvers.periodic import Boundary, sensitivities, solve_periodic
-from bayesoleo.solvers.schemes import scheme
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import Boundary, sensitivities, solve_periodic
+from bayesoleo.solvers.schemes.choose import scheme
+from bayesoleo.solvers.schemes.mesh import equidistant
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

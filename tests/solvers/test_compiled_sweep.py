@@ -13,7 +13,8 @@ from periodic_problems import (
 )
 from periodic_problems import problem as discretised
 
-from bayesoleo.solvers import newton, periodic
+from bayesoleo.solvers.periodic import newton
+from bayesoleo.solvers.periodic import solve as periodic
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.3, h1=1.0, h3=0.2j)

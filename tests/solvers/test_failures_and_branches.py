@@ -7,8 +7,8 @@ import pytest
 from periodic_problems import coupled, duffing, gas_spring, harmonics, problem, relaxation, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.periodic import sensitivities, solve_periodic
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
 from bayesoleo.solvers.status import Status, count
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

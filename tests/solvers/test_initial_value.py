@@ -10,8 +10,8 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model.kernels import kernels
 from bayesoleo.model.switching import analytic_pieces
-from bayesoleo.solvers.initial_value import Dynamics, solve_initial_value
-from bayesoleo.solvers.signals import evaluate, periodic_signal, piecewise_signal
+from bayesoleo.solvers.shooting.initial_value import Dynamics, solve_initial_value
+from bayesoleo.solvers.shooting.signals import evaluate, periodic_signal, piecewise_signal
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 

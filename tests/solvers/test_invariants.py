@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from periodic_problems import coupled, duffing, friction_oscillator, harmonics, problem, rest
 
-from bayesoleo.solvers.collocation import Collocation
-from bayesoleo.solvers.periodic import sensitivities, solve_periodic
+from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
+from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

@@ -6,8 +6,8 @@ from periodic_problems import coupled, duffing, friction_oscillator, gas_spring,
 from periodic_problems import problem as discretised
 from test_initial_value import FORCE, FREQUENCY, dynamics
 
-from bayesoleo.solvers.continuation import solve_from_guess
-from bayesoleo.solvers.shooting import solve_shooting
+from bayesoleo.solvers.periodic.continuation import solve_from_guess
+from bayesoleo.solvers.shooting.shoot import solve_shooting
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 

@@ -5,8 +5,8 @@ import pytest
 from periodic_problems import coupled, duffing, harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers import sparse
-from bayesoleo.solvers.periodic import Solution, sensitivities, solve_periodic
+from bayesoleo.solvers.periodic.solve import Solution, sensitivities, solve_periodic
+from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

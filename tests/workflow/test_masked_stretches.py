@@ -14,7 +14,7 @@ from bayesoleo.assessment import assess
 from bayesoleo.data import load_campaign, reduce_campaign, reduce_run
 from bayesoleo.errors import CampaignError
 from bayesoleo.estimation import estimate, sampling_distribution
-from bayesoleo.estimation.campaign_problem import CampaignProblem
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.forecast import predict
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.workflow import Settings

@@ -17,7 +17,7 @@ import difflib
 from collections.abc import Mapping
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.error_models.base import ErrorModel, Frame, Quantity
 from bayesoleo.posterior.error_models.correlated import CorrelatedErrors
@@ -81,7 +81,7 @@ def error_model(
         One of :data:`ERROR_MODELS`.
     problem : Problem
         What is fitted. All but ``independent`` and ``per-run`` need one that gives residuals by
-        sample, :class:`~bayesoleo.estimation.residuals.ResidualProblem`.
+        sample, :class:`~bayesoleo.estimation.problems.residuals.ResidualProblem`.
     log_variance_prior : mapping of str to Prior, optional
         By output, the prior of the logarithm of its variance; by default flat.
 

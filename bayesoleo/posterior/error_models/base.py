@@ -19,8 +19,8 @@ from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problem import Problem
-from bayesoleo.estimation.residuals import RunSamples
+from bayesoleo.estimation.problems.problem import Problem
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.transforms import Transform
 

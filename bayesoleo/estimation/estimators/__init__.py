@@ -1,0 +1,1 @@
+"""How it is minimised, and the point estimate that results."""

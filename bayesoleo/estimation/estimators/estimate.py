@@ -1,0 +1,219 @@
+"""Entry points: estimate the unknowns of a problem, and move on to the posterior's mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.estimators.iterate import Iteration, Outcome, iterate
+from bayesoleo.estimation.estimators.methods import method as find_method
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.estimators.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
+from bayesoleo.estimation.estimators.steps import Step
+from bayesoleo.estimation.estimators.summarise import summarise
+from bayesoleo.estimation.objectives.objective import Objective, objective_of
+from bayesoleo.estimation.problems.problem import Array, Problem, jumps_of
+from bayesoleo.estimation.problems.scaling import PriorScale
+from bayesoleo.solvers.status import added
+
+Progress = Callable[[Iteration], None]
+Method = str | Step[Any]
+
+#: MBE finds its way where the prior says how far to go, Levenberg-Marquardt where it says nothing.
+DEFAULT_METHODS: tuple[Method, ...] = ("mbe", "levenberg-marquardt")
+
+
+def estimate(
+    problem: Problem,
+    method: Method | Sequence[Method] = DEFAULT_METHODS,
+    *,
+    objective: str | Objective = "diagonal",
+    error_covariance: object = None,
+    start: ArrayLike | None = None,
+    tolerance: float = 1e-8,
+    max_iterations: int | None = None,
+    resolution: float = 0.0,
+    bias_corrected: bool = False,
+    progress: Progress | None = None,
+) -> PointEstimate:
+    """Estimate the unknowns of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is fitted.
+    method : str or Step, or sequence of them, optional
+        ``"be"``, ``"mve"``, ``"mmve"``, ``"mbe"``, ``"gauss-newton"``, ``"levenberg-marquardt"``,
+        ``"newton"``, or ``"scipy:"`` and the name of one of SciPy's optimisers. Of several, each
+        begins at the start until one converges. ``"be"``, ``"newton"`` and SciPy's end in a mode of
+        the posterior where the objective has a prior; the others in the maximum-likelihood point,
+        for which the prior only scales the steps. Unknowns with a log-normal prior are stepped in
+        their logarithm, but the mode is that of the density per unit of the unknown itself.
+    objective : str or Objective, optional
+        What is maximised: ``"diagonal"`` (the thesis's standard), ``"full"``, ``"given"``,
+        ``"likelihood"``, ``"determinant"``, ``"weighted"`` or ``"unweighted"``; see
+        :data:`bayesoleo.estimation.OBJECTIVES`.
+    error_covariance : array_like or sequence of array_like, optional
+        Known errors for ``"given"`` and ``"weighted"``: a variance for each output, (s,); an array
+        of variances by sample for each output; a covariance, (s, s), or one by sample, (n, s, s).
+        By default the noise that was measured in a campaign's records.
+    start : array_like, shape (l,), optional
+        By default the problem's own.
+    tolerance : float, optional
+        Relative step: converged when every step is below this part of the unknown, or of its
+        linearised standard deviation where that is larger.
+    max_iterations : int, optional
+        By default 100, and 1000 for Levenberg-Marquardt and for SciPy's optimisers, which take
+        many small steps where the others would have given up.
+    resolution : float, optional
+        Converged also where the optimum is nearer than this many standard deviations: what is
+        below, the data cannot tell. Zero asks for digits alone.
+    bias_corrected : bool, optional
+        Divide the sums of squares by ``n - l/s`` instead of ``n``.
+    progress : callable, optional
+        Called with each :class:`~bayesoleo.estimation.Iteration`.
+
+    Returns
+    -------
+    PointEstimate
+        A numerical failure is its ``status``, never an exception.
+
+    Raises
+    ------
+    InputError
+        If the start does not fit, lies outside a prior's support, or the method is unknown.
+
+    References
+    ----------
+    Verbeek (1993), section 2.3, eqs. 2.25-2.35 (objectives), sections 3.2 and 3.3, eqs. 3.17-3.23
+    (estimators).
+    """
+    scale = PriorScale.of(problem.priors, problem.names)
+    begin = checked_start(problem, scale, problem.start if start is None else start)
+    wanted = objective_of(problem, objective, error_covariance)
+    limits = _Limits(tolerance, max_iterations, resolution, bias_corrected, progress)
+    found: list[PointEstimate] = []
+    jumps = jumps_of(problem)
+    for each in [method] if isinstance(method, str | Step) else method:
+        name, outcome = limits.run(problem, each, begin, wanted)
+        found.append(summarise(problem, scale, name, begin, outcome, wanted, bias_corrected))
+        if outcome.status.ok:
+            break
+    best = found[-1] if found[-1].status.ok else max(found, key=_height)
+    return replace(
+        best,
+        evaluations=sum(point.evaluations for point in found),
+        failures=added(point.failures for point in found),
+        stability=best.stability and best.stability.with_jumps(jumps_of(problem) - jumps),
+    )
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """When an estimator stops, and whom it tells."""
+
+    tolerance: float
+    max_iterations: int | None
+    resolution: float
+    bias_corrected: bool
+    progress: Progress | None
+
+    def run(
+        self, problem: Problem, method: Method, start: Array, objective: Objective
+    ) -> tuple[str, Outcome]:
+        """Name of the estimator, and how it ended."""
+        common: dict[str, Any] = {
+            "tolerance": self.tolerance,
+            "bias_corrected": self.bias_corrected,
+            "max_iterations": self.max_iterations,
+        }
+        if isinstance(method, str) and method.startswith(PREFIX):
+            name = method.removeprefix(PREFIX)
+            common["max_iterations"] = self.max_iterations or MOST_ITERATIONS
+            return method, run_scipy(problem, name, start, objective, **common)
+        step = find_method(method)
+        if step.name == "be" and not objective.prior:
+            raise InputError(
+                f"the objective {objective.name!r} has no prior, which BE would weigh",
+                key="method",
+                value="be",
+                hint="use mbe, levenberg-marquardt, gauss-newton or newton",
+            )
+        common["max_iterations"] = self.max_iterations or step.most
+        common |= {"resolution": self.resolution, "progress": self.progress}
+        return step.name, iterate(problem, step, start, objective, **common)
+
+
+def _height(point: PointEstimate) -> float:
+    """By which failed estimates are compared: what they have reached in the likelihood."""
+    with np.errstate(divide="ignore"):
+        return -float(np.nan_to_num(np.log(point.variance), nan=np.inf).sum())
+
+
+def polish(
+    problem: Problem,
+    point: PointEstimate,
+    *,
+    objective: str | Objective = "diagonal",
+    error_covariance: object = None,
+    tolerance: float = 1e-8,
+    max_iterations: int | None = None,
+    resolution: float = 0.0,
+    progress: Progress | None = None,
+) -> PointEstimate:
+    """Move from an estimate, usually MBE's, to the posterior's mode by the Bayesian estimator.
+
+    The staged variance maximises the objective at fixed parameters, so the fixed point is the joint
+    mode in the parameters and the variances.
+
+    Parameters
+    ----------
+    problem : Problem
+    point : PointEstimate
+        Where to begin.
+    objective, error_covariance, tolerance, max_iterations, resolution, progress
+        As in :func:`estimate`.
+
+    Returns
+    -------
+    PointEstimate
+    """
+    return estimate(
+        problem,
+        "be",
+        objective=objective,
+        error_covariance=error_covariance,
+        start=point.theta,
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        resolution=resolution,
+        progress=progress,
+    )
+
+
+def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Array:
+    """The start as an array, or an :class:`InputError` that names what does not fit."""
+    theta = np.array(start, dtype=float)
+    if theta.shape != scale.mean.shape or not np.isfinite(theta).all():
+        raise InputError(
+            "start must be one finite number per unknown",
+            key="start",
+            value=theta.tolist(),
+            hint=f"the unknowns are {', '.join(problem.names)}",
+        )
+    inside = scale.inside(theta)
+    columns = (problem.names, theta, scale.low, scale.high, inside)
+    for name, value, low, high, fits in zip(*columns, strict=True):
+        if not fits:
+            raise InputError(
+                "start lies outside the prior's support",
+                key=name,
+                value=float(value),
+                hint=f"use a value between {low:g} and {high:g}",
+            )
+    return theta

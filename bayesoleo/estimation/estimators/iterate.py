@@ -1,0 +1,353 @@
+"""The one loop of all estimators: stage the variances, take a step, halve it if it does not help.
+
+References
+----------
+Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rarely act.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.estimation.estimators.newton import newton_equations
+from bayesoleo.estimation.estimators.pace import Pace
+from bayesoleo.estimation.estimators.steps import Step
+from bayesoleo.estimation.objectives.bounded import is_cut
+from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts
+from bayesoleo.estimation.objectives.equations import Equations
+from bayesoleo.estimation.objectives.objective import Objective
+from bayesoleo.estimation.problems.problem import Array, Evaluation, Problem
+from bayesoleo.estimation.problems.scaling import PriorScale
+from bayesoleo.parallel import single_blas_thread
+from bayesoleo.solvers.status import Status
+
+# 2**-30 of a step moves nothing that another thirty iterations could use.
+_MAX_HALVINGS = 30
+# Rounding of the merit function, by sample: a step that is worse by less is not worse.
+_ROUNDING = 1e-13
+# Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
+# this means nothing in statistics (0.0014 sd), but may lie below the noise of a solver's tolerance.
+_NEGLIGIBLE_GAIN = 1e-6
+_MANY_HALVINGS = 4
+# Distance to the fixed point, in standard deviations, up to which a small step means convergence.
+_NEAR = 0.1
+# So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
+_IDLE = 3
+# Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
+# asks for certified digits gets them, if slowly.
+_IDLE_STEPS = 1e3
+# A logarithm of which the data leave more than this part of the prior's sd may have no optimum: the
+# likelihood levels off on the way to zero or infinity, and an estimator that follows it never ends.
+# What then lies nearer to the level than _NEAR is on it.
+_FLAT = 0.9
+_LEVEL = 0.5 * _NEAR**2
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """Where one iteration ended.
+
+    Parameters
+    ----------
+    number : int
+        Zero at the start.
+    theta : ndarray, shape (l,)
+    variance : ndarray, shape (s,) or (s, s)
+        Staged at ``theta``; a matrix where the objective estimates one.
+    objective : float
+        The method's own objective at both.
+    halvings : int
+        Of the step that led here.
+    """
+
+    number: int
+    theta: Array
+    variance: Array
+    objective: float
+    halvings: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the loop ended: the last point, its evaluation and the way there.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (l,)
+    evaluation : Evaluation
+    status : Status
+    history : tuple of Iteration
+        Empty if the start could not be evaluated.
+    evaluations : int
+    distance : float
+        To the method's fixed point by the last linearisation, in standard deviations.
+    failures : mapping of str to int
+        Evaluations that came to nothing, by the lower-case name of their status.
+    """
+
+    theta: Array
+    evaluation: Evaluation
+    status: Status
+    history: tuple[Iteration, ...]
+    evaluations: int
+    distance: float
+    failures: Mapping[str, int] = field(default_factory=dict)
+
+
+def iterate(
+    problem: Problem,
+    step: Step[Any],
+    start: Array,
+    objective: Objective,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    resolution: float = 0.0,
+    bias_corrected: bool = False,
+    progress: Callable[[Iteration], None] | None = None,
+) -> Outcome:
+    """Repeat a step until it is small.
+
+    Parameters
+    ----------
+    problem : Problem
+    step : Step
+        The estimator.
+    start : ndarray, shape (l,)
+        Inside the priors' support.
+    objective : Objective
+        What is maximised.
+    tolerance : float
+        Converged when every unknown's step is below this part of its value, or of its linearised
+        standard deviation where that is larger.
+    max_iterations : int
+    resolution : float, optional
+        Converged also where a step is shorter than this many standard deviations, all unknowns
+        together.
+    bias_corrected : bool, optional
+        Stage the variances with eq. 3.18 instead of 3.17.
+    progress : callable, optional
+        Called with each :class:`Iteration`.
+
+    Returns
+    -------
+    Outcome
+        Ends on the last point that improved, so never on a worse one than the start.
+    """
+    loop = _Loop(problem, step, objective, bias_corrected, progress)
+    with single_blas_thread():
+        loop.move(loop.look(np.array(start, dtype=float)), 0)
+        status = loop.point.status
+        if status.ok:
+            try:
+                status = loop.run(tolerance, max_iterations, resolution)
+            except np.linalg.LinAlgError:
+                status = Status.SINGULAR
+    return Outcome(
+        theta=loop.point.theta,
+        evaluation=loop.point.evaluation,
+        status=status,
+        history=tuple(loop.history),
+        evaluations=loop.evaluations,
+        distance=loop.distance,
+        failures=dict(loop.failures),
+    )
+
+
+@dataclass(frozen=True)
+class _Point:
+    theta: Array
+    evaluation: Evaluation
+    moments: Array
+
+    @property
+    def status(self) -> Status:
+        if self.evaluation.status.ok and not np.isfinite(self.moments).all():
+            return Status.NOT_FINITE
+        return self.evaluation.status
+
+
+class _Loop:
+    """The iteration's current point and history; lives inside :func:`iterate` only."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        step: Step[Any],
+        objective: Objective,
+        bias_corrected: bool,
+        progress: Callable[[Iteration], None] | None,
+    ) -> None:
+        self.problem, self.step, self.objective = problem, step, objective
+        self.bias_corrected, self.progress = bias_corrected, progress
+        self.counts: NDArray[np.int64] = output_counts(problem.counts)
+        self.scale = PriorScale.of(problem.priors, problem.names)
+        self.state = step.begin(self.scale.root)
+        self.history: list[Iteration] = []
+        self.evaluations, self.distance = 0, np.nan
+        self.failures: Counter[str] = Counter()
+        self.point: _Point
+
+    def look(self, theta: Array) -> _Point:
+        self.evaluations += 1
+        evaluation = self.problem.evaluate(theta)
+        point = _Point(theta, evaluation, np.array([np.nan]))
+        if evaluation.status.ok:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+                point = _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        if not point.status.ok:
+            self.failures[point.status.name.lower()] += 1
+        return point
+
+    def move(self, point: _Point, halvings: int) -> None:
+        """Make a point the current one, and a line of the history."""
+        self.point = point
+        if not point.status.ok:
+            return
+        variance = self.variance()
+        objective = self.merit(point, variance)
+        number = len(self.history)
+        iteration = Iteration(number, point.theta, variance, objective, halvings)
+        self.history.append(iteration)
+        if self.progress is not None:
+            self.progress(iteration)
+
+    def run(self, tolerance: float, max_iterations: int, resolution: float) -> Status:
+        """Iterate until a step is small and the fixed point near, or nothing helps."""
+        pace = Pace()
+        for _ in range(max_iterations):
+            variance = self.variance()
+            equations = self.equations(variance)
+            if not np.isfinite(equations.jacobian).all():
+                return Status.NOT_FINITE
+            self.state = self.step.prepare(self.state, equations)
+            weight = self.step.rows(self.state, equations.jacobian)
+            proposal = equations.solve(weight)
+            pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
+            part = self.part_of(proposal, pace, equations)
+            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance, resolution)
+            before = self.point
+            trial, halvings, taken = self.shorten(part * proposal, equations, variance)
+            if halvings >= _MANY_HALVINGS:
+                gain = 0.5 * float(proposal @ equations.gradient)
+                small = small or gain <= _NEGLIGIBLE_GAIN
+            if trial.status.ok and trial is not before:
+                self.move(trial, halvings)
+            elif not small:
+                return Status.NO_CONVERGENCE if trial.status.ok else trial.status
+            won = self.merit(self.point, variance) - self.merit(before, variance)
+            pace = pace.after(taken, part * 0.5**halvings, self.is_idle(won, equations, tolerance))
+            if small or pace.idle >= _IDLE:
+                self.distance = self.equations(self.variance()).distance()
+                if self.distance <= _NEAR:
+                    return Status.CONVERGED
+                if self.step.locks or self.point is before:
+                    return Status.NO_CONVERGENCE
+            expected = equations.expected_gain(taken)
+            ratio = won / expected if expected > 0 else 1.0
+            self.state = self.step.accept(self.state, equations.jacobian, ratio, taken)
+        return Status.NO_CONVERGENCE
+
+    def part_of(self, proposal: Array, pace: Pace, equations: Equations) -> float:
+        """How much of a proposal to take: more than all of it only well inside the support."""
+        if pace.wanted <= 1:
+            return pace.wanted
+        if self.step.locks or is_cut(pace.wanted * proposal, equations.room):
+            return 1.0  # steps of an estimator that locks up creep by design
+        return pace.wanted
+
+    def shorten(
+        self, proposal: Array, equations: Equations, variance: Array
+    ) -> tuple[_Point, int, Array]:
+        """First point along ever shorter steps that is not worse than the current one.
+
+        With the number of halvings and the step that led there. If there is none: the last point
+        that failed, or the current one.
+        """
+        merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
+        trial = self.point
+        for halvings in range(_MAX_HALVINGS + 1):
+            trial = self.look(self.scale.moved(self.point.theta, proposal))
+            if trial.status.ok and self.merit(trial, variance) >= merit:
+                return trial, halvings, proposal
+            softer = self.step.refuse(self.state, proposal)
+            if softer is None:
+                proposal = proposal / 2
+            else:
+                self.state = self.step.prepare(softer, equations)
+                proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
+        return (self.point if trial.status.ok else trial), _MAX_HALVINGS, proposal
+
+    @property
+    def pulls(self) -> bool:
+        """Whether the prior stays where it was declared and counts in the objective."""
+        return self.step.fixed_prior and self.objective.prior
+
+    def variance(self) -> Array:
+        """Staged covariance of the errors at the current point."""
+        unknowns = len(self.scale.sd)
+        return self.objective.errors.stage(
+            self.point.moments, self.counts, unknowns, self.bias_corrected
+        )
+
+    def merit(self, point: _Point, variance: Array) -> float:
+        """Objective with ``v`` held; the prior counts only where it is fixed at its centre."""
+        value = self.objective.errors.log_likelihood(point.moments, variance, self.counts)
+        if self.pulls:
+            value += log_prior(self.scale.priors, point.theta)
+        return value
+
+    def equations(self, variance: Array) -> Equations:
+        """Linear equations at the current point, with ``v`` held."""
+        theta, errors = self.point.theta, self.objective.errors
+        rows = errors.rows(self.point.evaluation, self.scale.unit(theta), variance)
+        slope = self.scale.slope(theta) if self.pulls else np.zeros(theta.size)
+        # a matrix has its entries' size on its diagonal
+        sizes = np.diag(variance) if variance.ndim == 2 else variance
+        noise = float(np.exp(0.5 * np.mean(np.log(sizes))))
+        place = theta / self.scale.unit(theta)
+        equations = Equations(*rows, slope, self.scale.room(theta), self.scale.root, place, noise)
+        if not self.step.second_order:
+            return equations
+        self.evaluations += 2 * theta.size
+        return newton_equations(
+            self.problem,
+            errors,
+            self.scale,
+            theta,
+            self.point.evaluation,
+            variance,
+            equations,
+            prior=self.pulls,
+        )
+
+    def is_small(
+        self, proposal: Array, equations: Equations, tolerance: float, resolution: float
+    ) -> bool:
+        if is_cut(proposal, equations.room):
+            return False
+        if not self.step.locks and equations.distance() <= resolution:
+            return True
+        if self.step.limits_length:  # a short step then means caution as often as arrival
+            own = equations.solve(equations.root)
+            proposal = np.where(np.abs(own) > np.abs(proposal), own, proposal)
+        unit = self.scale.unit(self.point.theta)
+        least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
+        return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
+
+    def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:
+        """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
+        nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
+        rows = equations.root
+        if not self.step.fixed_prior:
+            # A prior that only scales the steps must not hide how far the optimum is, if any.
+            flat = self.scale.logarithmic & (equations.sd() > _FLAT)
+            rows = rows[flat]
+            nothing = _LEVEL if flat.any() else nothing
+        return won <= nothing and equations.expected_gain(equations.solve(rows)) <= nothing

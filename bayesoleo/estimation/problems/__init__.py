@@ -1,0 +1,1 @@
+"""What can be fitted: functions, models over runs, and sections of them."""

@@ -1,0 +1,57 @@
+"""Problems that give residuals sample by sample, for error models that look at their order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.estimation.problems.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RunSamples:
+    """When the samples of a run were taken.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Ascending; in seconds, or in the unit of a regression's abscissa.
+    frequency : float or None
+        Of the motion that repeats itself, in cycles per unit of ``time``; None for a run that does
+        not.
+    """
+
+    time: Array
+    frequency: float | None
+
+    @property
+    def phase(self) -> Array:
+        """Cycles since the first sample, shape (n,).
+
+        A run that does not repeat itself goes through half a cycle, so that a periodic function of
+        phase can end elsewhere than it began.
+        """
+        since = self.time - self.time[0]
+        if self.frequency is not None:
+            return np.asarray(self.frequency * since)
+        return np.asarray(0.5 * since / since[-1]) if since[-1] > 0 else since
+
+
+@runtime_checkable
+class ResidualProblem(Problem, Protocol):
+    """A problem that gives its residuals."""
+
+    @property
+    def samples(self) -> tuple[RunSamples, ...]:
+        """When the samples of each run were taken, length N."""
+
+    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals (L, s, n) of one run at vectors (L, l), and statuses (L,).
+
+        Each depends on its own vector alone, bit for bit.
+        """

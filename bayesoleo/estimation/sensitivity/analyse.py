@@ -1,0 +1,294 @@
+"""Which parameters matter for a feature of the prediction: near an estimate, and over the prior."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from bayesoleo import schema
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.sensitivity.features import Feature, Features
+from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.model.priors import LogNormal, Normal, Prior, TruncatedNormal, Uniform
+
+Per = Literal["prior", "percent"]
+# Central differences over this part of the step that is reported.
+_STEP = 0.02
+_DRAWS = 2**17
+
+
+def local_sensitivity(
+    problem: Problem,
+    theta: ArrayLike,
+    features: Mapping[str, Feature] | None = None,
+    *,
+    per: Per = "prior",
+) -> Shown:
+    """Change of each feature by one step of each parameter, by linearisation.
+
+    Parameters
+    ----------
+    problem : Problem
+        A campaign's problem, or one with a method ``predict``.
+    theta : array_like, shape (l,)
+        Where.
+    features : mapping of str to callable, optional
+        See :class:`~bayesoleo.estimation.sensitivity.features.Features`; by default the mean and
+        the rms of every output.
+    per : {"prior", "percent"}, optional
+        A step is one standard deviation of the prior, or one per cent of the value.
+
+    Returns
+    -------
+    Shown
+        ``change(feature, parameter)`` in the feature's own unit, ``percent(feature, parameter)`` of
+        its value, ``value(feature)``, ``step(parameter)``.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be predicted there.
+    """
+    if per not in ("prior", "percent"):
+        raise InputError("unknown step", key="per", value=per, hint="use 'prior' or 'percent'")
+    centre = np.array(theta, dtype=float)
+    _anchor(problem, centre)
+    found = Features.of(problem, features)
+    spread = np.array([prior.sd for prior in problem.priors])
+    step = spread if per == "prior" else 0.01 * np.abs(centre)
+    if not (step > 0).all():
+        raise InputError(
+            "one per cent of zero is no step",
+            key=problem.names[int(np.argmin(step))],
+            hint="use per='prior'",
+        )
+    offsets = np.diag(_STEP * step)
+    table = found(np.concatenate((centre[None], centre + offsets, centre - offsets)))
+    if not np.isfinite(table).all():
+        raise InputError(
+            "cannot be predicted near these parameters",
+            key="theta",
+            value=centre.tolist(),
+            hint="give parameters inside the admissible region",
+        )
+    unknowns = len(centre)
+    change = (table[1 : unknowns + 1] - table[unknowns + 1 :]).T / (2 * _STEP)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100 * change / np.abs(table[0])[:, None]
+    square = ("feature", schema.PARAMETER)
+    words = "one prior standard deviation" if per == "prior" else "one per cent"
+    data = xr.Dataset(
+        {
+            "change": _variable(square, change, f"change by {words}", "unit of each feature"),
+            "percent": _variable(square, percent, f"change by {words}", "%"),
+            "value": _variable(("feature",), table[0], "value", "unit of each feature"),
+            "step": _variable((schema.PARAMETER,), step, words, "unit of each parameter"),
+        },
+        coords={"feature": found.names, schema.PARAMETER: list(problem.names)},
+    )
+    data.attrs = {"per": per}
+    return Shown(data, _percent_text(data))
+
+
+def global_sensitivity(
+    problem: Problem,
+    features: Mapping[str, Feature] | None = None,
+    *,
+    priors: Sequence[Prior] | None = None,
+    samples: int = 1024,
+    seed: int = 0,
+    level: float = 0.95,
+) -> Shown:
+    """Sobol indices of each feature over the priors; see :func:`sobol`.
+
+    Parameters
+    ----------
+    problem : Problem
+        A campaign's problem, or one with a method ``predict``.
+    features : mapping of str to callable, optional
+        By default the mean and the rms of every output.
+    priors : sequence of Prior, length l, optional
+        Instead of the problem's own.
+    samples, seed, level
+        As in :func:`sobol`.
+    """
+    _anchor(problem, problem.start)
+    found = Features.of(problem, features)
+    return sobol(
+        found,
+        problem.priors if priors is None else priors,
+        problem.names,
+        found.names,
+        samples=samples,
+        seed=seed,
+        level=level,
+    )
+
+
+def sobol(
+    function: Callable[[Array], Array],
+    priors: Sequence[Prior],
+    names: Sequence[str],
+    features: Sequence[str],
+    *,
+    samples: int = 1024,
+    seed: int = 0,
+    level: float = 0.95,
+) -> Shown:
+    """Share of a feature's variance that each parameter causes, alone and in all.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(theta)`` for vectors (L, l) returns features (L, F); NaN where it fails.
+    priors : sequence of Prior, length l
+        Independent.
+    names, features : sequence of str
+        Labels of parameters and features.
+    samples : int, optional
+        Base samples, a power of two; the function is called for ``samples (l + 2)`` vectors.
+    seed : int, optional
+    level : float, optional
+        Coverage of the bootstrap intervals.
+
+    Returns
+    -------
+    Shown
+        ``first``, ``total``, each with ``_low`` and ``_high``, ``(feature, parameter)``;
+        ``variance(feature)``. Where the function failed, the whole sample is left out; attributes
+        say how many.
+
+    Raises
+    ------
+    InputError
+        If ``samples`` is no power of two, or the function fails too often.
+
+    References
+    ----------
+    Sobol (2001); Saltelli et al. (2010), by ``scipy.stats.sobol_indices``.
+    """
+    if samples < 8 or samples & (samples - 1):
+        raise InputError(
+            "samples must be a power of two", key="samples", value=samples, hint="use 1024"
+        )
+    unknowns = len(priors)
+    uniform = stats.qmc.Sobol(2 * unknowns, rng=np.random.default_rng(seed)).random(samples)
+    draws = _quantiles([*priors, *priors], uniform)
+    first, second = draws[:, :unknowns], draws[:, unknowns:]
+    mixed = np.repeat(first[None], unknowns, axis=0)
+    for k in range(unknowns):
+        mixed[k, :, k] = second[:, k]
+    f_first, f_second = np.asarray(function(first)), np.asarray(function(second))
+    f_mixed = np.array([function(block) for block in mixed])
+    good = np.isfinite(f_first) & np.isfinite(f_second) & np.isfinite(f_mixed).all(axis=0)
+    rows = np.flatnonzero(good.all(axis=1))
+    # The routine wants a power of two, whatever was left out.
+    kept = 1 << (int(rows.size).bit_length() - 1) if rows.size else 0
+    if kept < max(8, samples // 4):
+        raise InputError(
+            f"only {rows.size} of {samples} samples can be predicted",
+            hint="give narrower priors with priors=",
+        )
+    rows = rows[:kept]
+    found = stats.sobol_indices(
+        func={
+            "f_A": f_first[rows].T,
+            "f_B": f_second[rows].T,
+            "f_AB": np.moveaxis(f_mixed[:, rows], 1, 2),
+        },
+        n=kept,
+        rng=np.random.default_rng(seed),
+    )
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
+        # A parameter that a feature does not depend on has no scatter to resample: NaN.
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        spread = found.bootstrap(confidence_level=level, n_resamples=200)
+    data = _indices(found, spread, names, features, np.var(f_first[rows], axis=0))
+    data.attrs = {"samples": kept, "failed": int(samples - good.all(axis=1).sum()), "level": level}
+    return Shown(data, _sobol_text(data))
+
+
+def quantile(prior: Prior, part: ArrayLike) -> Array:
+    """Value below which a part of the prior lies, any shape."""
+    u = np.asarray(part, dtype=float)
+    if isinstance(prior, Normal):
+        return stats.norm.ppf(u, prior.centre, prior.spread)
+    if isinstance(prior, Uniform):
+        return prior.low + (prior.high - prior.low) * u
+    if isinstance(prior, LogNormal):
+        return prior.median * np.exp(prior.log_spread * stats.norm.ppf(u))
+    if isinstance(prior, TruncatedNormal):
+        ends = ((end - prior.centre) / prior.spread for end in (prior.low, prior.high))
+        return stats.truncnorm.ppf(u, *ends, loc=prior.centre, scale=prior.spread)
+    # A prior of one's own has draws at least.
+    return np.quantile(prior.sample(np.random.default_rng(0), _DRAWS), u)
+
+
+def _quantiles(priors: Sequence[Prior], uniform: Array) -> Array:
+    # The first point of a scrambled sequence may round to an end of the interval.
+    inside = np.clip(uniform, 1e-12, 1 - 1e-12)
+    return np.column_stack([quantile(p, inside[:, k]) for k, p in enumerate(priors)])
+
+
+def _anchor(problem: Problem, theta: Array) -> None:
+    """A campaign's solver starts every solution from a known one."""
+    freeze = getattr(problem, "freeze", None)
+    if freeze is not None:
+        freeze(np.array(theta, dtype=float))
+
+
+def _indices(
+    found: object, spread: object, names: Sequence[str], features: Sequence[str], variance: Array
+) -> xr.Dataset:
+    square, shape = ("feature", schema.PARAMETER), (len(features), len(names))
+    variables = {}
+    for key, attribute, text in (
+        ("first", "first_order", "share of the variance, alone"),
+        ("total", "total_order", "share of the variance, with all interactions"),
+    ):
+        interval = getattr(spread, attribute).confidence_interval
+        for end, numbers in (
+            ("", getattr(found, attribute)),
+            ("_low", interval.low),
+            ("_high", interval.high),
+        ):
+            values = np.reshape(numbers, shape)
+            variables[key + end] = _variable(square, values, text, "1")
+    variables["variance"] = _variable(
+        ("feature",), np.asarray(variance), "variance over the priors", "square of its unit"
+    )
+    return xr.Dataset(variables, coords={"feature": list(features), schema.PARAMETER: list(names)})
+
+
+def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+
+
+def _percent_text(data: xr.Dataset) -> str:
+    names = [str(name) for name in data[schema.PARAMETER].values]
+    rows = [
+        [str(feature), *(f"{float(v):+.3g}" for v in data["percent"].sel(feature=feature).values)]
+        for feature in data["feature"].values
+    ]
+    step = "one prior sd" if data.attrs["per"] == "prior" else "1 %"
+    return columns([f"% change by {step}", *names], rows)
+
+
+def _sobol_text(data: xr.Dataset) -> str:
+    names = [str(name) for name in data[schema.PARAMETER].values]
+    rows = []
+    for feature in data["feature"].values:
+        one = data.sel(feature=feature)
+        pairs = zip(one["first"].values, one["total"].values, strict=True)
+        rows.append([str(feature), *(f"{a:.2f} / {b:.2f}" for a, b in pairs)])
+    end = f"{data.attrs['samples']} samples"
+    if data.attrs["failed"]:
+        end += f"; {data.attrs['failed']} left out, for which there is no prediction"
+    return columns(["Sobol: first / total", *names], rows) + f"\n{end}"

@@ -1,0 +1,1 @@
+"""Estimation from chaotic and other transient records by multiple shooting."""

@@ -1,0 +1,361 @@
+"""How an estimator scatters over repeated experiments, by simulation.
+
+References
+----------
+Verbeek (1993), eqs. 2.18-2.20: mean, bias and covariance of the estimates over replications.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from bayesoleo import schema
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.estimators.estimate import estimate
+from bayesoleo.estimation.estimators.methods import method as find_method
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.objectives.curvature import prior_precision
+from bayesoleo.estimation.problems.batch import BatchProblem
+from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
+from bayesoleo.estimation.uncertainty.redraw import DataSource, NoiseBlock, data_source
+from bayesoleo.estimation.uncertainty.replicate import estimate_many
+from bayesoleo.solvers.status import Status, count
+from bayesoleo.storage.slots import Arrays, Slots
+
+_MIXED = "unit of each parameter"
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What every replication has in common."""
+
+    source: DataSource
+    theta: Array
+    method: str
+    seed: int
+    tolerance: float
+    max_iterations: int
+
+    def generator(self, number: int) -> np.random.Generator:
+        """The data of a replication depend on the seed and its own number alone."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
+
+    def replicate(self, number: int) -> PointEstimate:
+        """One replication."""
+        return estimate(
+            self.source.draw(self.generator(number)),
+            self.method,
+            start=self.theta,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )
+
+    def block(self, numbers: Sequence[int]) -> Arrays:
+        """Replications as arrays; where only outputs are new, all together."""
+        if self.source.batch is not None:
+            return self._together(self.source.batch, numbers)
+        points = [self.replicate(number) for number in numbers]
+        return {
+            "theta": np.array([point.theta for point in points]),
+            "variance": np.array([point.variance for point in points]),
+            "status": np.array([int(point.status) for point in points]),
+            "iterations": np.array([point.iterations for point in points]),
+        }
+
+    def _together(self, problem: BatchProblem, numbers: Sequence[int]) -> Arrays:
+        drawn = [self.source.outputs(self.generator(number)) for number in numbers]
+        data = [np.stack(column) for column in zip(*drawn, strict=True)]
+        found = estimate_many(
+            problem,
+            data,
+            self.method,
+            start=self.theta,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )
+        return {
+            "theta": found.theta,
+            "variance": found.variance,
+            "status": found.status,
+            "iterations": found.iterations,
+        }
+
+
+def sampling_distribution(
+    problem: Problem,
+    point: PointEstimate | ArrayLike,
+    *,
+    replications: int = 1000,
+    method: str = "mbe",
+    variance: ArrayLike | None = None,
+    input_noise: bool = True,
+    seed: int = 0,
+    tolerance: float = 1e-5,
+    max_iterations: int = 50,
+    block: int = 100,
+    out: str | os.PathLike[str] | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = False,
+) -> Shown:
+    """Simulate an experiment again and again, estimate from each, and compare with theory.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says when and at what inputs is measured; its measured outputs are not used.
+    point : PointEstimate or array_like, shape (l,)
+        The true parameters.
+    replications : int, optional
+        Number of experiments.
+    method : str, optional
+        The estimator. It starts at the truth, so that its own failures to get there do not enter.
+    variance : array_like, shape (s,), optional
+        Noise variance of each output. Of a campaign it is by default that of the records, run by
+        run; otherwise that of the point.
+    input_noise : bool, optional
+        Whether the inputs of a campaign are measured with noise too. The estimator takes them as
+        true.
+    seed : int, optional
+        With the number of a replication it fixes its noise, whatever the block or the threads.
+    tolerance, max_iterations
+        As in :func:`~bayesoleo.estimation.estimate`. A relative step of 1e-5 is far below the
+        scatter.
+    block : int, optional
+        Replications that are saved together.
+    out : path-like, optional
+        Folder in which finished blocks are kept; the same call goes on where it was stopped.
+    jobs : int, optional
+        Threads over blocks; by default the cores this process may use.
+    scheduler : str, optional
+        Other processes or machines that make the blocks instead: ``local:4``, or the address of a
+        Dask scheduler; see :func:`bayesoleo.machines.connected`.
+    progress : bool, optional
+        Whether to show a bar.
+
+    Returns
+    -------
+    Shown
+        The group ``sampling_distribution``: ``replicate(replication, parameter)``,
+        ``status(replication)``, ``variance(replication, output)``; ``truth``, ``mean``, ``bias``,
+        ``bias_standard_error``, ``sd``, ``expected_sd``, ``bound_sd``, ``efficiency``
+        ``(parameter)``; ``covariance``, ``expected_covariance`` and ``bound``
+        ``(parameter, parameter_column)``. Expected is the noise propagated through the linearised
+        estimator, the bound is that of Cramér and Rao, the efficiency is the bound's variance over
+        the one found. Replications that did not converge are counted and left out.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be evaluated at the point, or ``out`` holds another calculation.
+
+    References
+    ----------
+    Verbeek (1993), eqs. 2.18-2.20.
+    """
+    if replications < 2 or block < 1:
+        raise InputError(
+            "replications must be two or more, block one or more",
+            value=(replications, block),
+        )
+    theta = np.array(point.theta if isinstance(point, PointEstimate) else point, dtype=float)
+    noise = None if variance is None else np.array(variance, dtype=float)
+    if noise is None and isinstance(point, PointEstimate) and not hasattr(problem, "predictor"):
+        noise = point.variance
+    source = data_source(problem, theta, noise, input_noise=input_noise)
+    blocks = source.blocks()
+    find_method(method)
+    work = _Work(source, theta, method, seed, tolerance, max_iterations)
+    slots = Slots(out, _fingerprint(problem, work, blocks, block))
+    parts = _all_blocks(work, slots, replications, block, jobs, scheduler, progress)
+    data = _summarise(problem, work, blocks, parts)
+    return Shown(data, sampling_text(data))
+
+
+def _all_blocks(
+    work: _Work,
+    slots: Slots,
+    replications: int,
+    block: int,
+    jobs: int | None,
+    scheduler: str | None,
+    progress: bool,
+) -> Arrays:
+    """Blocks that are stored, and those that had to be made."""
+    from tqdm.auto import tqdm
+
+    numbers = [
+        range(first, min(first + block, replications)) for first in range(0, replications, block)
+    ]
+    with tqdm(total=replications, unit="fit", desc="replications", disable=not progress) as bar:
+        parts = slots.fill(
+            _Blocks(work, numbers),
+            len(numbers),
+            # The last block of a shorter calculation is made again in full by a longer one.
+            whole=lambda index, arrays: len(arrays["status"]) >= len(numbers[index]),
+            scheduler=scheduler,
+            jobs=jobs,
+            done=lambda index: bar.update(len(numbers[index])) and None,
+        )
+    wanted = [
+        {name: values[: len(block)] for name, values in part.items()}
+        for part, block in zip(parts, numbers, strict=True)
+    ]
+    return {name: np.concatenate([part[name] for part in wanted]) for name in wanted[0]}
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Makes a block of replications by its number, wherever it is sent."""
+
+    work: _Work
+    numbers: Sequence[range]
+
+    def __call__(self, index: int) -> Arrays:
+        return self.work.block(self.numbers[index])
+
+
+def _fingerprint(problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], block: int) -> str:
+    """What the stored replications belong to."""
+    settings: list[object] = [
+        list(problem.names),
+        list(problem.outputs),
+        list(problem.runs),
+        work.method,
+    ]
+    settings += [work.seed, work.tolerance, work.max_iterations, block]
+    total = hashlib.sha256(json.dumps(settings).encode())
+    total.update(np.ascontiguousarray(work.theta).tobytes())
+    total.update(np.ascontiguousarray(problem.counts).tobytes())
+    for part in blocks:
+        total.update(np.ascontiguousarray(part.sd).tobytes())
+        total.update(np.int64(part.columns.shape[1]).tobytes())
+    return total.hexdigest()
+
+
+def _summarise(
+    problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], parts: Arrays
+) -> xr.Dataset:
+    good = parts["status"] == Status.CONVERGED.value
+    found = parts["theta"][good]
+    used = len(found)
+    unknowns = len(problem.names)
+    covariance = np.full((unknowns, unknowns), np.nan)
+    mean = np.full(unknowns, np.nan)
+    if used > 1:
+        mean, covariance = found.mean(axis=0), np.atleast_2d(np.cov(found, rowvar=False))
+    precision = None
+    if find_method(work.method).fixed_prior:
+        precision = prior_precision(problem.priors, work.theta)
+    weights = parts["variance"][good].mean(axis=0) if used else np.ones(len(problem.outputs))
+    expected, bound = propagated(blocks, weights, precision), cramer_rao(blocks)
+    sd = np.sqrt(np.diag(covariance))
+    bound_sd = np.sqrt(np.diag(bound))
+    by_parameter = {
+        "truth": (work.theta, "true value"),
+        "mean": (mean, "mean of the estimates"),
+        "bias": (mean - work.theta, "mean of the estimates less the truth"),
+        "bias_standard_error": (sd / np.sqrt(max(used, 1)), "standard error of the bias"),
+        schema.SD: (sd, "standard deviation of the estimates"),
+        "expected_sd": (np.sqrt(np.diag(expected)), "standard deviation by linearisation"),
+        "bound_sd": (bound_sd, "least standard deviation (Cramér and Rao)"),
+    }
+    square = (schema.PARAMETER, schema.PARAMETER_COLUMN)
+    tables = {
+        schema.COVARIANCE: (covariance, "covariance of the estimates"),
+        "expected_covariance": (expected, "covariance by linearisation"),
+        "bound": (bound, "least covariance (Cramér and Rao)"),
+    }
+    each = ("replication", schema.PARAMETER)
+    data = xr.Dataset(
+        {
+            "replicate": _variable(each, parts["theta"], "estimate by replication", _MIXED),
+            "status": _variable(("replication",), parts["status"], "outcome", "1"),
+            schema.VARIANCE: _variable(
+                ("replication", schema.OUTPUT),
+                parts["variance"],
+                "error variance by replication",
+                "square of the output's SI unit",
+            ),
+            **{
+                name: _variable((schema.PARAMETER,), values, text, _MIXED)
+                for name, (values, text) in by_parameter.items()
+            },
+            **{
+                name: _variable(square, values, text, "product of the parameters' units")
+                for name, (values, text) in tables.items()
+            },
+            "efficiency": _variable(
+                (schema.PARAMETER,),
+                bound_sd**2 / sd**2,
+                "variance of the bound over that found",
+                "1",
+            ),
+        },
+        coords={
+            schema.PARAMETER: list(problem.names),
+            schema.PARAMETER_COLUMN: list(problem.names),
+            schema.OUTPUT: list(problem.outputs),
+        },
+    )
+    data.attrs = {
+        "method": work.method,
+        "seed": work.seed,
+        "replications": len(good),
+        "converged": used,
+        "outcomes": json.dumps(count(parts["status"])),
+        "iterations": float(parts["iterations"].mean()),
+    }
+    return data
+
+
+def _variable(dims: tuple[str, ...], values: NDArray, name: str, unit: str) -> xr.Variable:
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+
+
+def sampling_text(data: xr.Dataset) -> str:
+    """Bias and scatter against theory, one line a parameter.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        The group ``sampling_distribution``.
+    """
+    head = [
+        "parameter",
+        "truth",
+        "bias",
+        "± se",
+        "bias/sd",
+        "sd",
+        "expected",
+        "bound",
+        "efficiency",
+    ]
+    rows = []
+    for name in data[schema.PARAMETER].values:
+        one = data.sel({schema.PARAMETER: name})
+        value = {key: float(one[key]) for key in one.data_vars if one[key].ndim == 0}
+        cells = [
+            f"{value['truth']:.6g}",
+            f"{value['bias']:.2e}",
+            f"{value['bias_standard_error']:.1e}",
+        ]
+        cells += [f"{value['bias'] / value['sd']:.3f}", f"{value['sd']:.4g}"]
+        cells += [f"{value['expected_sd']:.4g}", f"{value['bound_sd']:.4g}"]
+        rows.append([str(name), *cells, f"{value['efficiency']:.3f}"])
+    about = data.attrs
+    end = (
+        f"{about['method']}, {about['converged']} of {about['replications']} replications converged"
+    )
+    return f"{columns(head, rows)}\n{end}, {about['iterations']:.1f} iterations on average"

@@ -1,0 +1,1 @@
+"""Periodic solutions on a mesh of their own."""

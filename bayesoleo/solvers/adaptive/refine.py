@@ -1,0 +1,264 @@
+"""Periodic solutions on a mesh of their own: steps are placed where the solution needs them.
+
+A solution on a mesh and that on the mesh of half its steps differ by the coarse one's error, at the
+nodes and between them; the part that arises inside a step says how long the step may be. Edges are
+placed where the equations have kinks, so that every step sees smooth equations and the order of the
+method is kept across a contact.
+
+References
+----------
+Ascher, U., Christiansen, J. and Russell, R. D. (1979). A collocation solver for mixed order systems
+of boundary value problems. Mathematics of Computation 33, 659-679 (errors from halved meshes).
+
+Verbeek (1993), section 4.3.1, recommends error-controlled meshes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.adaptive.crossings import Crossings
+from bayesoleo.solvers.adaptive.moving_edges import solve_on
+from bayesoleo.solvers.adaptive.remesh import Misfit, remesh
+from bayesoleo.solvers.adaptive.switched import (
+    Level,
+    Motion,
+    PeriodicProblem,
+    kinks_of,
+    state_rows,
+)
+from bayesoleo.solvers.adaptive.warp import SAME, Warp
+from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.periodic.solve import Solution, sensitivities
+from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
+from bayesoleo.solvers.schemes.tableau import Tableau, tableau
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: Equal steps tried in turn where no mesh is given.
+FIRST_STEPS = (64, 256, 1024)
+MAXIMUM_PASSES = 25
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where to start from: a motion, and a mesh that suits it.
+
+    Parameters
+    ----------
+    motion : callable
+        Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,).
+    mesh : Mesh, optional
+        To begin with; equal steps where there is none.
+    kinks : Crossings, optional
+        Phases of those of its edges at which the equations switch.
+    """
+
+    motion: Motion
+    mesh: Mesh | None = None
+    kinks: Crossings | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveSolution:
+    """A periodic solution on its mesh.
+
+    Parameters
+    ----------
+    orbit : Orbit
+        States at the nodes, status, estimated error, multipliers.
+    problem : PeriodicProblem
+        As solved.
+    level : Level
+        The problem on the last mesh, and the scheme's unknowns.
+    p : ndarray, shape (np,)
+        Constants.
+    next_mesh : Mesh
+        For a motion like this one: edges on the kinks, and as many steps as the tolerance needs.
+    """
+
+    orbit: Orbit
+    problem: PeriodicProblem
+    level: Level
+    p: Array
+    next_mesh: Mesh
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh."""
+        return self.level.mesh
+
+    def motion(self, phase: Array) -> Array:
+        """Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,)."""
+        return self.level.motion(phase)
+
+    def start(self, warp: Warp = SAME) -> Start:
+        """Start of another solution, phases moved by a warp."""
+        kinks = self.level.kinks
+        if kinks is not None:
+            kinks = replace(kinks, phases=warp.forward(kinks.phases))
+        return Start(lambda phase: self.motion(warp.back(phase)), warp.mesh(self.next_mesh), kinks)
+
+    def sensitivities(self) -> Array:
+        """Derivatives of the unknowns by the active parameters, shape (n, w, na).
+
+        They are exact derivatives of the discrete solution on this mesh (Verbeek 1993, eq. 4.28).
+        """
+        zero = np.zeros(1, dtype=np.int64)
+        found = Solution(self.level.x[None], zero, zero)
+        return sensitivities(self.level.boundary, self.p[None], found)[1][0]
+
+    def motion_by_parameter(self, phase: Array) -> Array:
+        """Derivatives of :meth:`motion` by the active parameters, shape (nz, na, N)."""
+        n = self.level.x.shape[0]
+        plan, step = self.level.scheme.plan(phase, n), self.level.boundary.step(n)
+        return self.level.scheme.sample(self.sensitivities()[None], plan, step)[0]
+
+
+def solve_adaptive(
+    problem: PeriodicProblem,
+    p: Array,
+    start: Motion | Start,
+    *,
+    method: str = "radau3",
+    tolerance: float = 1e-6,
+    max_steps: int = 20_000,
+) -> AdaptiveSolution:
+    """Solve for a periodic solution to a tolerance, with as few steps as it needs.
+
+    Parameters
+    ----------
+    problem : PeriodicProblem
+        Equations and inputs.
+    p : ndarray, shape (np,)
+        Constants.
+    start : callable or Start
+        A guess: values and derivatives of all dofs, shape (nz, N), at phases in cycles; or what
+        another solution's :meth:`AdaptiveSolution.start` gives.
+    method : str
+        A collocation method, see :func:`~bayesoleo.solvers.schemes.tableau.tableau`.
+    tolerance : float
+        Estimated largest error of a state, anywhere in the period, over that state's largest size.
+    max_steps : int
+        Of the last mesh; where they do not suffice the status is ``TOLERANCE_NOT_MET``.
+
+    Returns
+    -------
+    AdaptiveSolution
+        Whatever came of it; see ``orbit.status``.
+    """
+    begin = start if isinstance(start, Start) else Start(start)
+    end = _Work(problem, p, tableau(method), tolerance, max_steps).run(begin)
+    return _finish(end, problem, p)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Where a search ended: its best level and what else is known of it."""
+
+    level: Level
+    status: Status
+    error: float
+    next_mesh: Mesh
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One search for a mesh."""
+
+    problem: PeriodicProblem
+    p: Array
+    method: Tableau
+    tolerance: float
+    max_steps: int
+
+    def run(self, start: Start) -> _End:
+        """Solve, halve, compare, place the steps anew, until the tolerance is met."""
+        level, spent = self._first(start)
+        for _ in range(MAXIMUM_PASSES):
+            if level.status is not Status.CONVERGED:
+                return _End(level, level.status, np.nan, level.mesh, spent)
+            fine = self._solve(level.mesh.halved(), level.motion, level.kinks)
+            spent += fine.evaluations
+            if fine.status is not Status.CONVERGED:
+                return _End(fine, fine.status, np.nan, fine.mesh, spent)
+            misfit, kinks = compare(level, fine), kinks_of(self.problem, fine, self.p)
+            mesh, enough = remesh(
+                level.mesh, misfit, self.tolerance, level.kinks, kinks,
+                self.method.stages + 1, self.max_steps // 2,
+            )  # fmt: skip
+            end = _End(replace(fine, kinks=kinks), Status.CONVERGED, misfit.largest, mesh, spent)
+            if misfit.largest <= self.tolerance and (fine.kinks is None or fine.kinks is kinks):
+                return end
+            if not enough and level.mesh.steps >= self.max_steps // 2:
+                break
+            level = self._solve(mesh, fine.motion, kinks)
+            spent += level.evaluations
+        return replace(end, status=Status.TOLERANCE_NOT_MET)
+
+    def _first(self, start: Start) -> tuple[Level, int]:
+        if start.mesh is not None:
+            level = self._solve(start.mesh, start.motion, start.kinks)
+            return level, level.evaluations
+        spent = 0
+        for n in FIRST_STEPS:
+            level = self._solve(equidistant(n), start.motion, None, far=True)
+            spent += level.evaluations
+            if level.status is Status.CONVERGED:
+                break
+        return level, spent
+
+    def _solve(
+        self, mesh: Mesh, start: Motion, kinks: Crossings | None, *, far: bool = False
+    ) -> Level:
+        return solve_on(self.problem, self.method, self.p, mesh, start, kinks, far=far)
+
+
+def _finish(end: _End, problem: PeriodicProblem, p: Array) -> AdaptiveSolution:
+    level, status, scheme = end.level, end.status, end.level.scheme
+    multipliers = np.full(scheme.state_size, complex(np.nan))
+    if status is Status.CONVERGED:
+        held = problem.on(scheme.method, level.mesh, level.kinks)
+        level = replace(level, boundary=held)
+        found = Solution(level.x[None], np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        found, _, monodromy = sensitivities(held, p[None], found)
+        status = Status(int(found.status[0]))
+        multipliers = floquet_multipliers(monodromy[0])
+    orbit = Orbit(
+        phases=level.mesh.edges[:-1],
+        states=level.x[:, : scheme.state_size],
+        period=problem.period,
+        multipliers=multipliers,
+        status=status,
+        error=end.error,
+        evaluations=end.evaluations,
+    )
+    return AdaptiveSolution(orbit, problem, level, p, end.next_mesh)
+
+
+def compare(coarse: Level, fine: Level) -> Misfit:
+    """What a solution gains by halving its steps.
+
+    States are compared at the same part of the same step, over their largest sizes, and the edges
+    on kinks by their phases, in cycles: a contact that comes a little later is an error of its
+    time, not one of the velocity, which may change sign in a millionth of the period.
+    """
+    scheme, n = fine.scheme, fine.mesh.steps
+    c, kept = scheme.method.c, state_rows(scheme.orders)
+    position = np.concatenate([[0.0], c / 2, [0.5], 0.5 + c / 2])
+    step = np.repeat(np.arange(n), 1 + c.size)
+    now = fine.inside(step, np.tile(np.concatenate([[0.0], c]), n))[kept]
+    half = np.repeat(np.arange(n // 2), position.size)
+    change = now - coarse.inside(half, np.tile(position, n // 2))[kept]
+    size = np.maximum(np.abs(now).max(axis=1), 1e-300)
+    change = change.reshape(len(kept), n // 2, position.size) / size[:, None, None]
+    own = np.abs(change - change[:, :, :1]).max(axis=(0, 2))
+    late = 0.0
+    if coarse.kinks is not None and fine.kinks is not None and fine.kinks.phases.size:
+        late = float(np.abs(fine.kinks.phases - coarse.kinks.phases).max())
+    return Misfit(own, max(float(np.abs(change).max()), late))

@@ -1,0 +1,1 @@
+"""Families of periodic solutions, their folds and doublings, and periods that are unknown."""

@@ -1,0 +1,128 @@
+"""Limit cycles of systems without input: the period is unknown, and so is where a cycle starts.
+
+The closure is bordered by the period on one side and on the other by a phase condition, that the
+first state stay in the plane through the guess across the motion.
+
+References
+----------
+Seydel, R. (2010). Practical Bifurcation and Stability Analysis, 3rd ed., section 7.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.branches.bordered import (
+    BorderedSolution,
+    Condition,
+    Family,
+    end_states,
+    solve_bordered,
+)
+from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.periodic.solve import Boundary
+
+Array = NDArray[np.float64]
+
+_LANE = np.zeros(1, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class LimitCycle:
+    """A cycle of an autonomous system.
+
+    Parameters
+    ----------
+    solution : BorderedSolution
+        Its value is the period, s.
+    orbit : Orbit
+    period_theta : ndarray, shape (na,)
+        Derivatives of the period by the active parameters; NaN where the solve failed.
+    """
+
+    solution: BorderedSolution
+    orbit: Orbit
+    period_theta: Array
+
+    @property
+    def own(self) -> complex:
+        """The multiplier along the motion: one, but for the errors of the solution."""
+        values = self.orbit.multipliers
+        return complex(values[np.argmin(np.abs(values - 1.0))])
+
+    @property
+    def stable(self) -> bool:
+        """Whether all multipliers but the motion's own lie inside the unit circle."""
+        values = self.orbit.multipliers
+        others = np.delete(values, np.argmin(np.abs(values - 1.0)))
+        return self.orbit.status.ok and bool(np.all(np.abs(others) < 1.0))
+
+
+def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> LimitCycle:
+    """Solve for a cycle and its period.
+
+    Parameters
+    ----------
+    problem : Boundary
+        With constant inputs; its own period does not count.
+    p : ndarray, shape (np,)
+        Constants.
+    x : ndarray, shape (n, w)
+        Where the scheme's unknowns start: a motion near the cycle. At a rest position the condition
+        on the phase is void, and the status says that it is singular.
+    period : float
+        Where the period starts, s.
+
+    Returns
+    -------
+    LimitCycle
+    """
+
+    def family(value: float) -> tuple[Boundary, Array]:
+        return replace(problem, period=value), p
+
+    D, method = problem.scheme.state_size, problem.scheme
+    plan = method.plan(np.zeros(1), len(x))
+    rows = method.sample(x[None, :, :, None], plan, period / len(x))[0, :, 0, 0]
+    first = np.cumsum([0, *(order + 1 for order in method.orders)])
+    moving = rows[[first[j] + k + 1 for j, o in enumerate(method.orders) for k in range(o)]]
+    condition = Condition(np.append(moving, 0.0), float(moving @ x[0, :D]))
+    solution = solve_bordered(family, x, period, condition)
+    multipliers = floquet_multipliers(solution.monodromy)
+    orbit = Orbit(
+        phases=np.arange(len(x)) / len(x),
+        states=solution.x[:, :D],
+        period=solution.value,
+        multipliers=multipliers,
+        status=solution.status,
+        error=np.nan,
+        evaluations=4 * solution.iterations * problem.inputs.shape[1],
+    )
+    return LimitCycle(solution, orbit, _period_theta(family, solution, condition))
+
+
+def _period_theta(family: Family, solution: BorderedSolution, condition: Condition) -> Array:
+    problem, p = family(solution.value)
+    if not solution.status.ok:
+        return np.full(problem.active, np.nan)
+    method, x = problem.scheme, solution.x
+    D, d, points, step = (
+        method.state_size,
+        len(method.orders),
+        problem.inputs.shape[1],
+        problem.step(len(x)),
+    )
+    z, g = np.zeros((1, D + d, points)), np.zeros((1, d, points))
+    gz, gp = np.zeros((1, d, D + d, points)), np.zeros((1, d, problem.active, points))
+    method.rows(x[None], _LANE, step, z)
+    problem.equations.jacobian(z, problem.inputs, p[None], _LANE, g, gz)
+    problem.equations.parameters(z, problem.inputs, p[None], _LANE, gp)
+    dx, _, _ = method.linear(gz, gp, None, _LANE, step, initial=True)
+    border = np.block(
+        [[np.eye(D) - solution.monodromy, -solution.by_value[:, None]], [condition.row[None]]]
+    )
+    right = np.concatenate([end_states(problem, dx[0]), np.zeros((1, problem.active))])
+    return np.linalg.solve(border, right)[D]

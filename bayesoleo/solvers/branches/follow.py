@@ -1,0 +1,246 @@
+"""Branches of periodic orbits, followed through folds by pseudo-arclength continuation.
+
+Along a branch the first state and one other value - a parameter, the frequency or the amplitude of
+the forcing - change together. A step goes along the tangent and back to the branch in the plane
+across it, so that the branch may turn round in the value. Every orbit comes with its multipliers:
+one passes through 1 at a fold and through -1 where the period doubles.
+
+References
+----------
+Keller, H. B. (1977). Numerical solution of bifurcation and nonlinear eigenvalue problems. In:
+Applications of Bifurcation Theory, 359-384. Verbeek (1993), section 4.3, names path following.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from bayesoleo.solvers.branches.bordered import (
+    BorderedSolution,
+    Condition,
+    Family,
+    solve_bordered,
+)
+from bayesoleo.solvers.orbit import floquet_multipliers
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: A step with more iterations than these is followed by a shorter one, with fewer by a longer.
+MANY_ITERATIONS, FEW_ITERATIONS = 6, 4
+#: Least cosine between tangents of neighbouring points: a larger turn may be another branch.
+LEAST_COSINE = 0.9
+#: A step may shrink to this part of the longest before the branch is given up.
+SMALLEST_STEP = 1e-4
+#: Where along a step a special orbit lies, over its length.
+PLACE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class BranchPoint:
+    """An orbit on a branch.
+
+    Parameters
+    ----------
+    value : float
+    x : ndarray, shape (n, w)
+        The scheme's unknowns.
+    multipliers : ndarray of complex, shape (D,)
+        Floquet multipliers, largest first.
+    tangent : ndarray, shape (D + 1,)
+        Direction of the branch in scaled units, the value last.
+    """
+
+    value: float
+    x: Array
+    multipliers: NDArray[np.complex128]
+    tangent: Array
+
+    @property
+    def unstable(self) -> int:
+        """Number of multipliers outside the unit circle."""
+        return int(np.sum(np.abs(self.multipliers) > 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SpecialPoint:
+    """Where a branch folds back (``fold``) or its period doubles (``doubling``)."""
+
+    kind: str
+    point: BranchPoint
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A branch of orbits.
+
+    Parameters
+    ----------
+    points : tuple of BranchPoint
+        In the order in which they were met.
+    special : tuple of SpecialPoint
+    status : Status
+        ``CONVERGED`` where an end of the span was reached.
+    """
+
+    points: tuple[BranchPoint, ...]
+    special: tuple[SpecialPoint, ...]
+    status: Status
+
+    @property
+    def values(self) -> Array:
+        """Shape (K,)."""
+        return np.array([point.value for point in self.points])
+
+    def of_kind(self, kind: str) -> tuple[BranchPoint, ...]:
+        """Special orbits of one kind."""
+        return tuple(item.point for item in self.special if item.kind == kind)
+
+
+def follow(
+    family: Family,
+    x: Array,
+    value: float,
+    span: tuple[float, float],
+    *,
+    forward: bool = True,
+    longest: float = 0.1,
+    most: int = 400,
+) -> Branch:
+    """Follow the branch through an orbit until it leaves a span of values.
+
+    Parameters
+    ----------
+    family : callable
+        See :data:`~bayesoleo.solvers.branches.bordered.Family`; its scheme is a one-step
+        collocation.
+    x : ndarray, shape (n, w)
+        Unknowns of an orbit at ``value``, or near one.
+    value : float
+    span : tuple of float
+        Least and largest value.
+    forward : bool
+        Whether to set out towards larger values.
+    longest : float
+        Length of a step, in spans of the value and in largest values of the states so far.
+    most : int
+        Orbits on the branch.
+
+    Returns
+    -------
+    Branch
+    """
+    D = family(value)[0].scheme.state_size
+    held = Condition(np.append(np.zeros(D), 1.0), value)
+    first = solve_bordered(family, x, value, held)
+    if not first.status.ok:
+        return Branch((), (), first.status)
+    spread = np.abs(first.x[:, :D]).max(axis=0)
+    units = np.append(np.where(spread > 0, spread, 1.0), span[1] - span[0])
+    onward = np.append(np.zeros(D), 1.0 if forward else -1.0)
+    return _Walk(family, units, longest).run(_point(first, units, onward), span, most)
+
+
+def _point(solution: BorderedSolution, units: Array, onward: Array) -> BranchPoint:
+    """An orbit with the tangent that goes the same way as ``onward``."""
+    D = units.size - 1
+    matrix = np.column_stack([np.eye(D) - solution.monodromy, -solution.by_value]) * units
+    # Rows have units of their own; the null space does not depend on them.
+    tangent = np.linalg.svd(matrix / np.abs(matrix).max(axis=1, keepdims=True))[2][-1]
+    tangent = tangent if tangent @ onward >= 0 else -tangent
+    multipliers = floquet_multipliers(solution.monodromy)
+    return BranchPoint(solution.value, solution.x, multipliers, tangent)
+
+
+class _Walk:
+    """Steps along one branch."""
+
+    def __init__(self, family: Family, units: Array, longest: float) -> None:
+        self.family, self.units, self.longest = family, units, longest
+
+    def run(self, first: BranchPoint, span: tuple[float, float], most: int) -> Branch:
+        points, special, length = [first], list[SpecialPoint](), self.longest
+        while len(points) < most:
+            here, trial = points[-1], self.step(points[-1], length)
+            if trial is None:
+                length /= 2
+                if length < SMALLEST_STEP * self.longest:
+                    return Branch(tuple(points), tuple(special), Status.NO_CONVERGENCE)
+                continue
+            point, iterations = trial
+            special += self.between(here, point, length)
+            points.append(self.grown(point))
+            if not span[0] <= point.value <= span[1]:
+                return Branch(tuple(points), tuple(special), Status.CONVERGED)
+            if iterations <= FEW_ITERATIONS:
+                length = min(2 * length, self.longest)
+            elif iterations > MANY_ITERATIONS:
+                length /= 2
+        return Branch(tuple(points), tuple(special), Status.NO_CONVERGENCE)
+
+    def grown(self, point: BranchPoint) -> BranchPoint:
+        """The orbit, with its tangent in units that grow with the motion."""
+        units, D = self.units, self.units.size - 1
+        self.units = np.append(np.maximum(units[:D], np.abs(point.x[:, :D]).max(axis=0)), units[D])
+        tangent = point.tangent * units / self.units
+        return replace(point, tangent=tangent / np.linalg.norm(tangent))
+
+    def step(self, point: BranchPoint, length: float) -> tuple[BranchPoint, int] | None:
+        """The orbit at a length along the tangent, with Newton's iterations; None if there is none
+        or the branch turns too much to be sure that it is the same.
+        """
+        D = self.units.size - 1
+        row = point.tangent / self.units
+        at = np.append(point.x[0, :D], point.value)
+        ahead = at + length * point.tangent * self.units
+        x = point.x.copy()
+        x[0, :D] = ahead[:D]
+        target = float(row @ at) + length
+        found = solve_bordered(self.family, x, float(ahead[D]), Condition(row, target))
+        if not found.status.ok:
+            return None
+        after = _point(found, self.units, point.tangent)
+        if after.tangent @ point.tangent < LEAST_COSINE:
+            return None
+        return after, found.iterations
+
+    def between(self, before: BranchPoint, after: BranchPoint, length: float) -> list[SpecialPoint]:
+        """Folds and doublings between two neighbouring orbits."""
+        found = []
+        for kind, test in TESTS.items():
+            if np.sign(test(before)) * np.sign(test(after)) < 0:
+                point = self.zero(before, length, test)
+                found += [SpecialPoint(kind, point)] if point is not None else []
+        return found
+
+    def zero(
+        self, before: BranchPoint, length: float, test: Callable[[BranchPoint], float]
+    ) -> BranchPoint | None:
+        """Where a test function vanishes along a step."""
+
+        def value(part: float) -> float:
+            trial = self.step(before, part)
+            return np.nan if trial is None else test(trial[0])
+
+        if not value(length) * test(before) < 0:
+            return None
+        place = brentq(value, 0.0, length, xtol=PLACE * length)
+        trial = self.step(before, float(place))
+        return None if trial is None else trial[0]
+
+
+def _doubling(point: BranchPoint) -> float:
+    """``det(M + 1)``, over its terms' size."""
+    return float(np.real(np.prod((1.0 + point.multipliers) / (1.0 + np.abs(point.multipliers)))))
+
+
+#: Functions whose sign changes at a special orbit.
+TESTS: dict[str, Callable[[BranchPoint], float]] = {
+    "fold": lambda point: float(point.tangent[-1]),
+    "doubling": _doubling,
+}

@@ -1,0 +1,330 @@
+"""Periodic solutions by Newton's method on all unknowns of a period at once, for many parameter
+vectors.
+
+Lanes (parameter vectors) never see each other: each has its own step length, its own end and its
+own status, so that a solution depends on its own parameters and start alone, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.compiled import BlockKernel
+from bayesoleo.solvers.periodic import measures, newton
+from bayesoleo.solvers.schemes.scheme import Scheme
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+Lanes = NDArray[np.int64]
+
+
+class Equations(Protocol):
+    """What a solver needs of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
+
+    @property
+    def residual(self) -> Any: ...
+    @property
+    def jacobian(self) -> Any: ...
+    @property
+    def parameters(self) -> Callable[..., Any]: ...
+    @property
+    def admissible(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """A discretised periodic boundary-value problem.
+
+    Parameters
+    ----------
+    equations : Equations
+        Residuals and partial derivatives.
+    scheme : Scheme
+        Discretisation.
+    period : float
+        Seconds.
+    inputs : ndarray, shape (nu, N)
+        Inputs and their derivatives at the scheme's points.
+    conditions : int
+        Number of conditions on the admissible region.
+    active : int
+        Number of parameters with derivatives.
+    """
+
+    equations: Equations
+    scheme: Scheme
+    period: float
+    inputs: Array
+    conditions: int
+    active: int
+
+    def step(self, n: int) -> float:
+        """Length of one of ``n`` steps, s."""
+        return self.period / n
+
+    @cached_property
+    def arranged(self) -> newton.Arranged | None:
+        """Inputs as the compiled iteration sweeps them; None where it has no code for the scheme,
+        or the equations are not compiled."""
+        compiled = isinstance(self.equations.jacobian, BlockKernel)
+        program = self.scheme.program if compiled else None
+        if program is None:
+            return None
+        n = self.inputs.shape[1] // program.stages
+        if n < newton.LEAST_STEPS:
+            return None
+        return newton.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Periodic solutions of ``L`` parameter vectors.
+
+    Parameters
+    ----------
+    x : ndarray, shape (L, n, w)
+        The scheme's unknowns.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers.status.Status`.
+    iterations : ndarray of int, shape (L,)
+        Newton iterations.
+    """
+
+    x: Array
+    status: NDArray[np.int64]
+    iterations: NDArray[np.int64]
+
+
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14.
+LAST_STEP = 1e-7
+#: Without quadratic contraction (at a kink) a step this small is taken as converged.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+
+
+def solve_periodic(
+    problem: Boundary, p: Array, start: Array, *, max_iterations: int = 40, monotone: bool = True
+) -> Solution:
+    """Solve the discretised periodic problem by Newton's method with step halving.
+
+    Parameters
+    ----------
+    problem : Boundary
+        Equations, scheme, inputs.
+    p : ndarray, shape (L, np)
+        Constants of each lane.
+    start : ndarray, shape (L, n, w)
+        Where each lane starts.
+    max_iterations : int
+        After which a lane's status is ``NO_CONVERGENCE``.
+    monotone : bool
+        Halve steps until the residual falls. Otherwise only until it is finite and admissible:
+        plain Newton wanders, but out of the hollows of the residual's norm in which the monotone
+        iteration gets stuck.
+
+    Returns
+    -------
+    Solution
+
+    References
+    ----------
+    Verbeek (1993), section 4.3.1.
+    """
+    if problem.arranged is None:
+        return _Newton(problem, p, start.copy(), max_iterations, monotone).run()
+    solution = _compiled(problem, problem.arranged, p, start, max_iterations, monotone)
+    again = np.flatnonzero(solution.status == newton.NEEDS_EXCHANGE)
+    if again.size:
+        other = _Newton(problem, p[again], start[again].copy(), max_iterations, monotone).run()
+        solution.x[again] = other.x
+        solution.status[again], solution.iterations[again] = other.status, other.iterations
+    return solution
+
+
+def _compiled(
+    problem: Boundary,
+    arranged: newton.Arranged,
+    p: Array,
+    start: Array,
+    max_iterations: int,
+    monotone: bool,
+) -> Solution:
+    """The same iteration, lane by lane, in one compiled call."""
+    x, equations, program = start.copy(), problem.equations, arranged.program
+    status = np.empty(x.shape[0], dtype=np.int64)
+    iterations = np.zeros(x.shape[0], dtype=np.int64)
+    sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
+    pieces = newton.Pieces(
+        equations.residual.address, equations.jacobian.address, equations.admissible.address,
+        program.rows, program.measure, program.eliminate, program.chain, program.substitute,
+        program.follow, program.update,
+    )  # fmt: skip
+    sweep = arranged.sweep
+    newton.solve_lanes(
+        pieces, sizes, sweep, newton.work_space(sizes, sweep),
+        newton.Options(max_iterations, monotone, False), p, x, status, iterations,
+    )  # fmt: skip
+    return Solution(x, status, iterations)
+
+
+class _Newton:
+    """State of one batched iteration; arrays are allocated once."""
+
+    def __init__(self, problem: Boundary, p: Array, x: Array, max_iterations: int, monotone: bool):
+        self.problem, self.p, self.x = problem, p, x
+        self.max_iterations, self.monotone = max_iterations, monotone
+        lanes, n, _ = x.shape
+        scheme = problem.scheme
+        d, points = len(scheme.orders), problem.inputs.shape[1]
+        nz = scheme.state_size + d
+        self.step = problem.step(n)
+        self.base = np.empty_like(x)
+        self.z = np.empty((lanes, nz, points))
+        self.g = np.empty((lanes, d, points))
+        self.gz = np.empty((lanes, d, nz, points))
+        self.a = np.empty((lanes, problem.conditions, points))
+        self.squares, self.terms = np.empty((lanes, d)), np.empty((lanes, d))
+        self.inside, self.defined = np.ones(lanes, dtype=np.bool_), np.ones(lanes, dtype=np.bool_)
+        self.status = np.full(lanes, Status.NO_CONVERGENCE.value, dtype=np.int64)
+        self.iterations = np.zeros(lanes, dtype=np.int64)
+        self.merit = np.full(lanes, np.inf)
+        self.last = np.full(lanes, np.inf)
+
+    def run(self) -> Solution:
+        lanes = np.arange(self.x.shape[0])
+        good = self._evaluate(lanes)
+        outside = np.where(self.inside, Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
+        lanes = self._drop(lanes, good, outside)
+        size = np.empty(self.x.shape[0])
+        for _ in range(self.max_iterations):
+            if lanes.size == 0:
+                break
+            self.iterations[lanes] += 1
+            dx, _, ok = self.problem.scheme.linear(
+                self.gz, self.g[:, :, None], self.x, lanes, self.step
+            )
+            measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
+            lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
+            lanes = self._finish(lanes, dx, size)
+            lanes = self._advance(lanes, dx, size)
+        return Solution(self.x, self.status, self.iterations)
+
+    def _drop(
+        self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]
+    ) -> Lanes:
+        bad = lanes[~good]
+        self.status[bad] = reason if isinstance(reason, int) else reason[bad]
+        return lanes[good]
+
+    def _evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
+        """Equations at the present unknowns; true where they are finite and admissible."""
+        equations, u = self.problem.equations, self.problem.inputs
+        self.problem.scheme.rows(self.x, lanes, self.step, self.z)
+        with np.errstate(all="ignore"):
+            equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
+            if self.problem.conditions:
+                equations.admissible(self.z, u, self.p, lanes, self.a)
+        measures.positive(self.a, lanes, self.inside, self.defined)
+        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
+        return self.inside[lanes] & self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
+
+    def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
+        """Whether the residual fell, in units of the equations' terms: the larger of those before
+        and after.
+
+        Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid
+        to leave it.
+        """
+        unit = np.maximum(terms, self.terms[lanes]) + 1e-300
+        with np.errstate(all="ignore"):
+            before = np.sqrt(np.sum(squares / unit, axis=1))
+            merit = np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
+        self.merit[lanes] = merit
+        return merit < before
+
+    def _finish(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
+        """Take the last step where it is small enough that what it leaves is round-off."""
+        sizes = size[lanes]
+        done = ((sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])) | (sizes < SMALL_STEP)
+        finished = lanes[done]
+        measures.keep(self.x, finished, self.base)
+        measures.take(self.base, dx, finished, np.ones(finished.size), self.x)
+        self.status[finished] = Status.CONVERGED.value
+        self.last[lanes] = sizes
+        return lanes[~done]
+
+    def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
+        """Take the steps, halved where they are inadmissible or do not reduce the residual."""
+        measures.keep(self.x, lanes, self.base)
+        squares, terms, fraction = self.squares[lanes], self.terms[lanes], np.ones(lanes.size)
+        pending = np.arange(lanes.size)
+        for _ in range(MAXIMUM_HALVINGS):
+            if pending.size == 0:
+                break
+            chosen = lanes[pending]
+            measures.take(self.base, dx, chosen, fraction[pending], self.x)
+            good = self._evaluate(chosen)
+            falls = self._reduces(chosen, squares[pending], terms[pending])
+            # Close to the solution round-off keeps the residual from falling; the step's own size
+            # then decides.
+            good &= falls | (size[chosen] < 1e-5) | (not self.monotone)
+            pending = pending[~good]
+            fraction[pending] *= 0.5
+        stuck = lanes[pending]
+        outside = np.where(
+            self.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value
+        )
+        self.status[stuck] = outside
+        measures.keep(self.base, stuck, self.x)
+        self.last[lanes[fraction < 1.0]] = np.inf
+        kept = np.ones(lanes.size, dtype=bool)
+        kept[pending] = False
+        lanes = lanes[kept]
+        # A linear problem is solved by its first step.
+        done = (self.merit[lanes] < 1e-14) & (self.iterations[lanes] > 1)
+        self.status[lanes[done]] = Status.CONVERGED.value
+        return lanes[~done]
+
+
+def sensitivities(problem: Boundary, p: Array, solution: Solution) -> tuple[Solution, Array, Array]:
+    """Derivatives of converged solutions with respect to the active parameters.
+
+    Parameters
+    ----------
+    problem : Boundary
+        As solved.
+    p : ndarray, shape (L, np)
+        Constants.
+    solution : Solution
+        Of :func:`solve_periodic`.
+
+    Returns
+    -------
+    solution : Solution
+        With the status ``SINGULAR`` where the linear problem has no solution.
+    x_theta : ndarray, shape (L, n, w, na)
+        ``-G^-1 dg/dtheta`` (Verbeek 1993, eq. 4.28).
+    monodromy : ndarray, shape (L, D, D)
+        Its eigenvalues are the Floquet multipliers of the discretised time map.
+    """
+    lanes = np.flatnonzero(solution.status == Status.CONVERGED.value)
+    count, n, _ = solution.x.shape
+    d, points = len(problem.scheme.orders), problem.inputs.shape[1]
+    nz = problem.scheme.state_size + d
+    z = np.zeros((count, nz, points))
+    g, gz = np.zeros((count, d, points)), np.zeros((count, d, nz, points))
+    gp = np.zeros((count, d, problem.active, points))
+    problem.scheme.rows(solution.x, lanes, problem.step(n), z)
+    problem.equations.jacobian(z, problem.inputs, p, lanes, g, gz)
+    problem.equations.parameters(z, problem.inputs, p, lanes, gp)
+    x_theta, monodromy, ok = problem.scheme.linear(gz, gp, None, lanes, problem.step(n))
+    status = solution.status.copy()
+    status[lanes[~ok[lanes]]] = Status.SINGULAR.value
+    return replace(solution, status=status), x_theta, monodromy

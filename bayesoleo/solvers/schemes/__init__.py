@@ -1,0 +1,1 @@
+"""How a period is cut into steps, and the linear algebra of steps."""

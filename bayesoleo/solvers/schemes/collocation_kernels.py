@@ -1,0 +1,294 @@
+"""Compiled loops of one-step collocation: rows at stages, samples between nodes, elimination of a
+step's stages.
+
+Unknowns are ``x (L, n, w)``, with the highest derivatives at the stages behind the state of each
+step; steps have the lengths ``h (n,)``; ``a``, ``b`` and ``c`` are the method's weights, ``aa`` and
+``ba`` those of the second integral.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesoleo.compiled import BLOCK as POINTS
+from bayesoleo.solvers.schemes.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
+
+
+@jit
+def sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
+    """``z (L, nz, C, N)`` at positions inside steps from the unknowns ``x (L, n, w, C)``."""
+    d, s = orders.size, w0.shape[0]
+    D = orders.sum()
+    for lane in lanes:
+        for column in range(x.shape[3]):
+            now = x[lane, :, :, column]
+            row = state = 0
+            for j in range(d):
+                value, rate = z[lane, row, column], z[lane, row + 1, column]
+                last = state + orders[j] - 1
+                for i in range(index.size):
+                    value[i] = now[index[i], state]
+                    rate[i] = 0.0
+                if orders[j] == 2:
+                    top = z[lane, row + 2, column]
+                    for i in range(index.size):
+                        value[i] += h * position[i] * now[index[i], last]
+                        rate[i] = now[index[i], last]
+                        top[i] = 0.0
+                for stage in range(s):
+                    own = D + stage * d + j
+                    if orders[j] == 1:
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * w1[stage, i] * highest
+                            rate[i] += w0[stage, i] * highest
+                    else:
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * h * w2[stage, i] * highest
+                            rate[i] += h * w1[stage, i] * highest
+                            z[lane, row + 2, column, i] += w0[stage, i] * highest
+                row += orders[j] + 1
+                state += orders[j]
+
+
+@jit
+def sample_block(x, lane, block, index, position, w0, w1, w2, h, orders, needed, z):
+    """The same for one lane and one block of samples, with plans cut into blocks: ``index (blocks,
+    POINTS)`` and weights ``(blocks, s, POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are
+    ``needed``; without a view of any array, which would cost more than what it is for."""
+    d, s = orders.size, w0.shape[1]
+    D = orders.sum()
+    row = state = 0
+    for j in range(d):
+        order = orders[j]
+        last, top = state + order - 1, row + order
+        if needed[row]:
+            for i in range(POINTS):
+                z[row, i] = x[lane, index[block, i], state]
+            for stage in range(s if order == 1 else 0):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+        if order == 2 and needed[row]:
+            for i in range(POINTS):
+                z[row, i] += h * position[block, i] * x[lane, index[block, i], last]
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row, i] += h * h * w2[block, stage, i] * x[lane, index[block, i], own]
+        if order == 2 and needed[row + 1]:
+            for i in range(POINTS):
+                z[row + 1, i] = x[lane, index[block, i], last]
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row + 1, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+        if needed[top]:
+            for i in range(POINTS):
+                z[top, i] = 0.0
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[top, i] += w0[block, stage, i] * x[lane, index[block, i], own]
+        row, state = top + 1, state + order
+
+
+@jit
+def rows(x, lanes, h, a, aa, c, orders, z):
+    """``z (L, nz, n s)`` at the stages, with steps of the lengths ``h (n,)``."""
+    d, s, n = orders.size, c.size, x.shape[1]
+    D = orders.sum()
+    low, rate, once, twice = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    own = np.empty((s, n))
+    for lane in lanes:
+        row = state = 0
+        for j in range(d):
+            for m in range(n):
+                low[m] = x[lane, m, state]
+                rate[m] = x[lane, m, state + orders[j] - 1]
+            for stage in range(s):
+                for m in range(n):
+                    own[stage, m] = x[lane, m, D + stage * d + j]
+            for i in range(s):
+                _integrals(own, h, a[i], aa[i], once, twice)
+                top = z[lane, row + orders[j]]
+                for m in range(n):
+                    top[m * s + i] = own[i, m]
+                below = z[lane, row + orders[j] - 1]
+                for m in range(n):
+                    below[m * s + i] = rate[m] + once[m]
+                if orders[j] == 2:
+                    for m in range(n):
+                        z[lane, row, m * s + i] = low[m] + (h[m] * c[i] * rate[m] + twice[m])
+            row += orders[j] + 1
+            state += orders[j]
+
+
+@jit
+def _integrals(own, h, first, second, once, twice):
+    """First and second integrals over steps of stage values ``own (s, n)``."""
+    s, n = own.shape
+    once[:] = 0.0
+    twice[:] = 0.0
+    for stage in range(s):
+        for m in range(n):
+            once[m] += first[stage] * own[stage, m]
+            twice[m] += second[stage] * own[stage, m]
+    for m in range(n):
+        once[m] *= h[m]
+        twice[m] *= h[m] * h[m]
+
+
+#: Steps of the mesh whose stages are eliminated together, innermost in memory.
+BLOCK = 32
+
+
+@jit
+def linear(
+    gz, right, x, newton, jumps, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok
+):  # fmt: skip
+    """Eliminate every step's stages, close the period, and recover the stages."""
+    d, s = orders.size, b.size
+    D, n, k = orders.sum(), dx.shape[1], right.shape[2]
+    size = s * d
+    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((2, size, BLOCK))
+    stages = np.empty((size, D + k, n))
+    transfer = np.empty((D, D + k, n))
+    states = np.empty((D, k, n))
+    for lane in lanes:
+        good = True
+        for first in range(0, n, BLOCK):
+            count = min(BLOCK, n - first)
+            _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+            if not eliminate_together(work, scale, count, size):
+                _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+                good = good and eliminate_each(work, count, size)
+            for line in range(size):
+                for column in range(D + k):
+                    for t in range(count):
+                        stages[line, column, first + t] = work[line, size + column, t]
+        if good:
+            _transfer(stages, h, b, ba, orders, transfer)
+            if newton:
+                _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
+            if jumps.shape[3] == n:
+                transfer[:, D:] += jumps[lane]
+            good = close_and_sweep(transfer, monodromy[lane], states, initial)
+        ok[lane] = good
+        if good:
+            _recover(stages, states, dx[lane])
+
+
+@jit
+def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
+    """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
+    d, s = orders.size, c.size
+    D, k = orders.sum(), right.shape[1]
+    size = s * d
+    for i in range(s):
+        begin = first * s + i
+        for e in range(d):
+            line = i * d + e
+            row = state = 0
+            for j in range(d):
+                for stage in range(s):
+                    once, twice = a[i, stage], aa[i, stage]
+                    own = 1.0 if stage == i else 0.0
+                    column = stage * d + j
+                    if orders[j] == 1:
+                        for t in range(count):
+                            point = begin + t * s
+                            work[line, column, t] = (
+                                h[first + t] * once * gz[e, row, point]
+                                + own * gz[e, row + 1, point]
+                            )
+                    else:
+                        for t in range(count):
+                            point, length = begin + t * s, h[first + t]
+                            total = length * length * twice * gz[e, row, point]
+                            total += length * once * gz[e, row + 1, point]
+                            work[line, column, t] = total + own * gz[e, row + 2, point]
+                for t in range(count):
+                    work[line, size + state, t] = -gz[e, row, begin + t * s]
+                if orders[j] == 2:
+                    for t in range(count):
+                        point = begin + t * s
+                        work[line, size + state + 1, t] = -(
+                            h[first + t] * c[i] * gz[e, row, point] + gz[e, row + 1, point]
+                        )
+                row += orders[j] + 1
+                state += orders[j]
+            for column in range(k):
+                for t in range(count):
+                    work[line, size + D + column, t] = -right[e, column, begin + t * s]
+
+
+@jit
+def _transfer(stages, h, b, ba, orders, transfer):
+    """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
+    d, s, n = orders.size, b.size, transfer.shape[2]
+    transfer[:] = 0.0
+    state = 0
+    for j in range(d):
+        last = state + orders[j] - 1
+        transfer[last, last] = 1.0
+        if orders[j] == 2:
+            transfer[state, state] = 1.0
+            for m in range(n):
+                transfer[state, last, m] = h[m]
+        for stage in range(s):
+            for column in range(transfer.shape[1]):
+                for m in range(n):
+                    transfer[last, column, m] += h[m] * b[stage] * stages[stage * d + j, column, m]
+                if orders[j] == 2:
+                    for m in range(n):
+                        transfer[state, column, m] += (
+                            h[m] * h[m] * ba[stage] * stages[stage * d + j, column, m]
+                        )
+        state += orders[j]
+
+
+@jit
+def _add_jumps(x, h, b, ba, orders, initial, transfer):
+    """Add the jump from each step's end to the next node to the right-hand side (one column).
+
+    A transient's last step has no next node.
+    """
+    d, s, n = orders.size, b.size, x.shape[0]
+    D = orders.sum()
+    state = 0
+    for j in range(d):
+        last = state + orders[j] - 1
+        for m in range(n - 1 if initial else n):
+            following = m + 1 if m + 1 < n else 0
+            once = twice = 0.0
+            for stage in range(s):
+                value = x[m, D + stage * d + j]
+                once += b[stage] * value
+                twice += ba[stage] * value
+            transfer[last, D, m] += x[m, last] + h[m] * once - x[following, last]
+            if orders[j] == 2:
+                transfer[state, D, m] += (
+                    x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
+                )
+        state += orders[j]
+
+
+@jit
+def _recover(stages, states, dx):
+    """Stage unknowns from the node states: ``dx (n, w, k)``."""
+    D, k, n = states.shape
+    total = np.empty(n)
+    for column in range(k):
+        for i in range(D):
+            for m in range(n):
+                dx[m, i, column] = states[i, column, m]
+        for line in range(stages.shape[0]):
+            for m in range(n):
+                total[m] = stages[line, D + column, m]
+            for i in range(D):
+                for m in range(n):
+                    total[m] += stages[line, i, m] * states[i, column, m]
+            for m in range(n):
+                dx[m, D + line, column] = total[m]

@@ -1,0 +1,1 @@
+"""Trajectories cut into short steps, continuous at the solution only: multiple shooting."""

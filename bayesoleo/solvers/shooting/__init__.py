@@ -1,0 +1,1 @@
+"""Periodic solutions by integrating from a start and closing the period."""

@@ -1,0 +1,1 @@
+"""Solutions from given states through a time."""

@@ -1,0 +1,305 @@
+"""Transient solutions: from given states through a time, for many parameter vectors at once.
+
+A library's integrator chooses the steps, once, where the error asks for them
+(:mod:`~bayesoleo.solvers.transient.integrate`); collocation on those steps then gives every further
+solution.
+On a frozen mesh a solution is a smooth function of its own parameters, with sensitivities exact to
+round-off and the same bits whatever the batch; an integrator that chose its steps anew for each
+vector would be none of that. The default scheme is the integrator's own method, so that the error
+it controlled is the error that is made.
+
+Lanes (parameter vectors) never see each other, as in :mod:`bayesoleo.solvers.periodic.solve`.
+
+References
+----------
+Verbeek (1993), section 4.2, eqs. 4.10-4.11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.periodic import measures
+from bayesoleo.solvers.periodic.solve import Boundary, Solution
+from bayesoleo.solvers.schemes.collocation import Collocation
+from bayesoleo.solvers.schemes.mesh import Mesh
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+Lanes = NDArray[np.int64]
+
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14.
+LAST_STEP = 1e-7
+#: Without quadratic contraction (at a kink) a step this small is taken as converged.
+SMALL_STEP = 1e-11
+#: Newton iterations on the whole time at once, before it is walked through piece by piece.
+MAXIMUM_ITERATIONS = 12
+MAXIMUM_HALVINGS = 8
+
+
+def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
+    """Solve the collocation equations from given first states.
+
+    Newton's method on all steps at once; a lane that does not converge so is walked through in
+    pieces, from the first step on: an initial value problem always can be.
+
+    Parameters
+    ----------
+    problem : Boundary
+        Equations, a collocation scheme with its mesh, inputs; its period is the duration.
+    p : ndarray, shape (L, np)
+        Constants of each lane.
+    start : ndarray, shape (L, n, w)
+        Where each lane starts. The state of its first step is the initial state, and stays.
+
+    Returns
+    -------
+    Solution
+    """
+    solution = newton(problem, p, start)
+    failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
+    if failed.size == 0:
+        return solution
+    x, status, iterations = solution.x, solution.status.copy(), solution.iterations.copy()
+    for lane in failed:
+        one = slice(lane, lane + 1)
+        x[one], status[lane], more = _walk(problem, p[one], start[one].copy())
+        iterations[lane] += more
+    return Solution(x, status, iterations)
+
+
+def newton(
+    problem: Boundary, p: Array, start: Array, max_iterations: int = MAXIMUM_ITERATIONS
+) -> Solution:
+    """Newton's method on all steps at once, halved where a step leaves the admissible region.
+
+    Parameters are those of :func:`solve_transient`.
+    """
+    state = _State(problem, p, start.copy())
+    lanes = state.keep(np.arange(start.shape[0]), state.evaluate(np.arange(start.shape[0])))
+    last = np.full(start.shape[0], np.inf)
+    for _ in range(max_iterations):
+        if lanes.size == 0:
+            break
+        state.iterations[lanes] += 1
+        dx, size = state.direction(lanes)
+        lanes = state.keep(lanes, np.isfinite(size[lanes]), Status.SINGULAR)
+        small = (size < LAST_STEP) & (size < 0.1 * last) | (size < SMALL_STEP)
+        last[lanes] = size[lanes]
+        lanes = state.finish(lanes, small, dx)
+        lanes = state.advance(lanes, dx)
+    return Solution(state.x, state.status, state.iterations)
+
+
+class _State:
+    """Unknowns, equations and statuses of one batched iteration."""
+
+    def __init__(self, problem: Boundary, p: Array, x: Array):
+        self.problem, self.p, self.x = problem, p, x
+        count, n, _ = x.shape
+        scheme = problem.scheme
+        d, points = len(scheme.orders), problem.inputs.shape[1]
+        nz = scheme.state_size + d
+        self.step, self.base = problem.step(n), np.empty_like(x)
+        self.z, self.g = np.empty((count, nz, points)), np.empty((count, d, points))
+        self.gz = np.empty((count, d, nz, points))
+        self.a = np.empty((count, problem.conditions, points))
+        self.inside = np.ones(count, dtype=np.bool_)
+        self.defined = np.ones(count, dtype=np.bool_)
+        self.squares, self.terms = np.empty((count, d)), np.empty((count, d))
+        self.status = np.full(count, Status.NO_CONVERGENCE.value, dtype=np.int64)
+        self.iterations = np.zeros(count, dtype=np.int64)
+
+    def evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
+        """Equations at the present unknowns; true where they are finite and admissible, (L,)."""
+        equations, u = self.problem.equations, self.problem.inputs
+        self.problem.scheme.rows(self.x, lanes, self.step, self.z)
+        with np.errstate(all="ignore"):
+            equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
+            if self.problem.conditions:
+                equations.admissible(self.z, u, self.p, lanes, self.a)
+        measures.positive(self.a, lanes, self.inside, self.defined)
+        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
+        finite = self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
+        return self.inside[lanes] & finite
+
+    def keep(self, lanes: Lanes, good: NDArray[np.bool_], reason: Status | None = None) -> Lanes:
+        """Give up the lanes that are not good, for a reason or for what the evaluation found."""
+        bad = lanes[~good]
+        outside = np.where(self.inside[bad], Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
+        self.status[bad] = outside if reason is None else reason.value
+        return lanes[good]
+
+    def direction(self, lanes: Lanes) -> tuple[Array, Array]:
+        """Newton's step, and its size over the states' by lane, (L,); infinite where singular."""
+        dx, _, ok = self.problem.scheme.linear(
+            self.gz, self.g[:, :, None], self.x, lanes, self.step, initial=True
+        )
+        size = np.full(self.x.shape[0], np.inf)
+        measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
+        size[~ok] = np.inf
+        return dx, size
+
+    def finish(self, lanes: Lanes, small: NDArray[np.bool_], dx: Array) -> Lanes:
+        """Take the last step where it is so small that what it leaves is round-off."""
+        finished = lanes[small[lanes]]
+        measures.keep(self.x, finished, self.base)
+        measures.take(self.base, dx, finished, np.ones(finished.size), self.x)
+        self.status[finished] = Status.CONVERGED.value
+        return lanes[~small[lanes]]
+
+    def advance(self, lanes: Lanes, dx: Array) -> Lanes:
+        """Take the steps, halved until they can be evaluated."""
+        measures.keep(self.x, lanes, self.base)
+        pending, fraction = lanes, np.ones(lanes.size)
+        for _ in range(MAXIMUM_HALVINGS):
+            if pending.size == 0:
+                break
+            measures.take(self.base, dx, pending, fraction, self.x)
+            bad = ~self.evaluate(pending)
+            pending, fraction = pending[bad], 0.5 * fraction[bad]
+        return self.keep(lanes, ~np.isin(lanes, pending))
+
+
+def _walk(problem: Boundary, p: Array, x: Array) -> tuple[Array, int, int]:
+    """Solve one lane piece by piece; pieces that fail are halved, down to one step."""
+    n, first, size, iterations = x.shape[1], 0, max(x.shape[1] // 8, 1), 0
+    while first < n:
+        last = min(first + size, n)
+        piece = _piece(problem, first, last)
+        trial = x[:, first:last].copy()
+        found = newton(piece, p, trial, 40)
+        if found.status[0] != Status.CONVERGED.value:
+            found = newton(piece, p, _constant(trial, problem.scheme.state_size), 40)
+        iterations += int(found.iterations[0])
+        if found.status[0] != Status.CONVERGED.value:
+            if size == 1:
+                return x, int(found.status[0]), iterations
+            size = max(size // 4, 1)
+            continue
+        x[:, first:last] = found.x
+        if last < n:
+            x[:, last, : problem.scheme.state_size] = end_state(piece, found.x)
+        first, size = last, 2 * size
+    return x, Status.CONVERGED.value, iterations
+
+
+def _constant(x: Array, state_size: int) -> Array:
+    """A start that stays where it begins: of no use but for being close in short pieces."""
+    still = np.zeros_like(x)
+    still[:, :, :state_size] = x[:, :1, :state_size]
+    return still
+
+
+def _piece(problem: Boundary, first: int, last: int) -> Boundary:
+    """The same equations over some of the steps."""
+    scheme = problem.scheme
+    assert isinstance(scheme, Collocation)
+    assert scheme.mesh is not None
+    edges, stages = scheme.mesh.edges[first : last + 1], scheme.method.stages
+    length = edges[-1] - edges[0]
+    inner = (edges - edges[0]) / length
+    inner[-1] = 1.0
+    return replace(
+        problem,
+        scheme=replace(scheme, mesh=Mesh(inner)),
+        period=problem.period * float(length),
+        inputs=np.ascontiguousarray(problem.inputs[:, first * stages : last * stages]),
+    )
+
+
+def end_state(problem: Boundary, x: Array) -> Array:
+    """States at the end of the time, shape (L, D), from unknowns ``(L, n, w)``."""
+    scheme, n = problem.scheme, x.shape[1]
+    assert isinstance(scheme, Collocation)
+    rows = scheme.sample(x[..., None], scheme.plan(np.ones(1), n, initial=True), problem.step(n))
+    return rows[:, state_rows(scheme.orders), 0, 0]
+
+
+def state_rows(orders: tuple[int, ...]) -> NDArray[np.int64]:
+    """Rows of values and derivatives that are the state, shape (D,)."""
+    first = np.cumsum([0, *(order + 1 for order in orders)])
+    rows = [first[j] + k for j, order in enumerate(orders) for k in range(order)]
+    return np.array(rows, dtype=np.int64)
+
+
+def transient_sensitivities(
+    problem: Boundary, p: Array, solution: Solution, start_p: Array
+) -> tuple[Solution, Array, Array]:
+    """Derivatives of converged transients with respect to the active parameters.
+
+    Parameters
+    ----------
+    problem : Boundary
+        As solved.
+    p : ndarray, shape (L, np)
+        Constants.
+    solution : Solution
+        Of :func:`solve_transient`.
+    start_p : ndarray, shape (L, D, na)
+        Derivatives of the initial states.
+
+    Returns
+    -------
+    solution : Solution
+        With the status ``SINGULAR`` where the linear problem has no solution.
+    x_theta : ndarray, shape (L, n, w, na)
+        The discretised ``ds_theta/dt = h_s s_theta + h_theta`` from ``ds(0)/dtheta``
+        (Verbeek 1993, eqs. 4.10-4.11).
+    transition : ndarray, shape (L, D, D)
+        Derivatives of the last state by the first.
+    """
+    lanes = np.flatnonzero(solution.status == Status.CONVERGED.value)
+    count, n, _ = solution.x.shape
+    scheme, step = problem.scheme, problem.step(n)
+    d, points = len(scheme.orders), problem.inputs.shape[1]
+    nz = scheme.state_size + d
+    z = np.zeros((count, nz, points))
+    g, gz = np.zeros((count, d, points)), np.zeros((count, d, nz, points))
+    right = np.zeros((count, d, problem.active, points))
+    scheme.rows(solution.x, lanes, step, z)
+    problem.equations.jacobian(z, problem.inputs, p, lanes, g, gz)
+    problem.equations.parameters(z, problem.inputs, p, lanes, right)
+    # A motion that carries the initial derivative on without a force is known; what is left to
+    # solve for starts at zero.
+    base = _free_motion(problem, n, start_p)
+    rows = _free_rows(problem, n, start_p)
+    for k in range(nz):
+        right += gz[:, :, k, None, :] * rows[:, None, k]
+    x_theta, transition, ok = scheme.linear(gz, right, None, lanes, step, initial=True)
+    status = solution.status.copy()
+    status[lanes[~ok[lanes]]] = Status.SINGULAR.value
+    return replace(solution, status=status), x_theta + base, transition
+
+
+def _free_motion(problem: Boundary, n: int, start_p: Array) -> Array:
+    """Unknowns ``(L, n, w, na)`` of a motion whose highest derivatives are zero."""
+    scheme = problem.scheme
+    assert isinstance(scheme, Collocation)
+    rows = _carried(scheme.orders, problem.period * scheme.nodes(n), start_p)
+    x = np.zeros((start_p.shape[0], n, scheme.width, start_p.shape[2]))
+    x[:, :, : scheme.state_size] = np.moveaxis(rows[:, state_rows(scheme.orders)], 3, 1)
+    return x
+
+
+def _free_rows(problem: Boundary, n: int, start_p: Array) -> Array:
+    """Values and derivatives ``(L, nz, na, N)`` of that motion at the points."""
+    return _carried(problem.scheme.orders, problem.period * problem.scheme.phases(n), start_p)
+
+
+def _carried(orders: tuple[int, ...], time: Array, start_p: Array) -> Array:
+    rows, state = [], 0
+    for order in orders:
+        value = np.repeat(start_p[:, state, :, None], time.size, axis=2)
+        if order == 2:
+            rate = np.repeat(start_p[:, state + 1, :, None], time.size, axis=2)
+            rows += [value + rate * time, rate]
+        else:
+            rows.append(value)
+        rows.append(np.zeros_like(value))
+        state += order
+    return np.stack(rows, axis=1)
