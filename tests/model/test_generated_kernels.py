@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 
 from bayesoleo.compiled import cache_folder
 from bayesoleo.model import Condition, Model, Output, Parameter
+from bayesoleo.model.derive import derive
 from bayesoleo.model.expressions import FUNCTIONS, symbol
-from bayesoleo.model.kernels import kernels
+from bayesoleo.model.kernels import _counts, _results, kernels
+from bayesoleo.systems import system
 from bayesoleo.systems.oleo import thermomechanical_oleo
 
 NAMES = ("x", "w", "a", "b")
@@ -225,3 +227,9 @@ def test_conditions_and_states_take_their_declared_places():
     ]
     assert derived.constants == (*model.parameters, *model.conditions)
     assert isinstance(model.conditions["initial_pressure"], Condition)
+
+
+@pytest.mark.parametrize("name", ["f16n2d2", "viscous_damper", "duffing"])
+def test_kernels_fill_as_many_rows_as_they_say(name):
+    derived = derive(system(name))
+    assert {key: len(make()) for key, make in _results(derived).items()} == _counts(derived)
