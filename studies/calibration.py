@@ -98,7 +98,8 @@ def coverage(number: int, seed: int) -> Arrays:
     problem.freeze(theta)
     low, high, reached = [], [], []
     for word in COVERAGE_MODELS:
-        samples = _posterior(LogDensity(problem, 1, errors=word), theta, seed, number)
+        # Ends of intervals need fewer draws than ranks.
+        samples = _posterior(LogDensity(problem, 1, errors=word), theta, seed, number, 200)
         ends = np.quantile(samples.theta.reshape(-1, theta.size), TAILS, axis=0)
         low.append(ends[0])
         high.append(ends[1])
@@ -132,10 +133,10 @@ def _drawn(rng: np.random.Generator, simulator: campaign.Simulator):
             return theta, outputs
 
 
-def _posterior(density: LogDensity, theta, seed: int, number: int) -> Samples:
+def _posterior(density: LogDensity, theta, seed: int, number: int, size: int = 400) -> Samples:
     """Started at the truth, which no draw that is kept remembers."""
     mixture = laplace_mixture(density, theta[None])
-    return draw(density, mixture, effective_size=400, seed=seed + number, progress=False)
+    return draw(density, mixture, effective_size=size, seed=seed + number, progress=False)
 
 
 class Task:

@@ -145,16 +145,16 @@ def mode_group(density: LogDensity, mode: Mode, word: str) -> xr.Dataset:
     names = density.names
     first = len(density.problem.names)
     natural = density.natural(mode.centre[None])[0]
-    sd = np.sqrt(np.diag(mode.covariance))
-    # By differences of one standard deviation either way: exact where a quantity is a coordinate.
-    steps = np.diag(sd)
-    ends = density.natural(np.concatenate([mode.centre + steps, mode.centre - steps]))
-    own = np.arange(len(names))
-    half = 0.5 * np.abs(ends[own, own] - ends[len(names) + own, own])
+    # By differences of a hundredth of a standard deviation: a quantity may follow from several
+    # coordinates.
+    steps = 0.01 * np.diag(np.sqrt(np.diag(mode.covariance)))
+    ahead, behind = (density.natural(mode.centre + sign * steps) for sign in (1, -1))
+    slope = (ahead - behind) / (2 * np.diag(steps)[:, None])
+    sd = np.sqrt(np.diag(slope.T @ mode.covariance @ slope))
     return xr.Dataset(
         {
             schema.ESTIMATE: (schema.QUANTITY, natural[first:], _about("posterior mode")),
-            schema.SD: (schema.QUANTITY, half[first:], _about("standard deviation at the mode")),
+            schema.SD: (schema.QUANTITY, sd[first:], _about("standard deviation at the mode")),
         },
         coords={schema.QUANTITY: list(names[first:])},
         attrs={"word": word},
