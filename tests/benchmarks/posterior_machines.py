@@ -17,7 +17,7 @@ from bayesoleo.estimation.uncertainty.sampling_distribution import _Blocks, _Wor
 from bayesoleo.machines import connected, each_done
 
 #: Replications of the campaign of 14 runs, one a task.
-TASKS = 96
+TASKS = 48
 REPLICATIONS, BLOCK = 1000, 10
 
 
