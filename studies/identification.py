@@ -239,6 +239,7 @@ def run(campaign: Campaign) -> dict[str, Any]:
     return asdict(campaign) | {
         "added": [f"{item.effect} at {item.target}" for item in accepted],
         "same": list(accepted[0].same) if accepted else [],
+        "reason": loop.rounds[-1].reason,
         "verdict": loop.verdict,
         "place": own[0] + 1 if own else None,
         "p_value": ranking[own[0]].p_value if own else None,
