@@ -22,6 +22,7 @@ from pathlib import Path
 
 import calibration_oleo as campaign
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesoleo.estimation import FunctionProblem
@@ -99,7 +100,7 @@ def coverage(number: int, seed: int) -> Arrays:
     low, high, reached = [], [], []
     for word in COVERAGE_MODELS:
         # Ends of intervals need fewer draws than ranks.
-        samples = _posterior(LogDensity(problem, 1, errors=word), theta, seed, number, 200)
+        samples = _posterior(LogDensity(problem, 1, errors=word), theta, seed, number, quick=True)
         ends = np.quantile(samples.theta.reshape(-1, theta.size), TAILS, axis=0)
         low.append(ends[0])
         high.append(ends[1])
@@ -133,10 +134,14 @@ def _drawn(rng: np.random.Generator, simulator: campaign.Simulator):
             return theta, outputs
 
 
-def _posterior(density: LogDensity, theta, seed: int, number: int, size: int = 400) -> Samples:
+def _posterior(
+    density: LogDensity, theta, seed: int, number: int, *, quick: bool = False
+) -> Samples:
     """Started at the truth, which no draw that is kept remembers."""
     mixture = laplace_mixture(density, theta[None])
-    return draw(density, mixture, effective_size=size, seed=seed + number, progress=False)
+    return draw(
+        density, mixture, effective_size=400, seed=seed + number, quick=quick, progress=False
+    )
 
 
 class Task:
@@ -205,6 +210,73 @@ def coverage_table(found: list[Arrays]) -> dict[str, object]:
             "reached": int(sum(bool(item["reached"][k]) for item in found)),
         }
     return table
+
+
+def stored(study: str) -> dict | None:
+    """The table of the last run; None if there is none."""
+    path = STORED / f"calibration-{study}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def ranks_figure(study: str) -> Figure | None:
+    """Distribution functions of the ranks, less the uniform one, with their band."""
+    table = stored(study)
+    if table is None:
+        return None
+    columns = min(len(table["names"]), 3)
+    rows = -(-len(table["names"]) // columns)
+    figure = Figure(figsize=(9, 0.4 + 1.9 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for axes, name, ranks in zip(panels, table["names"], table["ranks"], strict=False):
+        test = uniformity(ranks)
+        axes.fill_between(test.places, test.low, test.high, color="0.88", lw=0)
+        axes.plot(test.places, test.difference, color="#0072b2", lw=1.4)
+        axes.set_title(f"{name}, p = {test.p_value:.2g}", fontsize=9)
+        axes.axhline(0, color="0.6", lw=0.6)
+    for axes in panels[len(table["names"]) :]:
+        axes.set_axis_off()
+    figure.supxlabel("rank of the truth", fontsize=9)
+    figure.supylabel("part of the ranks − uniform", fontsize=9)
+    return figure
+
+
+def print_coverage() -> None:
+    """Coverage of 90 % intervals and their widths, by error model and parameter."""
+    table = stored("coverage")
+    if table is None:
+        return
+    print(f"{'':22}" + "".join(f"{word:>16}" for word in COVERAGE_MODELS))
+    for a, name in enumerate(table["names"]):
+        cells = [
+            f"{table[word]['each'][a]:8.0%} {table[word]['median_width_over_prior_sd'][a]:6.2g}"
+            for word in COVERAGE_MODELS
+        ]
+        print(f"{name:22}" + "".join(f"{cell:>16}" for cell in cells))
+    pooled = [table[word]["pooled"] for word in COVERAGE_MODELS]
+    print(f"{'pooled':22}" + "".join(f"{value:8.1%}        " for value in pooled))
+    print("Each: coverage, and the median width over the prior's standard deviation.")
+
+
+def coverage_figure() -> Figure | None:
+    """Coverage by parameter and by effect."""
+    table = stored("coverage")
+    if table is None:
+        return None
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True)
+    rows = ((table["names"], "each"), (table["effects"], "by_effect"))
+    colours = ("#d55e00", "#e69f00", "#0072b2")
+    for axes, (names, key) in zip(panels, rows, strict=True):
+        for k, (word, colour) in enumerate(zip(COVERAGE_MODELS, colours, strict=True)):
+            place = np.arange(len(names)) + 0.22 * (k - 1)
+            axes.plot(table[word][key], place, "o", color=colour, label=word)
+        axes.axvline(0.9, color="0.6", lw=0.8)
+        axes.set_yticks(range(len(names)), [n.replace("_", " ") for n in names], fontsize=8)
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.set_xlabel("coverage of 90 % intervals", fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].legend(frameon=False, fontsize=8)
+    return figure
 
 
 def main() -> None:

@@ -67,7 +67,7 @@ def pairs(tree: xr.DataTree) -> Figure:
         style.line(style.BEFORE, "second order", 1.0, "--"),
         style.line(style.INK, "normal, of the draws", 1.0, ":"),
     ]
-    style.legend(figure, handles)
+    style.legend(figure, handles, "in brackets: of a normal posterior")
     return figure
 
 

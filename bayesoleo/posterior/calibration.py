@@ -15,6 +15,7 @@ multiple sample comparison", *Statistics and Computing* 32, section 2 (the band)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,15 +97,32 @@ def uniformity(
     """
     ranks = np.asarray(ranks, dtype=np.int64)
     count, places = ranks.size, np.arange(1, draws + 1) / (draws + 1)
-    least = _least_p(_counts(ranks[None], draws), count, places)[0]
-    rng = np.random.default_rng(seed)
-    simulated = rng.integers(0, draws + 1, (_SETS, count))
-    reference = np.sort(_least_p(_counts(simulated, draws), count, places))
+    counts = _counts(ranks[None], draws)
+    least = _least_p(counts, _two_sided(count, draws))[0]
+    reference = _reference(count, draws, seed)
     gamma = float(np.quantile(reference, 1 - level))
     low, high = (stats.binom.ppf(p, count, places) / count for p in (gamma / 2, 1 - gamma / 2))
-    found = _counts(ranks[None], draws)[0] / count
     p_value = float((np.searchsorted(reference, least, side="right") + 1) / (_SETS + 1))
+    found = counts[0] / count
     return Uniformity(places, found - places, low - places, high - places, p_value, level)
+
+
+@lru_cache(maxsize=16)
+def _two_sided(count: int, draws: int) -> Array:
+    """Binomial probabilities of so many ranks or further off, shape (count + 1, draws)."""
+    places = np.arange(1, draws + 1) / (draws + 1)
+    number = np.arange(count + 1)[:, None]
+    below = stats.binom.cdf(number, count, places)
+    above = stats.binom.sf(number - 1, count, places)
+    return np.asarray(np.minimum(2 * np.minimum(below, above), 1.0))
+
+
+@lru_cache(maxsize=16)
+def _reference(count: int, draws: int, seed: int) -> Array:
+    """Smallest probabilities of simulated sets of uniform ranks, ascending."""
+    rng = np.random.default_rng(seed)
+    sets = rng.integers(0, draws + 1, (_SETS, count))
+    return np.sort(_least_p(_counts(sets, draws), _two_sided(count, draws)))
 
 
 def _counts(ranks: NDArray[np.int64], draws: int) -> NDArray[np.int64]:
@@ -114,8 +132,6 @@ def _counts(ranks: NDArray[np.int64], draws: int) -> NDArray[np.int64]:
     return np.cumsum(table, axis=1)[:, :-1]
 
 
-def _least_p(counts: NDArray[np.int64], size: int, places: Array) -> Array:
-    """Smallest two-sided binomial probability over the places, shape (S,)."""
-    below = stats.binom.cdf(counts, size, places)
-    above = stats.binom.sf(counts - 1, size, places)
-    return np.asarray(np.minimum(2 * np.minimum(below, above), 1.0).min(axis=1))
+def _least_p(counts: NDArray[np.int64], table: Array) -> Array:
+    """Smallest probability over the places, shape (S,), of counts (S, draws)."""
+    return np.asarray(table[counts, np.arange(counts.shape[1])].min(axis=1))

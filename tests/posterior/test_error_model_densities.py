@@ -110,12 +110,12 @@ def test_sums_give_products_of_normals(word):
 
 def test_a_settled_filter_is_the_filter_itself():
     # Equal steps, so that the gain is frozen on the way; long enough to matter.
-    time = np.arange(400) * 0.01
-    campaign = Campaign(outputs=("force",), runs=("a",), lengths=(400,))
+    time = np.arange(200) * 0.01
+    campaign = Campaign(outputs=("force",), runs=("a",), lengths=(200,))
     campaign.__class__ = type("Equal", (Campaign,), {"samples": (RunSamples(time, 1.0),)})
     model = error_model("correlated", campaign)
     eta = np.array([[0.3, 1.0, np.log(0.05)], [0.3, 7.0, np.log(0.5)], [0.3, -7.0, 0.0]])
-    residual = np.random.default_rng(0).normal(size=(3, 1, 400))
+    residual = np.random.default_rng(0).normal(size=(3, 1, 200))
     found = model.of_run(0, residual, eta)
     for lane in range(3):
         log_v, share, tau = model.natural(eta[lane : lane + 1])[0]

@@ -1,0 +1,54 @@
+"""
+Do intervals cover?
+===================
+
+A 90 % interval should hold the truth in nine experiments of ten. Whether sampler and density are
+right can be tested: draw the truth from the prior, simulate, sample the posterior, and rank the
+truth among its draws. Over many replications the ranks are uniform (simulation-based calibration,
+Talts et al. 2018). Whether the *model* is right cannot be tested so, and where an effect is missing
+intervals promise too much: the second half of this page counts how much.
+"""
+
+# %%
+# Replications take long; the tables are those of the commands that they name.
+
+import calibration
+
+for name in calibration.STUDIES:
+    stored = calibration.stored(name)
+    print(f"{name:9}", stored["command"] if stored else "not run yet", sep="  ")
+
+# %%
+# Ranks
+# -----
+#
+# The part of the ranks up to a place, less that of a uniform variable. A curve that stays inside
+# its band is what chance makes of a right posterior; one that leans has a bias, one that is bent
+# twice has the wrong width. First the gas spring: its exponent and the logarithm of its variance.
+
+figure = calibration.ranks_figure("spring")
+
+# %%
+# The same of seven parameters and two variances of an oleo, four runs of a shaker campaign.
+
+figure = calibration.ranks_figure("oleo")
+
+# %%
+# An effect that nobody declared
+# ------------------------------
+#
+# Parameters, the effect and its size are drawn anew in each replication: direction-dependent
+# damping, a linear stiffness, Stribeck friction or a wall that stores heat, one as likely as
+# another, of a size of half to four times the noise (rms of what it changes, in the output that
+# shows it most; uniform in the logarithm). Parameters that mean something else beside the effect
+# are left out: the heat conduction of a wall that stores heat, base and slope of a friction with a
+# Stribeck peak. The posterior knows nothing of the effect.
+
+calibration.print_coverage()
+
+# %%
+# Errors assumed independent count each sample as news. The others know that a residual which stays
+# off is one error and not a hundred; what the parameters have taken over is not in the residual,
+# and no error model sees it. So it pays to look for the effect first.
+
+figure = calibration.coverage_figure()
