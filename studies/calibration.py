@@ -35,7 +35,7 @@ from bayesoleo.posterior.calibration import rank_of, uniformity
 from bayesoleo.storage.slots import Slots
 
 Arrays = dict[str, NDArray]
-STORED = Path(__file__).resolve().parent / "figures"
+STORED = Path(__file__).resolve().parent / "tables"
 #: Ninety-per-cent intervals.
 TAILS = (0.05, 0.95)
 COVERAGE_MODELS = ("independent", "correlated", "discrepancy")
