@@ -33,6 +33,8 @@ STILL = 1e-9
 #: How far outside the unit circle a multiplier must lie to count: an undamped motion's lie on it
 #: but for the errors of the mesh.
 MARGIN = 1e-6
+#: Errors of eigenvalues over the largest one: rounding of a product of a period's steps.
+ROUNDING = 1e-13
 #: Real multipliers below this are called close to a doubling of the period.
 NEAR = -0.9
 
@@ -77,9 +79,15 @@ def compared(n: int) -> NDArray[np.int64]:
 
 
 def count_unstable(multipliers: Complex) -> NDArray[np.int64]:
-    """Number of multipliers ``(..., D)`` outside the unit circle, -1 where they are not known."""
+    """Number of multipliers ``(..., D)`` outside the unit circle, -1 where they are not known.
+
+    Beside a huge one the others are known to its rounding only; what is not known to lie outside
+    is not counted.
+    """
     known = np.isfinite(multipliers).all(axis=-1) & (multipliers.shape[-1] > 0)
-    return np.where(known, np.sum(np.abs(multipliers) > 1.0 + MARGIN, axis=-1), -1)
+    sizes = np.where(known[..., None], np.abs(multipliers), 0.0)
+    margin = MARGIN + ROUNDING * sizes.max(axis=-1, keepdims=True, initial=0.0)
+    return np.where(known, np.sum(sizes > 1.0 + margin, axis=-1), -1)
 
 
 def unstable_of(monodromy: Array) -> NDArray[np.int64]:

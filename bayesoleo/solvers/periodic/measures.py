@@ -61,22 +61,40 @@ def positive(a, lanes, inside, defined):
         defined[lane] = odd == 0
 
 
+#: Motion about a level that is smaller than this part of it is measured by the level: the digits of
+#: a step are lost against it.
+LEAST_MOTION = 1e-6
+
+
 @jit
-def step_size(x, dx, lanes, state_size, size):
-    """Largest change of a state over its largest value, shape (L,); NaN where one is not finite."""
+def unit(motion, level, change):
+    """What a change of a state is small against: its motion about a level, not the level itself.
+
+    A preload or an ambient temperature says nothing of how far a solution is from its own motion.
+    The change itself bounds it: there is no step longer than the motion that it makes.
+    """
+    return max(motion, LEAST_MOTION * abs(level), change)
+
+
+@jit
+def step_size(x, dx, lanes, state_size, size, least):
+    """Largest change of a state over its :func:`unit`, and over its largest value, both of shape
+    (L,); NaN where one is not finite."""
     n, w = x.shape[1:]
     for lane in lanes:
         spoilt = 0.0
         for m in range(n):
             for j in range(w):
                 spoilt += dx[lane, m, j, 0] * 0.0
-        size[lane] = spoilt
+        size[lane] = least[lane] = spoilt
         for j in range(min(state_size, w)):
-            largest, change = 1e-300, 0.0
+            level, motion, change = x[lane, 0, j], 0.0, 0.0
             for m in range(n):
-                largest = max(largest, abs(x[lane, m, j]))
+                motion = max(motion, abs(x[lane, m, j] - level))
                 change = max(change, abs(dx[lane, m, j, 0]))
-            size[lane] = max(size[lane], change / largest) if spoilt == 0.0 else np.nan
+            if spoilt == 0.0 and change > 0.0:
+                size[lane] = max(size[lane], change / unit(motion, level, change))
+                least[lane] = max(least[lane], change / max(motion + abs(level), change))
 
 
 @jit

@@ -18,7 +18,7 @@ from numba import carray
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BLOCK, call_kernel, caller, pointer
-from bayesoleo.solvers.periodic.measures import total
+from bayesoleo.solvers.periodic.measures import total, unit
 from bayesoleo.solvers.schemes.sweep import LARGEST_GROWTH, ROUND_OFF, eliminate, jit
 from bayesoleo.solvers.schemes.unrolled import REACH, SIGNATURES, WIDTH, Program, chunks
 from bayesoleo.solvers.status import Status
@@ -43,6 +43,8 @@ LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
+#: Relative step from which on steps can be taken for those of a contraction.
+CHORD_FROM = 0.1
 #: Steps with old derivatives, half as expensive, before there are new ones.
 MOST_CHORDS = 2
 #: Contraction that is none.
@@ -182,7 +184,7 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
         z=np.zeros((sizes.nz, BLOCK)),
         out=np.zeros((rows, BLOCK)),
         sums=np.zeros((2 * d, BLOCK)),
-        scratch=np.zeros(1),
+        scratch=np.zeros(BLOCK),
         transfer=np.zeros((blocks, sizes.transfer * sizes.block)),
         history=history,
         start=np.zeros((D, WIDTH)),
@@ -229,13 +231,13 @@ def _iterate(pieces, sizes, sweep, work, options):
         outcome = _step(pieces, sizes, sweep, work, options.initial)
         if outcome != CONVERGED:
             return outcome, iteration
-        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
         if not size < np.inf:
             return SINGULAR, iteration
-        if size < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
+        if least < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
             _take(work.now, work.dx, 1.0, work.now)
             return CONVERGED, iteration
-        if chords and last < np.inf and _chord_suffices(size, last):
+        if chords and last < CHORD_FROM and _chord_suffices(size, last):
             _keep(work.now, work.base)
             steps, last = _chords(pieces, sizes, sweep, work, options, size)
             iteration += steps
@@ -268,12 +270,12 @@ def _chords(pieces, sizes, sweep, work, options, size):
             return count, np.inf
         _start(sizes, sweep, work, options.initial)
         _update(pieces.update, sizes, sweep, work)
-        size = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
         if not size < SLOW_CHORD * last:
             return count, np.inf
         # What is left is a geometric series, twice as steep as seen where the first of the two
         # steps was one of Newton's.
-        if size < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
+        if least < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
             _take(work.now, work.dx, 1.0, work.now)
             return count, 0.0
         last = size
@@ -540,45 +542,58 @@ def _update(update, sizes, sweep, work):
 
 @jit
 def _size(x, dx, begin, measured, scratch):
-    """Largest change of a state over its largest value; not finite where one is not."""
-    size = 0.0
+    """Largest change of a state, over what :func:`unit` says; not finite where one is not.
+
+    Also over its largest value, which digits are lost against.
+    """
+    size = least = 0.0
     for k in range(x.shape[0]):
-        change = _largest(dx[k, begin:], scratch)
+        change = _largest(dx[k, begin:], 0.0, scratch)
         if not change < np.inf:
-            return np.inf
-        if k < measured:
-            size = max(size, change / max(_largest(x[k, begin:], scratch), 1e-300))
-    return size
+            return np.inf, np.inf
+        if k < measured and change > 0.0:
+            level = x[k, begin]
+            motion = _largest(x[k, begin:], level, scratch)
+            size = max(size, change / unit(motion, level, change))
+            least = max(least, change / max(motion + abs(level), change))
+    return size, least
 
 
 @jit
-def _largest(values, scratch):
-    """Largest magnitude, not a number where one is not.
+def _largest(values, level, scratch):
+    """Largest distance from a level, not a number where one is not.
 
     Without their sign, floating-point numbers are ordered as the integers with their bits, and what
     is not finite comes last: integers, which have no exceptions, are compared in vectors.
     """
-    bits, largest = values.view(np.int64), np.int64(0)
-    for i in range(bits.size):
-        magnitude = bits[i] & WITHOUT_SIGN
-        largest = magnitude if magnitude > largest else largest
-    scratch.view(np.int64)[0] = largest
+    bits, largest = scratch.view(np.int64), np.int64(0)
+    for first in range(0, values.size, BLOCK):
+        part = values[first:]
+        count = min(part.size, BLOCK)
+        for i in range(count):
+            scratch[i] = part[i] - level
+        for i in range(count):
+            magnitude = bits[i] & WITHOUT_SIGN
+            largest = magnitude if magnitude > largest else largest
+    bits[0] = largest
     return scratch[0]
 
 
 @jit
 def _reduces(before, after, d):
-    """Whether the residual fell, in units of the equations' terms, and its size in them.
+    """Whether the residual fell, in units of the equations' terms, and its size in its own.
 
-    The larger of the terms before and after: terms before alone would be nothing for an equation
-    that a start at rest fulfils, and forbid to leave it.
+    It falls in the larger of the terms before and after: terms before alone would be nothing for an
+    equation that a start at rest fulfils, and forbid to leave it. It is small against its own terms
+    only: an iteration that comes back from far away has a small residual against those it left.
     """
-    old = new = 0.0
+    old = new = left = 0.0
     for e in range(d):
-        unit = max(before[d + e], after[d + e]) + 1e-300
-        old += before[e] / unit
-        new += after[e] / unit
-    return np.sqrt(new) < np.sqrt(old), np.sqrt(new)
+        larger = max(before[d + e], after[d + e]) + 1e-300
+        old += before[e] / larger
+        new += after[e] / larger
+        left += after[e] / (after[d + e] + 1e-300)
+    return np.sqrt(new) < np.sqrt(old), np.sqrt(left)
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,7 @@ class _Newton:
         good = self._evaluate(lanes)
         outside = np.where(self.inside, Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
         lanes = self._drop(lanes, good, outside)
-        size = np.empty(self.x.shape[0])
+        size, least = np.empty(self.x.shape[0]), np.empty(self.x.shape[0])
         for _ in range(self.max_iterations):
             if lanes.size == 0:
                 break
@@ -210,9 +210,9 @@ class _Newton:
             dx, _, ok = self.problem.scheme.linear(
                 self.gz, self.g[:, :, None], self.x, lanes, self.step
             )
-            measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
+            measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size, least)
             lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
-            lanes = self._finish(lanes, dx, size)
+            lanes = self._finish(lanes, dx, size, least)
             lanes = self._advance(lanes, dx, size)
         return Solution(self.x, self.status, self.iterations)
 
@@ -245,14 +245,17 @@ class _Newton:
         unit = np.maximum(terms, self.terms[lanes]) + 1e-300
         with np.errstate(all="ignore"):
             before = np.sqrt(np.sum(squares / unit, axis=1))
-            merit = np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
-        self.merit[lanes] = merit
-        return merit < before
+            after = np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
+            own = self.squares[lanes] / (self.terms[lanes] + 1e-300)
+        # An iteration that comes back from far away has a small residual against what it left.
+        self.merit[lanes] = np.sqrt(np.sum(own, axis=1))
+        return after < before
 
-    def _finish(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
+    def _finish(self, lanes: Lanes, dx: Array, size: Array, least: Array) -> Lanes:
         """Take the last step where it is small enough that what it leaves is round-off."""
         sizes = size[lanes]
-        done = ((sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])) | (sizes < SMALL_STEP)
+        falling = (sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])
+        done = falling | (least[lanes] < SMALL_STEP)
         finished = lanes[done]
         measures.keep(self.x, finished, self.base)
         measures.take(self.base, dx, finished, np.ones(finished.size), self.x)

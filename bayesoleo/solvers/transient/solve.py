@@ -140,7 +140,9 @@ class _State:
             self.gz, self.g[:, :, None], self.x, lanes, self.step, initial=True
         )
         size = np.full(self.x.shape[0], np.inf)
-        measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size)
+        # Over the largest value: a piece of a transient may hardly move.
+        states, moved = self.problem.scheme.state_size, np.empty(self.x.shape[0])
+        measures.step_size(self.x, dx, lanes, states, moved, size)
         size[~ok] = np.inf
         return dx, size
 
