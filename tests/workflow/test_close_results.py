@@ -77,13 +77,15 @@ def test_the_truth_lies_in_the_posteriors_interval(closed):
     assert summary["parameters"]["coulomb_friction"]["mean"] == pytest.approx(FRICTION, rel=0.05)
 
 
-#: What a closed loop fills; the others come of a study of the estimate.
+#: What a closed loop fills; the others come of a study of the estimate, and that of the errors
+#: where an error model remembers.
 CLOSED = set(schema.GROUPS) - {
     schema.SAMPLING_DISTRIBUTION,
     schema.INDIFFERENCE,
     schema.ASSESSMENT,
     schema.PROFILE,
     schema.SENSITIVITY,
+    schema.ERROR_MODEL,
 }
 
 
@@ -189,6 +191,7 @@ def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
     assert set(read_tree(tmp_path / "estimate" / "results.nc").children) == set(point.children)
     sampled = workflow.sample(campaign, MODEL, SETTINGS, out=tmp_path / "sample")
     more = {schema.POSTERIOR, schema.PRIOR, schema.SAMPLE_STATS, schema.LOG_LIKELIHOOD}
+    more |= {schema.LOG_PRIOR, schema.PREDICTION, schema.POSTERIOR_PREDICTIVE, schema.COMPARISON}
     assert set(sampled.children) == set(point.children) | more
     xr.testing.assert_identical(
         sampled[schema.POINT].to_dataset(), point[schema.POINT].to_dataset()
