@@ -34,12 +34,16 @@ def estimate_each(
     import xarray as xr
 
     from bayesoleo import workflow
+    from bayesoleo.errors import InputError
     from bayesoleo.estimation import between_runs
     from bayesoleo.storage import provenance, write_tree
 
     found = workflow.estimate_each(campaign, model, chosen, say=shell.teller(quiet))
-    usable = int((found["status"] == "converged").sum())
-    view = between_runs(found) if usable > 1 else None
+    view, reason = None, ""
+    try:
+        view = between_runs(found)
+    except InputError as error:  # the runs' own estimates stand without a comparison
+        reason = str(error)
     if out is not None:
         groups = {"each": found} | ({} if view is None else {"between_runs": view.to_dataset()})
         tree = xr.DataTree.from_dict(groups)
@@ -52,9 +56,9 @@ def estimate_each(
         return
     console = shell.console()
     console.print(tables.table(*_rows(found)))
-    if view is not None:
-        console.print()
-        console.print(str(view), markup=False, highlight=False, soft_wrap=True)
+    console.print()
+    said = f"runs not compared: {reason}" if view is None else str(view)
+    console.print(said, markup=False, highlight=False, soft_wrap=True)
     if out is not None:
         console.print(f"result    {out / FILE}", markup=False, soft_wrap=True)
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo.errors import InputError
 from bayesoleo.estimation import Hierarchy, between_runs
 from bayesoleo.plots import style
 from bayesoleo.plots.units import engineering
@@ -32,14 +33,14 @@ def by_run(each: xr.Dataset) -> Figure:
         A panel a parameter. The line is the mean over runs, the band twice the standard deviation
         between runs that is left when the estimates' own is taken off. Runs that did not converge
         are crosses and count for neither; in the title, the probability of so much scatter by
-        noise.
+        noise. A parameter that the runs do not determine has neither line nor band.
     """
     names = [str(name) for name in each[schema.PARAMETER].values]
     rows = math.ceil(len(names) / _COLUMNS)
     height = TOP + rows * HIGH + (rows - 1) * GAP + BOTTOM
     figure = style.blank(style.WIDTH, height)
     good = each["status"].values == "converged"
-    view = between_runs(each) if good.sum() > 1 and each.attrs.get("method") != "be" else None
+    view = _compared(each)
     wide = (style.WIDTH - LEFT) / _COLUMNS
     for k, name in enumerate(names):
         row, column = divmod(k, _COLUMNS)
@@ -63,12 +64,20 @@ def by_run(each: xr.Dataset) -> Figure:
     return figure
 
 
+def _compared(each: xr.Dataset) -> Hierarchy | None:
+    """Mean and spread over the runs; None where too few of them can be compared."""
+    try:
+        return between_runs(each)
+    except InputError:
+        return None
+
+
 def _panel(
     axes: Axes, one: xr.Dataset, view: Hierarchy | None, name: str, good: np.ndarray
 ) -> None:
     values, place = one[schema.ESTIMATE].values, np.arange(good.size)
     scale = engineering(str(one[schema.UNIT].values), style.magnitude(values))
-    if view is not None:
+    if view is not None and name in view.names:
         k = view.names.index(name)
         mean, spread = scale.factor * view.mean[k], scale.factor * view.spread[k]
         axes.axhspan(mean - 2 * spread, mean + 2 * spread, color=style.SIMILAR, lw=0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 
+from bayesoleo import estimation
+from bayesoleo.errors import InputError
 from bayesoleo.storage import read_tree
 
 
@@ -23,3 +25,18 @@ def test_each_run_gets_its_line_and_the_runs_are_compared(run, campaign, model, 
     # simulated with 2000 N/m in both runs
     stiffness = [row[1] for row in facts["each"]["data_vars"]["estimate"]["data"]]
     assert max(abs(value - 2000) for value in stiffness) < 5
+
+
+def test_estimates_are_written_where_the_runs_cannot_be_compared(
+    run, campaign, model, tmp_path, monkeypatch
+):
+    def refuse(each):
+        raise InputError("nothing can be compared", run="slow")
+
+    monkeypatch.setattr(estimation, "between_runs", refuse)
+    arguments = ["estimate", campaign, "--model", model, "--each", "--quiet", "--jobs", 1]
+    result = run(*arguments, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "runs not compared: run slow: nothing can be compared" in result.stdout
+    tree = read_tree(tmp_path / "each.nc")
+    assert set(tree.children) == {"each"}

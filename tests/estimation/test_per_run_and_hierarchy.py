@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.stats
+import xarray as xr
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, between_runs, estimate, estimate_each
@@ -159,5 +160,58 @@ def test_what_cannot_be_compared_is_refused(lines):
         InputError, match=r'would count it once a run.*estimate each run with "mbe"'
     ):
         between_runs(estimate_each(lines, "be"))
-    with pytest.raises(InputError, match="not positive definite"):
+    with pytest.raises(InputError, match=r"run x, key a: .*not positive definite"):
         pooled(np.zeros((2, 1)), np.zeros((2, 1, 1)), names=["a"], runs=["x", "y"])
+
+
+def vague(each, run, parameter):
+    """The estimates as if the data of one run said next to nothing of one parameter."""
+    each = each.copy(deep=True)
+    factor = xr.ones_like(each["estimate"])
+    factor.loc[{"run": run, "parameter": parameter}] = 1e9
+    each["covariance_likelihood"] *= factor * factor.rename(parameter="parameter_column")
+    return each
+
+
+def test_a_run_that_does_not_determine_a_parameter_is_left_out_and_named(lines):
+    each = estimate_each(lines)
+    view, known = between_runs(vague(each, "b", "slope")), between_runs(each.sel(run=["a", "c"]))
+    assert view.left_out == ("run b, does not determine slope",)
+    assert "left out: run b" in str(view)
+    assert view.to_dataset().attrs["left_out"] == view.left_out[0]
+    np.testing.assert_array_equal(view.mean, known.mean)
+
+
+def test_a_parameter_that_most_runs_leave_open_is_left_out_and_named(lines):
+    each = estimate_each(lines)
+    view = between_runs(vague(vague(each, "b", "slope"), "c", "slope"))
+    assert view.names == ("level",)
+    assert view.runs == ("a", "b", "c")
+    assert view.left_out == ("parameter slope, not determined by run b, c",)
+    # Each slope that is open is marginal: the levels are what they were.
+    level = each["estimate"].sel(parameter="level").values
+    assert level.min() < view.mean[0] < level.max()
+
+
+def test_what_is_lacking_is_said_where_nothing_can_be_compared(lines):
+    each = estimate_each(lines)
+    for run in "abc":
+        for parameter in ("level", "slope"):
+            each = vague(each, run, parameter)
+    with pytest.raises(InputError, match="parameter level, not determined by run a, b, c; param"):
+        between_runs(each)
+    each["covariance_likelihood"].loc[{"run": ["a", "b"]}] = np.nan
+    with pytest.raises(InputError, match="run a, does not tell level, slope apart"):
+        between_runs(each)
+
+
+def test_units_of_any_size_are_compared_alike():
+    """Covariances are judged in their own units: newtons beside nanometres, and one vague run."""
+    y = np.array([[1.0, 2e-9], [1.1, 2.2e-9], [0.9, 1.9e-9], [500.0, 3e-9]])
+    R = np.array([[1.0, 0.4], [0.4, 1.0]])
+    S = np.array([np.outer(u, u) * R for u in ([0.1, 1e-10],) * 3 + ([1e9, 1e-10],)])
+    runs = list("abcd")
+    view = pooled(y, S, names=["force", "gap"], runs=runs)
+    # the vague run moves the mean of the force by nothing
+    three = pooled(y[:3], S[:3], names=["force", "gap"], runs=runs[:3])
+    assert view.mean[0] == pytest.approx(three.mean[0], abs=0.05)

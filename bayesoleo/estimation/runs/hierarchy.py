@@ -21,10 +21,11 @@ Medicine* 33 (the interval of the mean).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from bayesoleo import schema
@@ -32,6 +33,12 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Array
 
 _MIXED = "unit of each parameter"
+
+#: A run says nothing of a parameter where its data alone leave the standard deviation a thousand
+#: times larger than the prior does: in a mean over runs its weight would be a millionth.
+UNDETERMINED = 1e-6
+#: Smallest eigenvalue of a matrix of correlations, a parameter, that rounding can be told from.
+SINGULAR = 10 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,8 @@ class Hierarchy:
         Each run's parameters given all runs.
     level : float
         Of the intervals.
+    left_out : tuple of str
+        Parameters and runs that are not compared, each with the reason.
     """
 
     names: tuple[str, ...]
@@ -73,6 +82,7 @@ class Hierarchy:
     shrunken: Array
     shrunken_sd: Array
     level: float
+    left_out: tuple[str, ...] = ()
 
     @property
     def mean_sd(self) -> Array:
@@ -112,7 +122,7 @@ class Hierarchy:
                 schema.RUN: list(self.runs),
                 "bound": ["low", "high"],
             },
-            attrs={"level": self.level},
+            attrs={"level": self.level, "left_out": "; ".join(self.left_out)},
         )
 
     def __str__(self) -> str:
@@ -126,7 +136,7 @@ class Hierarchy:
                 f"{name:<{width}}  {self.mean[k]:>11.5g}  {low:>11.5g} … {high:>11.5g}"
                 f"  {self.spread[k]:>9.3g}  {least:>9.3g} … {most:>9.3g}  {self.p_value[k]:>8.2g}"
             )
-        return "\n".join(lines)
+        return "\n".join((*lines, *(f"left out: {item}" for item in self.left_out)))
 
 
 def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
@@ -137,8 +147,9 @@ def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
     each : xarray.Dataset
         From :func:`~bayesoleo.estimation.estimate_each`, estimated by a method that ends in the
         maximum-likelihood point: a prior that every run has counted already would be counted once
-        a run. Runs that did not converge, or do not determine the parameters, are left out. An
-        estimate on a limit of its prior's support (``on_limit``) is taken as if it were free.
+        a run. Left out, and named, are runs that did not converge, parameters that no more than
+        half of the runs determine, and runs that do not determine one of the others. An estimate on
+        a limit of its prior's support (``on_limit``) is taken as if it were free.
     level : float, optional
         Of the intervals.
 
@@ -149,7 +160,7 @@ def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
     Raises
     ------
     InputError
-        If fewer than two runs are left, or the estimates are posterior modes.
+        If fewer than two runs or no parameter is left, or the estimates are posterior modes.
     """
     if each.attrs.get("method") == "be":
         raise InputError(
@@ -158,15 +169,78 @@ def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
             value="be",
             hint='estimate each run with "mbe"',
         )
+    good = each["status"].values == "converged"
+    names = each[schema.PARAMETER].values.astype(str)
+    runs = each[schema.RUN].values.astype(str)
     covariances = each["covariance_likelihood"].values
-    usable = (each["status"].values == "converged") & np.isfinite(covariances).all(axis=(1, 2))
-    return pooled(
-        each[schema.ESTIMATE].values[usable],
+    # A singular covariance is lost as a whole and tells no parameter from another.
+    regular = good & np.isfinite(covariances).all(axis=(1, 2))
+    determined = _determined(each)
+    kept = 2 * determined[regular].sum(axis=0) > regular.sum()
+    covariances = covariances[:, kept][:, :, kept]
+    usable = regular & determined[:, kept].all(axis=1)
+    usable[usable] = [_is_definite(S) for S in covariances[usable]]
+    left_out = _left_out(names, runs, good, regular, determined, kept, usable)
+    if usable.sum() < 2 or not kept.any():
+        raise InputError(
+            "a scatter between runs needs two runs that were estimated and determine a parameter",
+            value=runs[usable].tolist(),
+            hint="left out: " + "; ".join(left_out) if left_out else None,
+        )
+    view = pooled(
+        each[schema.ESTIMATE].values[usable][:, kept],
         covariances[usable],
-        names=[str(name) for name in each[schema.PARAMETER].values],
-        runs=[str(run) for run in each[schema.RUN].values[usable]],
+        names=names[kept].tolist(),
+        runs=runs[usable].tolist(),
         level=level,
     )
+    return replace(view, left_out=left_out)
+
+
+def _determined(each: xr.Dataset) -> NDArray[np.bool_]:
+    """Which parameters a run's data determine beside the prior, shape (N, l)."""
+    alone, with_prior = (
+        np.diagonal(each[name].values, axis1=1, axis2=2)
+        for name in ("covariance_likelihood", schema.COVARIANCE)
+    )
+    possible = np.isfinite(alone) & (alone > 0)
+    # Without a finite covariance under the prior there is nothing to compare with.
+    compared = np.isfinite(with_prior) & (with_prior > 0)
+    return possible & ~(compared & (with_prior < UNDETERMINED * np.where(possible, alone, 1.0)))
+
+
+def _is_definite(covariance: Array) -> bool:
+    """Whether a covariance is positive definite, in the units of its own standard deviations."""
+    variance = np.diag(covariance)
+    if not (variance.size and np.isfinite(covariance).all() and (variance > 0).all()):
+        return False
+    sd = np.sqrt(variance)
+    return bool(np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] > SINGULAR * sd.size)
+
+
+def _left_out(
+    names: NDArray[np.str_],
+    runs: NDArray[np.str_],
+    good: NDArray[np.bool_],
+    regular: NDArray[np.bool_],
+    determined: NDArray[np.bool_],
+    kept: NDArray[np.bool_],
+    usable: NDArray[np.bool_],
+) -> tuple[str, ...]:
+    """What is not compared, and why, a clause each."""
+    said = []
+    for k in np.flatnonzero(~kept) if regular.any() else ():
+        where = ", ".join(runs[regular & ~determined[:, k]])
+        said.append(f"parameter {names[k]}, not determined by run {where}")
+    for n in np.flatnonzero(~usable):
+        lacking = ", ".join(names[kept & ~determined[n]])
+        if not good[n]:
+            said.append(f"run {runs[n]}, did not converge")
+        elif regular[n] and lacking:
+            said.append(f"run {runs[n]}, does not determine {lacking}")
+        elif kept.any() or not regular[n]:
+            said.append(f"run {runs[n]}, does not tell {', '.join(names)} apart")
+    return tuple(said)
 
 
 def pooled(
@@ -202,14 +276,12 @@ def pooled(
         raise InputError(
             "a scatter between runs needs two runs that were estimated", value=list(runs)
         )
+    for run, covariance in zip(runs, S, strict=True):
+        _check_definite(run, covariance, names)
     diagonal = np.diagonal(S, axis1=1, axis2=2)
-    if not (diagonal > 0).all():
-        raise InputError("the covariance of a run's estimate is not positive definite")
     # In units of the estimates' own size of scatter and error, in which no parameter is special.
     unit = np.sqrt(np.var(y, axis=0, ddof=1) + np.mean(diagonal, axis=0))
     y, S = y / unit, S / np.outer(unit, unit)
-    if not (np.linalg.eigvalsh(S)[:, 0] > 0).all():
-        raise InputError("the covariance of a run's estimate is not positive definite")
     T = _restricted_maximum_likelihood(y, S)
     mean, C, W = _generalised_mean(y, S, T)
     r, (N, n) = y - mean, y.shape
@@ -234,6 +306,20 @@ def pooled(
         shrunken=(mean + np.einsum("nij,nj->ni", pull, r)) * unit,
         shrunken_sd=np.sqrt(np.diagonal(left, axis1=1, axis2=2)) * unit,
         level=level,
+    )
+
+
+def _check_definite(run: str, covariance: Array, names: Sequence[str]) -> None:
+    """Raise where a covariance is singular, with the parameters that are to blame."""
+    if _is_definite(covariance):
+        return
+    variance = np.diag(covariance)
+    lacking = [n for n, v in zip(names, variance, strict=True) if not (np.isfinite(v) and v > 0)]
+    raise InputError(
+        "the covariance of this run's estimate is not positive definite",
+        run=run,
+        key=", ".join(lacking or names),
+        hint="leave the run or the parameter out",
     )
 
 
