@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.prediction.stability import compared, count_unstable, is_jump, jumps, swings
 from bayesoleo.solvers.orbit import floquet_multipliers
+from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
 from bayesoleo.solvers.status import Status
 
@@ -57,14 +57,12 @@ class Anchor:
 
     def predict(self, change: Array) -> Array:
         """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
-        start = np.empty((change.shape[0], *self.x.shape))
-        _extrapolate(
-            self.x.ravel(),
-            self.x_p.reshape(self.x_p.shape[0], -1),
-            change,
-            start.reshape(change.shape[0], -1),
-        )
-        return start
+        return self.extrapolation.starts(change)
+
+    @cached_property
+    def extrapolation(self) -> Extrapolation:
+        """What solutions at other parameters start from."""
+        return Extrapolation(self.x, self.x_p)
 
     @cached_property
     def unstable(self) -> int:
@@ -128,14 +126,3 @@ class Anchor:
             here, slope = trial.x[0], (trial.x[0] - here) / length
             place, step = place + length, min(2 * length, LONGEST)
         return here
-
-
-@numba.njit(nogil=True, cache=True)
-def _extrapolate(x, x_p, change, start):
-    """Lane by lane: the order of summation of a matrix product would vary with the batch."""
-    for lane in range(change.shape[0]):
-        for i in range(x.size):
-            start[lane, i] = x[i]
-        for k in range(change.shape[1]):
-            for i in range(x.size):
-                start[lane, i] += change[lane, k] * x_p[k, i]

@@ -21,7 +21,13 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.squares import FusedSquares, squared_distances
 from bayesoleo.prediction.stability import unstable_of
 from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities, solve_periodic
+from bayesoleo.solvers.periodic.solve import (
+    Boundary,
+    Solution,
+    sensitivities,
+    solve_extrapolated,
+    solve_periodic,
+)
 from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.solvers.status import Status
 
@@ -208,9 +214,8 @@ class RunPredictor:
     def _from_anchor(self, p: Array) -> Solution:
         anchor = self.anchor
         assert anchor is not None
-        solution = solve_periodic(
-            self.boundary, p, anchor.predict(p[:, self.active] - anchor.p[self.active])
-        )
+        change = p[:, self.active] - anchor.p[self.active]
+        solution = solve_extrapolated(self.boundary, p, anchor.extrapolation, change)
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:

@@ -20,7 +20,7 @@ from bayesoleo.prediction.dynamics import dynamics_of
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.periodic.solve import Solution, solve_periodic
+from bayesoleo.solvers.periodic.solve import Solution, solve_extrapolated
 from bayesoleo.solvers.shooting.shoot import solve_shooting
 
 #: Parameter vectors in a batch, and their relative distance from the anchor.
@@ -119,4 +119,6 @@ def cases(model: Model, records: Sequence[Record]) -> list[Case]:
 
 def solve(run: RunPredictor, p: Array) -> Solution:
     """From the run's anchor, as inside a sampler; ``p (L, np)``."""
-    return solve_periodic(run.boundary, p, start(run, p))
+    assert run.anchor is not None
+    change = p[:, run.active] - run.anchor.p[run.active]
+    return solve_extrapolated(run.boundary, p, run.anchor.extrapolation, change)

@@ -15,6 +15,7 @@ from periodic_problems import problem as discretised
 
 from bayesoleo.solvers.periodic import newton
 from bayesoleo.solvers.periodic import solve as periodic
+from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.3, h1=1.0, h3=0.2j)
@@ -26,7 +27,7 @@ def both(model, name, n, force=FORCE, start=0.0, **options):
     assert boundary.arranged is not None
     x = rest(boundary, n, start)
     settings = {"max_iterations": 40, "monotone": True} | options
-    compiled = periodic._compiled(boundary, boundary.arranged, p, x, *settings.values())
+    compiled = periodic._compiled(boundary, boundary.arranged, p, x.copy(), *settings.values())
     general = periodic._Newton(boundary, p, x.copy(), *settings.values()).run()
     return compiled, general
 
@@ -74,6 +75,23 @@ def test_steps_with_old_derivatives_end_at_the_same_orbit(model, name):
     error = np.abs(found.x - exact).max(axis=(1, 2)) / np.abs(exact).max()
     # Rounding of both, which the stiffest of these problems amplify over a hundred steps.
     assert error.max() < 1e-12
+
+
+@pytest.mark.parametrize("n", [64, 101])
+@pytest.mark.parametrize("name", ["radau3", "thesis"])
+def test_starts_made_on_the_way_are_those_of_the_extrapolation(name, n):
+    boundary, p = discretised(duffing(), FORCE, 0.2, name, n, backend="numba")
+    solved = periodic.solve_periodic(boundary, p, rest(boundary, n))
+    solved, x_p, _ = periodic.sensitivities(boundary, p, solved)
+    line = Extrapolation(solved.x[0], np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0)))
+    change = 1e-2 * np.random.default_rng(1).standard_normal((5, boundary.active))
+    many = np.repeat(p, 5, axis=0)
+    # At the old parameters still: all come back, in as many steps as from the starts themselves.
+    found = periodic.solve_extrapolated(boundary, many, line, change)
+    told = periodic.solve_periodic(boundary, many, line.starts(change))
+    np.testing.assert_array_equal(found.iterations, told.iterations)
+    np.testing.assert_allclose(found.x, told.x, rtol=0, atol=1e-13 * np.abs(told.x).max())
+    assert (found.iterations > 1).all()
 
 
 @pytest.mark.parametrize("name", ["radau3", "thesis"])

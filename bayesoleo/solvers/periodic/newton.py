@@ -184,7 +184,7 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
         z=np.zeros((sizes.nz, BLOCK)),
         out=np.zeros((rows, BLOCK)),
         sums=np.zeros((2 * d, BLOCK)),
-        scratch=np.zeros(BLOCK),
+        scratch=np.zeros(positions),
         transfer=np.zeros((blocks, sizes.transfer * sizes.block)),
         history=history,
         start=np.zeros((D, WIDTH)),
@@ -204,21 +204,55 @@ class Options(NamedTuple):
     initial: bool
 
 
+class Line(NamedTuple):
+    """Where lanes start: ``base (w, positions)`` and ``change (L, na)`` times ``slopes (na, w,
+    positions)``; empty where ``x`` says it."""
+
+    base: Any
+    slopes: Any
+    change: Any
+
+
+NO_LINE = Line(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+
+
 @jit
-def solve_lanes(pieces, sizes, sweep, work, options, p, x, status, iterations):
-    """Newton's method for every lane of ``x (L, n, w)``, in place; see ``periodic``."""
+def solve_lanes(pieces, sizes, sweep, work, options, p, x, line, status, iterations):
+    """Newton's method for every lane of ``x (L, n, w)``, in place; see ``solve``."""
     now = work.now
     for lane in range(x.shape[0]):
         for k in range(sizes.constants):
             work.constants[k] = p[lane, k]
-        for k in range(sizes.unknowns):
-            for i in range(sweep.source.size):
-                now[k, i] = x[lane, sweep.source[i], k]
+        if line.base.size > 0:
+            _extrapolate(line, lane, now)
+        else:
+            for k in range(sizes.unknowns):
+                for i in range(sweep.source.size):
+                    now[k, i] = x[lane, sweep.source[i], k]
         status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
         if status[lane] != NEEDS_EXCHANGE:
             for m in range(sizes.steps):
                 for k in range(sizes.unknowns):
                     x[lane, m, k] = now[k, sweep.place[m]]
+
+
+@jit
+def _extrapolate(line, lane, now):
+    """``now = base + slopes change``, two slopes at a time."""
+    size, count = now.size, line.change.shape[1]
+    to, base = carray(pointer(now, 0), (size,)), carray(pointer(line.base, 0), (size,))
+    for i in range(size):
+        to[i] = base[i]
+    for k in range(0, count - count % 2, 2):
+        first, second = line.change[lane, k], line.change[lane, k + 1]
+        a = carray(pointer(line.slopes, k * size), (size,))
+        b = carray(pointer(line.slopes, (k + 1) * size), (size,))
+        for i in range(size):
+            to[i] += first * a[i] + second * b[i]
+    for k in range(count - count % 2, count):
+        first, a = line.change[lane, k], carray(pointer(line.slopes, k * size), (size,))
+        for i in range(size):
+            to[i] += first * a[i]
 
 
 @jit
@@ -547,34 +581,34 @@ def _size(x, dx, begin, measured, scratch):
     Also over its largest value, which digits are lost against.
     """
     size = least = 0.0
+    count = x.shape[1] - begin
     for k in range(x.shape[0]):
-        change = _largest(dx[k, begin:], 0.0, scratch)
+        at = k * x.shape[1] + begin
+        change = _largest(pointer(dx, at), count, 0.0, scratch)
         if not change < np.inf:
             return np.inf, np.inf
         if k < measured and change > 0.0:
             level = x[k, begin]
-            motion = _largest(x[k, begin:], level, scratch)
+            motion = _largest(pointer(x, at), count, level, scratch)
             size = max(size, change / unit(motion, level, change))
             least = max(least, change / max(motion + abs(level), change))
     return size, least
 
 
 @jit
-def _largest(values, level, scratch):
+def _largest(values, count, level, scratch):
     """Largest distance from a level, not a number where one is not.
 
     Without their sign, floating-point numbers are ordered as the integers with their bits, and what
     is not finite comes last: integers, which have no exceptions, are compared in vectors.
     """
+    values, distances = carray(values, (count,)), carray(pointer(scratch, 0), (count,))
+    for i in range(count):
+        distances[i] = values[i] - level
     bits, largest = scratch.view(np.int64), np.int64(0)
-    for first in range(0, values.size, BLOCK):
-        part = values[first:]
-        count = min(part.size, BLOCK)
-        for i in range(count):
-            scratch[i] = part[i] - level
-        for i in range(count):
-            magnitude = bits[i] & WITHOUT_SIGN
-            largest = magnitude if magnitude > largest else largest
+    for i in range(count):
+        magnitude = bits[i] & WITHOUT_SIGN
+        largest = magnitude if magnitude > largest else largest
     bits[0] = largest
     return scratch[0]
 
