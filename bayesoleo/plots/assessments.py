@@ -8,18 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.plots import style
+from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.sensitivities import table
 
 HIGH = 2.1
 
 
-def assessment(data: xr.Dataset, output: str | None = None) -> Figure:
+def assessment(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
     """Correlograms, the lack of fit and the dependence of one output's residuals.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         The group ``assessment``.
     output : str, optional
         By default the first.
@@ -31,6 +33,7 @@ def assessment(data: xr.Dataset, output: str | None = None) -> Figure:
         repeat: peaks at whole periods are the model's error. On the right what repeats over its
         noise, by run. Below the part of the residual's variance that each variable explains.
     """
+    data = dataset(found)
     one = data.isel(output=0) if output is None else data.sel(output=output)
     runs = [str(run) for run in one[schema.RUN].values]
     one = one.dropna("variable", how="all", subset=["share"])

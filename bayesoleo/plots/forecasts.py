@@ -7,7 +7,9 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.plots import style
+from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.units import engineering
 
 HIGH, GAP, TOP, BOTTOM, LEFT = 1.6, 0.7, 0.75, 0.55, 0.85
@@ -15,12 +17,12 @@ HIGH, GAP, TOP, BOTTOM, LEFT = 1.6, 0.7, 0.75, 0.55, 0.85
 MOST = 12
 
 
-def forecast(data: xr.Dataset, output: str | None = None) -> Figure:
+def forecast(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
     """Band and measurement of each run, with the probability integral transform beside it.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         Of :func:`bayesoleo.predict`.
     output : str, optional
         By default the first.
@@ -32,6 +34,7 @@ def forecast(data: xr.Dataset, output: str | None = None) -> Figure:
         histogram of the transform: flat where the prediction is calibrated, hollow where it is too
         wide, horned where it is too narrow.
     """
+    data = dataset(found)
     one = data.isel(output=0) if output is None else data.sel(output=output)
     runs = [str(run) for run in one[schema.RUN].values][:MOST]
     height = TOP + len(runs) * HIGH + (len(runs) - 1) * GAP + BOTTOM

@@ -11,6 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.shown import Shown
 
 Array = NDArray[np.float64]
 
@@ -35,6 +37,26 @@ class Run:
         if not self.periodic:
             return f"transient, {self.duration:.3g} s"
         return f"{self.frequency:.3g} Hz" if np.isfinite(self.frequency) else ""
+
+
+def dataset(found: Shown | xr.Dataset | xr.DataTree) -> xr.Dataset:
+    """The labelled arrays of a result, as the function that found it returns it, bare or a group.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    data = found.data if isinstance(found, Shown) else found
+    if isinstance(data, xr.DataTree):
+        return data.to_dataset()
+    if not isinstance(data, xr.Dataset):
+        raise InputError(
+            "a figure needs a result or its Dataset",
+            value=type(data).__name__,
+            hint="give what the function returns, or a group of a tree",
+        )
+    return data
 
 
 def group(tree: xr.DataTree, name: str) -> xr.Dataset | None:

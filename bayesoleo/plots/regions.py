@@ -11,18 +11,20 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.plots import style
+from bayesoleo.plots.reading import dataset
 
 SIDE, GAP, LEFT, TOP, BOTTOM, COLUMNS = 2.6, 0.75, 0.85, 0.6, 0.55, 3
 MOST = 12
 
 
-def indifference(data: xr.Dataset) -> Figure:
+def indifference(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     """Contours of the objective and the ellipses of its second-order expansion, plane by plane.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         The group ``indifference``.
 
     Returns
@@ -32,6 +34,7 @@ def indifference(data: xr.Dataset) -> Figure:
         which the other parameters follow, in blue, the conditional one in vermilion. Planes beyond
         twelve are left out.
     """
+    data = dataset(found)
     pairs = [str(pair) for pair in data["pair"].values][:MOST]
     figure, panels = panel_grid(len(pairs))
     colours = {"conditional": style.BEFORE, "profiled": style.AFTER}
@@ -53,12 +56,12 @@ def indifference(data: xr.Dataset) -> Figure:
     return figure
 
 
-def profile(data: xr.Dataset) -> Figure:
+def profile(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     """Fall of the profiled objective along each parameter, with the parabola of linearisation.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         From :func:`bayesoleo.estimation.profile`.
 
     Returns
@@ -67,6 +70,7 @@ def profile(data: xr.Dataset) -> Figure:
         The level of the limits is drawn across; where the curve stays below it the data do not
         bound the parameter on that side.
     """
+    data = dataset(found)
     names = [str(name) for name in data[schema.PARAMETER].values][:MOST]
     level = stats.chi2.isf(1 - float(data.attrs["level"]), 1) / 2
     figure, panels = panel_grid(len(names))

@@ -8,19 +8,21 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.plots import style
+from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.regions import MOST, panel_grid
 
 BINS = 41
 WIDTHS = 4.5
 
 
-def sampling_distribution(data: xr.Dataset) -> Figure:
+def sampling_distribution(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     """Histograms of the estimates about the truth, in standard deviations of the bound.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         The group ``sampling_distribution``.
 
     Returns
@@ -29,6 +31,7 @@ def sampling_distribution(data: xr.Dataset) -> Figure:
         The line is the normal density that the Cramér-Rao bound allows, the dashed one that of the
         noise propagated through the estimator.
     """
+    data = dataset(found)
     names = [str(name) for name in data[schema.PARAMETER].values][:MOST]
     good = data["status"].values == 0
     figure, panels = panel_grid(len(names))

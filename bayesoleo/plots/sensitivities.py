@@ -9,19 +9,21 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.plots import style
+from bayesoleo.plots.reading import dataset
 
 ROW, LEFT, TOP, BOTTOM = 0.32, 2.4, 1.5, 0.3
 MOST = 40
 _SHADES = LinearSegmentedColormap.from_list("share", ["#ffffff", style.SIMILAR, style.AFTER])
 
 
-def sensitivity(data: xr.Dataset) -> Figure:
+def sensitivity(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     """Sobol indices, or local changes in per cent, feature by parameter.
 
     Parameters
     ----------
-    data : xarray.Dataset
+    found : Shown, xarray.Dataset or xarray.DataTree
         From :func:`~bayesoleo.estimation.global_sensitivity`, ``sobol`` or
         ``local_sensitivity``.
 
@@ -30,6 +32,7 @@ def sensitivity(data: xr.Dataset) -> Figure:
     Figure
         Total shares with the first-order ones in brackets, or changes in per cent.
     """
+    data = dataset(found)
     names = [str(name) for name in data[schema.PARAMETER].values]
     features = [str(name) for name in data["feature"].values][:MOST]
     if "total" in data:

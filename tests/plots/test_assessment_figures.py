@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from small_campaigns import damper, damper_campaign, with_friction
 
 from bayesoleo import plots
@@ -36,7 +37,7 @@ def fitted(tmp_path_factory):
 
 def test_contours_and_ellipses_are_drawn(fitted):
     found = indifference(*fitted, [("damping", "stiffness")], points=12)
-    figure = plots.indifference(found.data)
+    figure = plots.indifference(found)
     (axes,) = figure.axes
     curves = [line.get_xydata() for line in axes.lines]
     np.testing.assert_allclose(curves[1][:-1], found["contour"].values[0, 0])
@@ -46,23 +47,37 @@ def test_contours_and_ellipses_are_drawn(fitted):
 
 def test_profile_shows_falls_and_level(fitted):
     found = profile(*fitted, ["cubic"])
-    (axes,) = plots.profile(found.data).axes
+    (axes,) = plots.profile(found).axes
     np.testing.assert_allclose(axes.lines[1].get_ydata(), found["fall"].values[0])
     assert axes.lines[2].get_ydata()[0] == pytest.approx(1.92, abs=0.01)
 
 
 def test_histograms_hold_all_replications(fitted):
     found = sampling_distribution(*fitted, replications=30, input_noise=False)
-    figure = plots.sampling_distribution(found.data)
+    figure = plots.sampling_distribution(found)
     assert len(figure.axes) == 3
     bars = figure.axes[0].patches
     assert sum(bar.get_height() * bar.get_width() for bar in bars) == pytest.approx(1.0)
 
 
+def test_bare_data_draw_the_same_and_other_things_are_refused(fitted):
+    found = profile(*fitted, ["cubic"])
+    for given in (found.data, xr.DataTree(found.data)):
+        np.testing.assert_allclose(
+            plots.profile(given).axes[0].lines[1].get_ydata(), found["fall"].values[0]
+        )
+    for draw in (
+        plots.profile, plots.indifference, plots.sampling_distribution, plots.assessment,
+        plots.sensitivity, plots.forecast,
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="needs a result or its Dataset"):
+            draw(fitted[1])
+
+
 def test_table_of_sensitivities_has_its_numbers(fitted):
     problem, point = fitted
     local = local_sensitivity(problem, point.theta)
-    texts = [t.get_text() for t in plots.sensitivity(local.data).axes[0].texts]
+    texts = [t.get_text() for t in plots.sensitivity(local).axes[0].texts]
     assert texts[0] == f"{float(local['percent'][0, 0]):+.3g} %"
     priors = [Normal(0, 1), Normal(0, 2)]
     shares = sobol(lambda t: t.sum(1, keepdims=True), priors, ["a", "b"], ["y"], samples=256)
@@ -72,7 +87,7 @@ def test_table_of_sensitivities_has_its_numbers(fitted):
 
 def test_assessment_shows_runs_and_variables(fitted):
     found = assess(*fitted)
-    correlogram, ratios, shares = plots.assessment(found.data).axes
+    correlogram, ratios, shares = plots.assessment(found).axes
     assert len(correlogram.lines) == 2 * 3 + 1
     np.testing.assert_allclose(ratios.lines[0].get_ydata(), found["ratio_to_noise"][0])
     labels = [label.get_text() for label in shares.get_xticklabels()]
