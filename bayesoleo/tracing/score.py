@@ -30,6 +30,8 @@ from bayesoleo.tracing.assembly import Option
 from bayesoleo.tracing.colour import inflation_of
 from bayesoleo.tracing.errors_table import RunError
 from bayesoleo.tracing.fit import Fit
+from bayesoleo.tracing.projection import coefficients, remains
+from bayesoleo.tracing.visible import without_round_off
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,9 @@ Array = NDArray[np.float64]
 MOST_SAMPLES = 1500
 #: Stretches of a transient whose scatter stands in for that between periods.
 STRETCHES = 8
+#: Why an effect has no score.
+SPANNED = "the model can already do what it would"
+INVISIBLE = "not visible in these data: no output changes with it"
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
 #: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
@@ -327,14 +332,15 @@ def score_all(
         if isinstance(r, Status)
     }
     failed |= {
-        f"{o.key[0]} at {o.key[1]}": "the model can already do what it would"
+        f"{o.key[0]} at {o.key[1]}": r
         for o, r in zip(options, results, strict=True)
-        if r is None
+        if isinstance(r, str)
     }
     return sorted(scores, key=lambda item: -item.share), failed
 
 
-def _attempt(base: Base, option: Option) -> Score | Status | None:
+def _attempt(base: Base, option: Option) -> Score | Status | str:
+    """The score, or why there is none."""
     candidate = option.candidate
     shapes = [
         dict(zip(candidate.shapes, values, strict=True))
@@ -352,7 +358,8 @@ def _attempt(base: Base, option: Option) -> Score | Status | None:
         if best is None or score.fall > best.fall:
             best, used = score, block
     if best is None:
-        return None
+        seen = any(item.any() for block in columns for item in block.by_run)
+        return SPANNED if seen else INVISIBLE
     inflation, freedom = inflation_of(base, _directions(base, used, best.expected))
     return replace(best, columns=np.concatenate(thinned), inflation=inflation, freedom=freedom)
 
@@ -404,9 +411,12 @@ def _sensitivities(
         samples = run.predict(p, derivatives=True)
         if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
             return Status(int(samples.status.max()))
+        constants = run.kernels.derived.constants
+        own = [k for k, name in enumerate(constants) if name in fit.model.parameters]
+        y_p = without_round_off(run, p, samples, own)
         for k in range(len(shapes)):
             full = np.zeros((samples.y.shape[1], theta.size, samples.y.shape[2]))
-            full[:, layout.columns[r]] = samples.y_p[k]
+            full[:, layout.columns[r]] = y_p[k]
             found[k].append(full)
     return [_Block(layout.names, item) for item in found]
 
@@ -430,10 +440,10 @@ def _evaluate(
     for run, new in zip(base.runs, columns, strict=True):
         parts = run.products(new)
         cross, own, score = cross + parts[0], own + parts[1], score + parts[2]
-    project = np.linalg.lstsq(base.gram, cross, rcond=1e-13)[0] if size else np.zeros((0, k))
+    project = coefficients(base.gram, cross)
     information = own - cross.T @ project
     score = score - project.T @ base.gradient
-    keep = np.diag(information) > 1e-8 * np.diag(own)
+    keep = remains(base.gram, project, own, information)
     if not keep.any() or not np.isfinite(information).all():
         return None
     expected = np.zeros(k)
@@ -492,7 +502,7 @@ def _directions(base: Base, block: _Block, expected: Array) -> list[Array]:
     cross = np.zeros((base.gram.shape[0], expected.size))
     for run, new in zip(base.runs, columns, strict=True):
         cross += run.products(new)[0]
-    project = np.linalg.lstsq(base.gram, cross, rcond=1e-13)[0] if len(cross) else cross
+    project = coefficients(base.gram, cross)
     return [
         expected @ new - (project @ expected) @ run.sensitivity
         for run, new in zip(base.runs, columns, strict=True)
