@@ -6,8 +6,9 @@ Kernels release the interpreter lock, so threads are enough inside one process.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from functools import cache
 
@@ -77,8 +78,39 @@ def thread_map[T, R](
         return [function(item) for item in work]
     # Threads of ours that each call a linear algebra library with threads of its own would crowd
     # each other out.
-    with (
-        single_blas_thread(),
-        ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool,
-    ):
-        return list(pool.map(function, work))
+    with single_blas_thread():
+        if getattr(_here, "pooled", False):  # its own threads: a full pool would wait for itself
+            with ThreadPoolExecutor(max_workers=min(jobs, len(work))) as pool:
+                return _gather(pool, function, work)
+        return _gather(_pool(jobs), function, work)
+
+
+#: Whether the present thread is one of a pool.
+_here = threading.local()
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def _pool(jobs: int) -> ThreadPoolExecutor:
+    """Threads that are kept: to start them takes as long as a good part of a small batch."""
+    if jobs not in _pools:
+        _pools.setdefault(jobs, ThreadPoolExecutor(jobs, initializer=_enter))
+    return _pools[jobs]
+
+
+def _enter() -> None:
+    _here.pooled = True
+
+
+if hasattr(os, "register_at_fork"):  # threads do not follow into a forked process
+    os.register_at_fork(after_in_child=_pools.clear)
+
+
+def _gather[T, R](pool: ThreadPoolExecutor, function: Callable[[T], R], work: list[T]) -> list[R]:
+    """Results in order; nothing is left running behind an error or an interrupt."""
+    futures = [pool.submit(function, item) for item in work]
+    try:
+        return [future.result() for future in futures]
+    finally:
+        for future in futures:
+            future.cancel()
+        wait(futures)
