@@ -81,6 +81,10 @@ class AnswerBranch:
         """An output over the points of one period, shape (N,); SI."""
         return self.answers.output(point, output)
 
+    def __repr__(self) -> str:
+        unit = self.units[self.along]
+        return f"along {self.along}{f' [{unit}]' if unit else ''}: {self.branch!r}"
+
 
 def follow_branch(
     model: Model,

@@ -27,6 +27,8 @@ def test_swing_along_the_frequency_is_the_linear_response():
     assert found.branch.status is Status.CONVERGED
     assert found.branch.special == ()
     assert not found.unstable.any()
+    assert str(found).startswith("along frequency [Hz]: branch of ")
+    assert len(str(found)) < 400
     rate = 2 * np.pi * found.values
     expected = 2.0 / np.abs(100.0 - rate**2 + 0.5j * rate)
     np.testing.assert_allclose(found.swing("displacement"), expected, rtol=MISSED)
@@ -58,6 +60,7 @@ def test_along_a_parameter_and_downward():
 
 def test_period_of_a_limit_cycle_by_name():
     cycle = limit_cycle(system("van_der_pol"), {"position": 1.0}, 40.0, steps=256)
+    assert str(cycle) == f"stable limit cycle of period {cycle.solution.value:.8g} s"
     assert cycle.orbit.status is Status.CONVERGED
     assert cycle.orbit.period == pytest.approx(6.6632868593, rel=1e-8)
     assert cycle.own == pytest.approx(1.0, abs=1e-7)

@@ -107,6 +107,17 @@ def test_a_branch_followed_backward_is_the_same(hardening):
     np.testing.assert_allclose(ends, expected, rtol=1e-8)
 
 
+def test_a_branch_prints_its_ends_and_special_orbits(hardening):
+    _, branch = hardening
+    head, columns, *rows = repr(branch).splitlines()
+    assert head == f"branch of {len(branch.points)} orbits, converged"
+    assert columns.split() == ["value", "unstable", "largest", "multiplier"]
+    assert [row.split()[0] for row in rows] == ["start", "fold", "fold", "end"]
+    shown = [branch.points[0], *branch.of_kind("fold"), branch.points[-1]]
+    for row, point in zip(rows, shown, strict=True):
+        assert row.split()[1:3] == [f"{point.value:.6g}", str(point.unstable)]
+
+
 def test_a_period_doubles_where_a_multiplier_is_minus_one():
     """Double well, damping 0.3, rate 1.2: motion in one well, its period doubled by more force."""
     model, frequency = duffing(damping=0.3, stiffness=-1.0), 1.2 / (2 * np.pi)
@@ -130,6 +141,7 @@ def test_a_branch_without_an_orbit_says_why():
     nowhere = follow(family, np.full((N, 5), np.nan), 0.1, (0.05, 0.2))
     assert nowhere.status is Status.NOT_FINITE
     assert nowhere.points == ()
+    assert str(nowhere) == "branch of 0 orbits, not finite"
 
 
 def van_der_pol(mu, steps, guess):

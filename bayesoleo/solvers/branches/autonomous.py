@@ -60,6 +60,13 @@ class LimitCycle:
         others = np.delete(values, np.argmin(np.abs(values - 1.0)))
         return self.orbit.status.ok and bool(np.all(np.abs(others) < 1.0))
 
+    def __repr__(self) -> str:
+        status = self.orbit.status
+        if not status.ok:
+            return f"limit cycle, {status.name.lower().replace('_', ' ')}"
+        kind = "stable" if self.stable else "unstable"
+        return f"{kind} limit cycle of period {self.solution.value:.8g} s"
+
 
 def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> LimitCycle:
     """Solve for a cycle and its period.

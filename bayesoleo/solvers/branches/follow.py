@@ -37,6 +37,8 @@ MANY_ITERATIONS, FEW_ITERATIONS = 6, 4
 LEAST_COSINE = 0.9
 #: A step may shrink to this part of the longest before the branch is given up.
 SMALLEST_STEP = 1e-4
+#: Special orbits in what is printed of a branch.
+MOST_SHOWN = 20
 #: Where along a step a special orbit lies, over its length.
 PLACE = 1e-12
 
@@ -66,6 +68,10 @@ class BranchPoint:
         """Number of multipliers outside the unit circle."""
         return int(np.sum(np.abs(self.multipliers) > 1.0))
 
+    def __repr__(self) -> str:
+        largest = np.abs(self.multipliers).max(initial=0.0)
+        return f"{self.value:>12.6g}  {self.unstable:>8}  {largest:>18.6g}"
+
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
@@ -73,6 +79,9 @@ class SpecialPoint:
 
     kind: str
     point: BranchPoint
+
+    def __repr__(self) -> str:
+        return f"{self.kind:<8}  {self.point!r}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +109,21 @@ class Branch:
     def of_kind(self, kind: str) -> tuple[BranchPoint, ...]:
         """Special orbits of one kind."""
         return tuple(item.point for item in self.special if item.kind == kind)
+
+    def __repr__(self) -> str:
+        """Its ends and special orbits, a line each; of many the first."""
+        head = f"branch of {len(self.points)} orbits, {self.status.name.lower().replace('_', ' ')}"
+        if not self.points:
+            return head
+        shown = (
+            SpecialPoint("start", self.points[0]),
+            *self.special[:MOST_SHOWN],
+            SpecialPoint("end", self.points[-1]),
+        )
+        lines = [head, f"{'':<8}  {'value':>12}  {'unstable':>8}  {'largest multiplier':>18}"]
+        lines += map(repr, shown)
+        more = len(self.special) - MOST_SHOWN
+        return "\n".join(lines + ([f"and {more} more special orbits"] if more > 0 else []))
 
 
 def follow(
