@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from bayesoleo.assessment import Series
 
 PANEL = "How good an estimate is"
+REPLICATIONS = "replications.nc"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -230,18 +231,21 @@ def replicate(
 
     The model is estimated once; its predictions with new noise, of the size that the records show,
     are estimated again and again. Bias, standard deviation, what linearisation expects, and the
-    least that is possible (Cramér and Rao) are printed. With --out finished blocks are kept, and
-    the same command goes on where it was stopped.
+    least that is possible (Cramér and Rao) are printed. With --out finished blocks are kept, from
+    which the same command goes on where it was stopped, and all of it is in replications.nc.
 
     \b
     Examples:
       bayesoleo replicate shaker --model f16n2d2 --runs d -n 1000 --out scatter
       bayesoleo replicate shaker --model f16n2d2 --out scatter --scheduler tcp://10.0.0.1:8786
     """
+    import xarray as xr
+
     from bayesoleo import workflow
     from bayesoleo.errors import CampaignError
     from bayesoleo.estimation import sampling_distribution
     from bayesoleo.modelfile import load_model
+    from bayesoleo.storage import provenance, write_tree
     from bayesoleo.tracing.fit import fit_model
 
     if out is not None:
@@ -269,4 +273,10 @@ def replicate(
             scheduler=scheduler,
             progress=shell.progress_shown(quiet),
         )
-    shell.console().print(str(found), markup=False, soft_wrap=True)
+    console = shell.console()
+    console.print(str(found), markup=False, soft_wrap=True)
+    if out is not None:
+        tree = xr.DataTree.from_dict({schema.SAMPLING_DISTRIBUTION: found.data})
+        tree.attrs.update(provenance(seed, command=chosen.command, model=fit.model.name))
+        write_tree(tree, out / REPLICATIONS)
+        console.print(f"result    {out / REPLICATIONS}", markup=False, soft_wrap=True)

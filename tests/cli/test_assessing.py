@@ -6,6 +6,9 @@ import json
 
 import pytest
 
+from bayesoleo import plots, schema
+from bayesoleo.storage import read_tree
+
 
 @pytest.fixture
 def traced(run, campaign, model, tmp_path):
@@ -40,6 +43,12 @@ def test_replications_go_on_where_they_were_stopped(run, campaign, model, tmp_pa
     assert result.exit_code == 0, result.output
     assert "20 of 20 replications converged" in result.stdout
     assert len(list((tmp_path / "kept").glob("slot-*.npz"))) == 1
+    tree = read_tree(tmp_path / "kept" / "replications.nc")
+    found = tree[schema.SAMPLING_DISTRIBUTION]
+    assert found["replicate"].sizes["replication"] == 20
+    assert int((found["status"] == 0).sum()) == 20
+    assert tree.attrs[schema.SEED] == 0
+    plots.sampling_distribution(found)
     assert run(*arguments).stdout == result.stdout
 
 
