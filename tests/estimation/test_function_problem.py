@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation import FunctionProblem
+from bayesoleo.estimation import FunctionProblem, estimate
 from bayesoleo.model.priors import Normal, TruncatedNormal
 from bayesoleo.solvers.status import Status
 
@@ -71,6 +71,7 @@ def test_a_failed_vector_is_not_a_number_and_counted():
     ("change", "message"),
     [
         ({"y": [1.0, np.nan]}, "key y: measured output must be one column of finite numbers"),
+        ({"y": []}, "key y: measured output has no sample"),
         ({"names": ["a", "b"]}, "must have one entry per unknown"),
         ({"start": [1.0, 2.0]}, "must have one entry per unknown"),
     ],
@@ -79,3 +80,34 @@ def test_lengths_must_agree(change, message):
     options = {"y": [1.0, 2.0], "priors": [Normal(1, 1)]} | change
     with pytest.raises(InputError, match=message):
         FunctionProblem(lambda x, t: t[0], None, **options)
+
+
+@pytest.mark.parametrize("x", [X[:-1], list(X[:-1]), np.append(X, 3.0)])
+def test_inputs_of_another_length_than_the_output_are_refused(x):
+    with pytest.raises(InputError, match=r"key x: .*each sample of y.*y has 30 samples"):
+        FunctionProblem(lambda x, t: t[0] * np.asarray(x), x, X, [Normal(1, 1)])
+
+
+def test_inputs_are_whatever_the_function_reads():
+    """Constants, or two rows of inputs: only the predictions have to be as many as the samples."""
+    line = FunctionProblem(lambda x, t: t[0] * x[0] * X, [2.0, 3.0], X, [Normal(1, 1)])
+    assert estimate(line).theta[0] == pytest.approx(0.5)
+    rows = FunctionProblem(lambda x, t: t[0] * x[0] + x[1], np.stack((X, X)), 3 * X, [Normal(1, 1)])
+    assert estimate(rows).theta[0] == pytest.approx(2.0)
+
+
+def test_a_function_that_changes_its_length_is_refused():
+    problem = FunctionProblem(lambda x, t: t[0] * x["time"][:-1], {"time": X}, X, [Normal(1, 1)])
+    with pytest.raises(InputError, match="one prediction for each sample of y"):
+        estimate(problem)
+
+
+def test_an_output_without_samples_is_not_estimated_from():
+    class Unmeasured(FunctionProblem):
+        @property
+        def counts(self):
+            return np.array([[0]])
+
+    problem = Unmeasured(lambda x, t: t[0] * x, X, X, [Normal(1, 1)], output="force")
+    with pytest.raises(InputError, match="column force: there is no sample to estimate from"):
+        estimate(problem)

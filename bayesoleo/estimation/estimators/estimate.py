@@ -16,6 +16,7 @@ from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.summarise import summarise
+from bayesoleo.estimation.objectives.diagonal import output_counts
 from bayesoleo.estimation.objectives.objective import Objective, objective_of
 from bayesoleo.estimation.problems.problem import Array, Problem, jumps_of
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -86,13 +87,15 @@ def estimate(
     Raises
     ------
     InputError
-        If the start does not fit, lies outside a prior's support, or the method is unknown.
+        If an output has no sample, the start does not fit or lies outside a prior's support, or the
+        method is unknown.
 
     References
     ----------
     Verbeek (1993), section 2.3, eqs. 2.25-2.35 (objectives), sections 3.2 and 3.3, eqs. 3.17-3.23
     (estimators).
     """
+    _check_samples(problem)
     scale = PriorScale.of(problem.priors, problem.names)
     begin = checked_start(problem, scale, problem.start if start is None else start)
     wanted = objective_of(problem, objective, error_covariance)
@@ -194,6 +197,13 @@ def polish(
         resolution=resolution,
         progress=progress,
     )
+
+
+def _check_samples(problem: Problem) -> None:
+    """Raise where an output was not measured in any run."""
+    for name, count in zip(problem.outputs, output_counts(problem.counts), strict=True):
+        if count == 0:
+            raise InputError("there is no sample to estimate from", column=name)
 
 
 def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Array:

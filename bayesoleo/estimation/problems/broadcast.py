@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Array
 
 # A sum in another order rounds differently; a function that broadcasts wrongly is off by far more.
@@ -36,11 +37,24 @@ class Broadcast:
         self._together: bool | None = None
 
     def one(self, theta: Array) -> Array:
-        """Prediction at one vector, shape (n,); not finite where the function fails."""
+        """Prediction at one vector, shape (n,); not finite where the function fails.
+
+        Raises
+        ------
+        InputError
+            If the function returns another number of predictions than there are samples.
+        """
         with np.errstate(all="ignore"):
             prediction = np.asarray(self._function(self._x, theta))
         if prediction.dtype != np.longdouble:
             prediction = prediction.astype(float, copy=False)
+        if prediction.shape not in ((), (1,), (self._samples,)):
+            raise InputError(
+                "function must return one prediction for each sample of y",
+                key="x",
+                value=prediction.shape,
+                hint=f"y has {self._samples} samples: give x for as many",
+            )
         return np.broadcast_to(prediction, (self._samples,))
 
     def many(self, theta: Array) -> Array:

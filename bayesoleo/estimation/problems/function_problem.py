@@ -57,7 +57,7 @@ class FunctionProblem:
     Raises
     ------
     InputError
-        If lengths disagree or the data are not finite.
+        If lengths disagree, or the data are empty or not finite.
     """
 
     def __init__(
@@ -77,6 +77,8 @@ class FunctionProblem:
         self._y = measured if measured.dtype == np.longdouble else measured.astype(float)
         if self._y.ndim != 1 or not np.isfinite(self._y).all():
             raise InputError("measured output must be one column of finite numbers", key="y")
+        if not self._y.size:
+            raise InputError("measured output has no sample", key="y")
         self._x, self._jacobian = x, jacobian
         self._prediction = Broadcast(function, x, self._y.size)
         self._priors = tuple(priors)
@@ -89,6 +91,9 @@ class FunctionProblem:
                 "names, start and priors must have one entry per unknown",
                 value=(len(self._names), self._start.shape, length),
             )
+        # Only the function knows how it reads x: where the lengths differ, ask it.
+        if isinstance(x, np.ndarray | list | tuple) and len(x) != self._y.size and length:
+            self._prediction.one(self._start)
         self._output = output
         self._sd = np.array([prior.sd for prior in self._priors])
         self._support = np.array([prior.support for prior in self._priors])
