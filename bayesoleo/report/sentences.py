@@ -11,6 +11,7 @@ from bayesoleo import schema
 from bayesoleo.plots.rankings import format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
+from bayesoleo.tracing.rounds import LEAST_SHARE, LEVEL
 
 FLOOR = 1.15
 """A ratio of repeating error to noise below which a run is taken to be explained."""
@@ -30,10 +31,26 @@ def headline(summary: Mapping[str, Any]) -> str:
         return "Nothing is missing: the model explains the measurements down to their noise."
     if summary["verdict"] == schema.EFFECT_ADDED:
         return f"The model lacked {lacked}: {found} found and added."
+    rest = _unexplained(summary["rounds"][-1])
     if found:
-        rest = "an error remains that no effect in the catalogue explains"
-        return f"The model lacked {lacked}: {found} added, but {rest}."
-    return "Something is missing that no effect in the catalogue explains."
+        return f"The model lacked {lacked}: {found} added, but an error remains{rest}."
+    return f"Something is missing{rest}."
+
+
+def _unexplained(last: Mapping[str, Any]) -> str:
+    """What the catalogue has to say to an error that remains, as the end of a sentence."""
+    open_ = [
+        c
+        for c in last["candidates"]
+        if c["p_value"] is not None and c["p_value"] < LEVEL and c["gain"] >= LEAST_SHARE
+    ]
+    if not open_:
+        return " that no effect in the catalogue explains"
+    best = max(open_, key=lambda candidate: candidate["gain"])
+    if any(c.get("estimated") for c in last["candidates"]):
+        return f", and no effect was confirmed; the nearest is {name(best)}"
+    share = f"{100 * best['gain']:.0f} %"
+    return f"; {name(best)} would explain {share} of the excess, and was not tried"
 
 
 def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:

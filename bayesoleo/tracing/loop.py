@@ -114,8 +114,8 @@ def close_loop(
     first, rounds = state, list[Round]()
     while True:
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
-        last = len(state.assembly.steps) >= max_effects or len(rounds) > 2 * max_effects
-        outcome = examine(state, roles, numerics, effects=effects, seed=seed, last=last, say=say)
+        limit = _limit(len(state.assembly.steps), len(rounds), max_effects)
+        outcome = examine(state, roles, numerics, effects=effects, seed=seed, limit=limit, say=say)
         rounds.append(outcome)
         if outcome.after is None:
             break
@@ -128,6 +128,17 @@ def close_loop(
             " too narrow"
         )
     return ClosedLoop(tuple(rounds), first, state, roles, tuple(notes))
+
+
+def _limit(added: int, rounds: int, max_effects: int) -> str:
+    """Why a round may only rank; empty where it may add an effect."""
+    if max_effects == 0:
+        return "effects were to be ranked only, and none added"
+    if added >= max_effects:
+        return f"as many effects as allowed, {max_effects}, have been added"
+    if rounds > 2 * max_effects:
+        return f"effects were added and removed again for {rounds} rounds"
+    return ""
 
 
 def _ratios(state: State) -> str:

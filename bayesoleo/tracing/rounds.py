@@ -107,7 +107,7 @@ def examine(
     *,
     effects: Sequence[Effect] | None,
     seed: int,
-    last: bool,
+    limit: str = "",
     say: Say,
 ) -> Round:
     """Look for the effect that a fitted model lacks.
@@ -124,8 +124,8 @@ def examine(
         Instead of the catalogue.
     seed : int
         For the correction for the search.
-    last : bool
-        Only rank; accept nothing.
+    limit : str
+        Why effects are only ranked and none is accepted; empty where one may be.
     say : callable
         Told what is being done.
     """
@@ -137,9 +137,8 @@ def examine(
     tests = effective_tests(scores, seed)
     ranking = _rank(scores, tests, {})
     stop = _stopping_reason(state, ranking)
-    if stop is not None or last:
-        reason = stop or "the largest number of effects has been added"
-        return Round(state, ranking, failed, None, None, reason, tests)
+    if stop is not None or limit:
+        return Round(state, ranking, failed, None, None, stop or limit, tests)
     refits = _refit_best(base, ranking, numerics, say)
     ranking = _rank(scores, tests, refits)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, say)

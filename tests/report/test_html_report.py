@@ -12,7 +12,7 @@ from bayesoleo import schema
 from bayesoleo.errors import ResultsError
 from bayesoleo.report import render_report, write_report
 from bayesoleo.report.images import encode_formula
-from bayesoleo.report.sentences import reason
+from bayesoleo.report.sentences import headline, reason
 from bayesoleo.report.tables import (
     diagnostics,
     diagnostics_by_parameter,
@@ -120,6 +120,23 @@ def test_an_unexplained_remainder_is_said(two_runs, effects, text):
     summary.update(verdict=schema.UNEXPLAINED, effects=effects)
     tree.attrs["summary"] = json.dumps(summary)
     assert text in render_report(tree)
+
+
+@pytest.mark.parametrize(
+    ("estimated", "p_value", "gain", "text"),
+    [
+        (False, 1e-6, 0.89, "missing; cubic @ strut would explain 89 % of the excess, and was not"),
+        (True, 1e-6, 0.89, "missing, and no effect was confirmed; the nearest is cubic @ strut."),
+        (False, 0.2, 0.89, "missing that no effect in the catalogue explains."),
+        (False, 1e-6, 0.01, "missing that no effect in the catalogue explains."),
+    ],
+)
+def test_a_candidate_that_stands_open_is_not_denied(two_runs, estimated, p_value, gain, text):
+    summary = json.loads(two_runs.attrs["summary"])
+    summary.update(verdict=schema.UNEXPLAINED, effects=[])
+    candidate = {"effect": "cubic", "target": "strut", "gain": gain, "p_value": p_value}
+    summary["rounds"][-1]["candidates"] = [{**candidate, "estimated": estimated}]
+    assert text in headline(summary).replace("\N{NO-BREAK SPACE}", " ")
 
 
 def test_many_candidates_are_folded_and_a_range_stands_for_the_runs(page):
