@@ -16,6 +16,7 @@ from bayesoleo.estimation.objectives.diagonal import (
     sums_of_squares,
 )
 from bayesoleo.estimation.objectives.objective import OBJECTIVES, Objective
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.estimation.problems.function_problem import FunctionProblem
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit, Problem
 from bayesoleo.estimation.runs.hierarchy import Hierarchy, between_runs
@@ -44,6 +45,7 @@ from bayesoleo.estimation.uncertainty.sampling_distribution import sampling_dist
 __all__ = [
     "METHODS",
     "OBJECTIVES",
+    "CampaignProblem",
     "Evaluation",
     "FunctionProblem",
     "Hierarchy",
