@@ -71,8 +71,10 @@ def _suspects(run: RunPredictor, y_p: Array) -> NDArray[np.bool_]:
     assert run.anchor is not None
     size = np.abs(run.anchor.x).max(axis=0)
     moved = np.abs(run.anchor.x_p).max(axis=1)
-    # A state at rest counts as moved by much; whether that is real shows in the second look.
-    reach = (moved / np.maximum(size, np.finfo(float).tiny)).max(axis=1)
+    # A state at rest counts as moved without limit; whether that is real shows in the second look.
+    relative = np.where(moved > 0, 1e200, 0.0)
+    np.divide(moved, size, out=relative, where=size > 1e-150)
+    reach = relative.max(axis=1)
     output = np.abs(run.measured).max(axis=1)
     found = np.abs(y_p).max(axis=-1)
     return (found > 0) & (found <= SUSPECT * output[:, None] * reach)
