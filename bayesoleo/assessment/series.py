@@ -229,8 +229,10 @@ def _of_tree(one: Mapping[str, xr.Dataset], run: str, output: str, stage: str) -
     variables[f"predicted {output}"] = observed[output].values[keep] - values.values[keep]
     for name in (schema.STROKE, schema.VELOCITY):
         if name in residual and np.isfinite(residual[name].values[keep]).all():
-            variables[name] = residual[name].values[keep]
-            units[name] = str(residual[name].attrs.get(schema.UNITS, ""))
+            # Whose position or velocity it is, which results of older versions do not say.
+            what = str(residual[name].attrs.get(schema.LONG_NAME, name))
+            variables[what] = residual[name].values[keep]
+            units[what] = str(residual[name].attrs.get(schema.UNITS, ""))
     frequency = float(constant[schema.FREQUENCY])
     series = Series(
         run=run,

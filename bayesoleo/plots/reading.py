@@ -177,3 +177,8 @@ def thin(x: Array, y: Array, points: int = 2 * BINS) -> tuple[Array, Array]:
         if np.isfinite(y[part]).any():
             chosen += sorted({part[np.nanargmin(y[part])], part[np.nanargmax(y[part])]})
     return x[chosen], y[chosen]
+
+
+def coordinate_name(data: xr.Dataset, name: str) -> str:
+    """What a coordinate of the residual is called: whose position or velocity it is."""
+    return str(data[name].attrs.get(schema.LONG_NAME, name))

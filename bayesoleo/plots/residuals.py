@@ -58,7 +58,8 @@ def residual(tree: xr.DataTree, output: str, against: Against = "phase") -> Figu
         spans.append(2 * style.magnitude(*(y for _, y in row)))
     style.share_y(grid.axes, spans, symmetric=True)
     _explain(grid.figure, len(kinds), remark, schema.noise(output) in data)
-    x_text = style.x_name(runs) if against == "phase" else x_scale.label(against)
+    phase = against == "phase"
+    x_text = style.x_name(runs) if phase else x_scale.label(reading.coordinate_name(data, against))
     style.label_outside(grid.figure, x_text, y_scale.label(f"{output} residual"))
     return grid.figure
 

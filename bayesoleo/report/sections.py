@@ -74,9 +74,10 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
         )
         for against in LOOPS:
             if against in tree[schema.RESIDUAL]:
+                what = reading.coordinate_name(tree[schema.RESIDUAL].to_dataset(), against)
                 yield (
                     partial(plots.residual, tree, output, against),
-                    f"Residual of {output} against {against}. {loops.format(against)}",
+                    f"Residual of {output} against the {what}. {loops.format(what)}",
                 )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bayesoleo import schema
 from bayesoleo.data import Campaign
 from bayesoleo.estimation import to_dataset
+from bayesoleo.model import Coordinate
 from bayesoleo.posterior import LogDensity, Samples, choose_draws, to_datasets
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
@@ -194,8 +195,8 @@ def _residuals(loop: ClosedLoop) -> xr.Dataset:
             data[schema.noise(output)] = _by_run(
                 [e.noise for e in errors], unit, "standard error of that average"
             )
-    for name, (values, unit) in _coordinate(loop.final).items():
-        data[name] = _padded(values, rows, unit, name)
+    for name, (values, unit, text) in _coordinate(loop).items():
+        data[name] = _padded(values, rows, unit, text)
     coords = {
         schema.RUN: [p.record.label for p in ordered(loop.first)],
         schema.PHASE: np.arange(PHASES) / PHASES,
@@ -203,11 +204,22 @@ def _residuals(loop: ClosedLoop) -> xr.Dataset:
     return xr.Dataset(data, coords=coords)
 
 
-def _coordinate(state: State) -> dict[str, tuple[list[Array], str]]:
-    """Position and velocity of the first coordinate that has a velocity, for plots of the
-    residual."""
+def _place(loop: ClosedLoop) -> Coordinate | None:
+    """The coordinate to look at: where the first added effect acts, else the best candidate, else
+    the first that has a velocity."""
+    moving = [c for c in loop.final.assembly.native.coordinates() if c.velocity is not None]
+    ranking = loop.rounds[-1].ranking
+    for target in (*loop.targets, *(item.target for item in ranking[:1])):
+        for place in moving:
+            if target in (place.name, place.target):
+                return place
+    return moving[0] if moving else None
+
+
+def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
+    """Position and velocity, with unit and name, of one coordinate for plots of the residual."""
+    state, place = loop.final, _place(loop)
     native = state.assembly.native
-    place = next((c for c in native.coordinates() if c.velocity is not None), None)
     if place is None:
         return {}
     unit = native.dofs[place.name].unit if place.name in native.dofs else native.inputs[place.name]
@@ -227,8 +239,8 @@ def _coordinate(state: State) -> dict[str, tuple[list[Array], str]]:
         position.append(item.evaluate(record.position, record.rate))
         velocity.append(item.evaluate(record.position, record.rate, 1))
     return {
-        schema.STROKE: (position, unit),
-        schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s"),
+        schema.STROKE: (position, unit, f"position of {place.name}"),
+        schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s", f"velocity of {place.name}"),
     }
 
 
