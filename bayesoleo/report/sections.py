@@ -64,7 +64,7 @@ def residual_title(tree: xr.DataTree) -> str:
 
 def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
     loops = (
-        "A cycle is a loop; where it closes to a line the residual is a function of the {}, and "
+        "A cycle is a loop; where it closes to a line the residual is a function of {}, and "
         "the line is the shape of what is missing."
     )
     for output in reading.outputs(tree):
@@ -77,7 +77,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
                 what = reading.coordinate_name(tree[schema.RESIDUAL].to_dataset(), against)
                 yield (
                     partial(plots.residual, tree, output, against),
-                    f"Residual of {output} against the {what}. {loops.format(what)}",
+                    f"Residual of {output} against {what}. {loops.format(what)}",
                 )
 
 
