@@ -30,19 +30,19 @@ def test_maps_within_maps_do_not_wait_for_each_other():
 
 
 def test_an_error_comes_out_when_all_is_at_rest():
-    running, most = [], []
+    running, ended = [], []
 
     def work(item: int) -> None:
         if item == 0:
             raise ValueError("the first")
         running.append(item)
         time.sleep(0.05)
-        most.append(item)
+        ended.append(item)
 
     with pytest.raises(ValueError, match="the first"):
         thread_map(work, range(50), 2)
     # What had begun has ended; what had not never will.
-    assert running == most
+    assert sorted(running) == sorted(ended)
     assert len(running) < 49
 
 

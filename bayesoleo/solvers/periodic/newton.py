@@ -120,7 +120,6 @@ class Pieces(NamedTuple):
     jacobian: int
     admissible: int
     rows: int
-    measure: int
     eliminate: int
     chain: int
     substitute: int
@@ -128,8 +127,8 @@ class Pieces(NamedTuple):
     update: int
 
 
-_call_rows, _call_measure = caller(SIGNATURES["rows"]), caller(SIGNATURES["measure"])
-_call_eliminate, _call_chain = caller(SIGNATURES["eliminate"]), caller(SIGNATURES["chain"])
+_call_rows, _call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
+_call_eliminate = caller(SIGNATURES["eliminate"])
 _call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
 _call_update = caller(SIGNATURES["update"])
 
@@ -402,9 +401,9 @@ def _evaluate(pieces, sizes, sweep, work):
         call_kernel(pieces.jacobian, (z, inputs, p, out, points))
         if b == u.shape[0] - 1:
             _silence(sizes, sweep.lengths, b, count, work.z, work.out)
-        _call_measure(pieces.measure, (z, out, sums, points))
         transfer = pointer(work.transfer, b * work.transfer.shape[1])
-        bad += _call_eliminate(pieces.eliminate, (out, x, length, transfer, count))
+        arguments = out, x, length, z, sums, transfer, count
+        bad += _call_eliminate(pieces.eliminate, arguments)
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
         _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
     if outside > 0:

@@ -202,8 +202,8 @@ def _compiled(
     sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
     pieces = newton.Pieces(
         equations.residual.address, equations.jacobian.address, equations.admissible.address,
-        program.rows, program.measure, program.eliminate, program.chain, program.substitute,
-        program.follow, program.update,
+        program.rows, program.eliminate, program.chain, program.substitute, program.follow,
+        program.update,
     )  # fmt: skip
     sweep = arranged.sweep
     newton.solve_lanes(

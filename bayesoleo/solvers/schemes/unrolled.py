@@ -33,8 +33,7 @@ _P, _I = types.CPointer(types.float64), types.intp
 #: Of the pieces, see :class:`Program`.
 SIGNATURES = {
     "rows": types.void(_P, _P, _P, _I),
-    "measure": types.void(_P, _P, _P, _I),
-    "eliminate": _I(_P, _P, _P, _P, _I),
+    "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
     "chain": types.void(_P, _P, _I, _I),
     "substitute": types.void(_P, _P, _P, _P, _I),
     "follow": types.void(_P, _P, _I, _I),
@@ -50,11 +49,9 @@ class Program:
     ----------
     rows : int
         ``(x, h, z, count)``: values and derivatives of the dofs at the points.
-    measure : int
-        ``(z, out, sums, count)``: adds squares of residuals, and of all terms, to ``sums``.
     eliminate : int
-        ``(out, x, h, transfer, count)``: solves for a step's own unknowns; returns how many pivots
-        were too small.
+        ``(out, x, h, z, sums, transfer, count)``: solves for a step's own unknowns, and adds
+        squares of residuals, and of all terms, to ``sums``; returns how many pivots were too small.
     chain : int
         ``(transfer, history, rows, width)``: runs the recursion of all chunks through the block.
     substitute : int
@@ -77,7 +74,6 @@ class Program:
     """
 
     rows: int
-    measure: int
     eliminate: int
     chain: int
     substitute: int
@@ -185,23 +181,14 @@ def _solve_again(source: _Source, right: list[str], factors: _Factors) -> list[s
     return [f"r{i}" for i in range(m)]
 
 
-def _measure(orders: Sequence[int]) -> str:
-    d, nz = len(orders), sum(orders) + len(orders)
-    source = _Source(
-        "measure",
-        "z, out, sums, count",
-        {"z": nz * BLOCK, "out": d * (1 + nz) * BLOCK, "sums": 2 * d * BLOCK},
-    )
-    source.loop("for i in range(count):")
-    for e in range(d):
-        source.add(f"g = out[{e * BLOCK} + i]")
-        source.add("total = g*g")
-        source.add(f"sums[{e * BLOCK} + i] += total")
-        for k in range(nz):
-            source.add(f"term = out[{(d + e * nz + k) * BLOCK} + i]*z[{k * BLOCK} + i]")
-            source.add("total += term*term")
-        source.add(f"sums[{(d + e) * BLOCK} + i] += total")
-    return "\n".join(source.lines)
+def _add_squares(source: _Source, e: int, d: int, g: str, terms: Sequence[str]) -> None:
+    """Emit the sums of squares of an equation's residual and of its terms."""
+    source.add(f"total = {g}*{g}")
+    source.add(f"sums[{e * BLOCK} + i] += total")
+    for term in terms:
+        source.add(f"term = {term}")
+        source.add("total += term*term")
+    source.add(f"sums[{(d + e) * BLOCK} + i] += total")
 
 
 def _chain(
@@ -272,10 +259,12 @@ def _difference_elimination(
     factors = _Factors(d * columns, d, steps)
     source = _Source(
         "eliminate",
-        "out, x, h, transfer, count",
+        "out, x, h, z, sums, transfer, count",
         {
             "out": d * (1 + nz) * BLOCK,
             "h": BLOCK,
+            "z": nz * BLOCK,
+            "sums": 2 * d * BLOCK,
             "transfer": (d * columns + d * d) * steps,
         },
     )
@@ -288,6 +277,7 @@ def _difference_elimination(
         for j, row in enumerate(_rows_before(orders)):
             for k in range(orders[j] + 1):
                 source.add(f"g{k} = out[{(d + e * nz + row + k) * BLOCK} + i]")
+                source.add(f"t{e}_{row + k} = g{k}*z[{(row + k) * BLOCK} + i]")
             source.add("g1 *= once")
             if orders[j] == 2:
                 source.add("g2 *= twice")
@@ -297,9 +287,10 @@ def _difference_elimination(
                 terms += [f"({second[past]!r})*g2"] if orders[j] == 2 and second[past] else []
                 entries[past][e][j] = f"w{past}_{e}_{j}"
                 source.add(f"w{past}_{e}_{j} = {_sum(terms)}")
+        source.add(f"g{e}_ = out[{e * BLOCK} + i]")
+        _add_squares(source, e, d, f"g{e}_", [f"t{e}_{k}" for k in range(nz)])
     right = [
-        [f"-{entries[past][e][j]}" for past, j in _past(orders)] + [f"-out[{e * BLOCK} + i]"]
-        for e in range(d)
+        [f"-{entries[past][e][j]}" for past, j in _past(orders)] + [f"-g{e}_"] for e in range(d)
     ]
     solution = _solve(source, entries[0], right, factors)
     for e in range(d):
@@ -415,24 +406,43 @@ def _stage_equations(
     return matrix, right
 
 
-def _collocation_source(name: str, orders: Sequence[int], method: Tableau, steps: int) -> _Source:
+def _stage_squares(source: _Source, orders: Sequence[int], first: int) -> None:
+    """Emit the sums of squares at one stage, whose points begin at ``first``."""
+    d, nz = len(orders), sum(orders) + len(orders)
+    for e in range(d):
+        source.add(f"g = out[{e * BLOCK + first} + i]")
+        terms = [
+            f"out[{(d + e * nz + k) * BLOCK + first} + i]*z[{k * BLOCK + first} + i]"
+            for k in range(nz)
+        ]
+        _add_squares(source, e, d, "g", terms)
+
+
+def _collocation_source(
+    name: str, orders: Sequence[int], method: Tableau, steps: int, *, squares: bool = False
+) -> _Source:
     d, s, D = len(orders), method.stages, sum(orders)
-    return _Source(
-        name,
-        "out, x, h, transfer, count",
-        {
-            "out": d * (1 + D + d) * BLOCK,
-            "x": (D + s * d) * REACH,
-            "h": BLOCK,
-            "transfer": ((D + s * d) * (D + 1) + (s * d) ** 2) * steps,
-        },
-    )
+    sizes = {
+        "out": d * (1 + D + d) * BLOCK,
+        "x": (D + s * d) * REACH,
+        "h": BLOCK,
+        "transfer": ((D + s * d) * (D + 1) + (s * d) ** 2) * steps,
+    }
+    if squares:
+        sizes |= {"z": (D + d) * BLOCK, "sums": 2 * d * BLOCK}
+    more = "z, sums, " if squares else ""
+    return _Source(name, f"out, x, h, {more}transfer, count", sizes)
 
 
 def _collocation_elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     m, D = len(orders) * method.stages, sum(orders)
-    source = _collocation_source("eliminate", orders, method, steps)
+    source = _collocation_source("eliminate", orders, method, steps, squares=True)
     source.add("bad = 0")
+    # In loops of their own: the elimination leaves no registers for more.
+    for stage in range(method.stages):
+        source.loop("for i in range(count):")
+        _stage_squares(source, orders, stage * steps)
+        source.indent = "    "
     source.loop("for i in range(count):")
     source.add("h1 = h[i]")
     source.add("h2 = h1*h1")
@@ -572,7 +582,6 @@ def _differences(
     pieces = _compile(
         [
             _difference_rows(orders, first, second),
-            _measure(orders),
             _difference_elimination(orders, first, second, BLOCK),
             _chain(d, 3 * d, order, BLOCK),
             _difference_substitution(orders, BLOCK),
@@ -602,7 +611,6 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
     pieces = _compile(
         [
             _collocation_rows(orders, method, steps),
-            _measure(orders),
             _collocation_elimination(orders, method, steps),
             _chain(D, D, tuple(range(D)), steps),
             _collocation_substitution(orders, method, steps),
