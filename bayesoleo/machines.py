@@ -61,7 +61,8 @@ def connected(scheduler: str | None) -> Iterator[Client | None]:
                 n_workers=_processes(scheduler),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                # Not None: even without a dashboard there is a port, and 8787 may be taken.
+                dashboard_address="localhost:0",
                 silence_logs="CRITICAL",
             ) as cluster,
             Client(cluster) as client,
