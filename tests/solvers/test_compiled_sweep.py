@@ -13,7 +13,7 @@ from periodic_problems import (
 )
 from periodic_problems import problem as discretised
 
-from bayesoleo.solvers.periodic import newton
+from bayesoleo.solvers.periodic import arrangement, newton
 from bayesoleo.solvers.periodic import solve as periodic
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.status import Status
@@ -58,7 +58,7 @@ def test_statuses_agree_where_iterations_run_out():
 
 
 def test_long_systems_and_few_steps_are_left_to_the_general_iteration():
-    boundary, _ = discretised(duffing(), FORCE, 0.2, "radau3", newton.LEAST_STEPS - 1, "numba")
+    boundary, _ = discretised(duffing(), FORCE, 0.2, "radau3", arrangement.LEAST_STEPS - 1, "numba")
     assert boundary.arranged is None
 
 

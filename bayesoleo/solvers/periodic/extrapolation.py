@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.periodic.newton import Layout
+from bayesoleo.solvers.periodic.arrangement import Layout
 from bayesoleo.solvers.schemes.sweep import jit
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BlockKernel
-from bayesoleo.solvers.periodic import measures, newton
+from bayesoleo.solvers.periodic import arrangement, measures, newton
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.schemes.scheme import Scheme
 from bayesoleo.solvers.status import Status
@@ -70,7 +70,7 @@ class Boundary:
         return self.period / n
 
     @cached_property
-    def arranged(self) -> newton.Arranged | None:
+    def arranged(self) -> arrangement.Arranged | None:
         """Inputs as the compiled iteration sweeps them; None where it has no code for the scheme,
         or the equations are not compiled."""
         compiled = isinstance(self.equations.jacobian, BlockKernel)
@@ -78,9 +78,9 @@ class Boundary:
         if program is None:
             return None
         n = self.inputs.shape[1] // program.stages
-        if n < newton.LEAST_STEPS:
+        if n < arrangement.LEAST_STEPS:
             return None
-        return newton.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
+        return arrangement.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def solve_extrapolated(
     if arranged is None:
         return solve_periodic(problem, p, extrapolation.starts(change), overwrite=True)
     x = np.empty((p.shape[0], *extrapolation.x.shape))
-    line = newton.Line(*extrapolation.swept(arranged.layout), np.ascontiguousarray(change))
+    line = arrangement.Line(*extrapolation.swept(arranged.layout), np.ascontiguousarray(change))
     solution = _compiled(problem, arranged, p, x, 40, True, line)
     return _with_exchange(
         problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), 40, True
@@ -188,27 +188,27 @@ def _with_exchange(
 
 def _compiled(
     problem: Boundary,
-    arranged: newton.Arranged,
+    arranged: arrangement.Arranged,
     p: Array,
     x: Array,
     max_iterations: int,
     monotone: bool,
-    line: newton.Line = newton.NO_LINE,
+    line: arrangement.Line = arrangement.NO_LINE,
 ) -> Solution:
     """The same iteration, lane by lane, in one compiled call, in place."""
     equations, program = problem.equations, arranged.program
     status = np.empty(x.shape[0], dtype=np.int64)
     iterations = np.zeros(x.shape[0], dtype=np.int64)
     sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
-    pieces = newton.Pieces(
+    pieces = arrangement.Pieces(
         equations.residual.address, equations.jacobian.address, equations.admissible.address,
         program.rows, program.eliminate, program.chain, program.substitute, program.follow,
         program.update,
     )  # fmt: skip
     sweep = arranged.sweep
     newton.solve_lanes(
-        pieces, sizes, sweep, newton.work_space(sizes, sweep),
-        newton.Options(max_iterations, monotone, False), p, x, line, status, iterations,
+        pieces, sizes, sweep, arrangement.work_space(sizes, sweep),
+        arrangement.Options(max_iterations, monotone, False), p, x, line, status, iterations,
     )  # fmt: skip
     return Solution(x, status, iterations)
 

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.schemes import collocation_kernels as kernels
-from bayesoleo.solvers.schemes import sparse, unrolled
+from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
+from bayesoleo.solvers.schemes.unrolled import program as unrolled
 
 Array = NDArray[np.float64]
 

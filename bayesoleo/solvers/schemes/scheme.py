@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.schemes.unrolled import Program
+from bayesoleo.solvers.schemes.unrolled.program import Program
 
 Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]

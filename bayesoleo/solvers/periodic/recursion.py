@@ -1,0 +1,253 @@
+"""The equations of a period, linearised, and the recursion through its steps that solves them.
+
+Models and schemes come as compiled pieces of fixed signature (``bayesoleo.compiled`` and
+``solvers.schemes.unrolled``), so this is compiled once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import carray
+
+from bayesoleo.compiled import BLOCK, call_kernel, caller, pointer
+from bayesoleo.solvers.periodic.arrangement import COLUMNS
+from bayesoleo.solvers.periodic.measures import total
+from bayesoleo.solvers.schemes.sweep import LARGEST_GROWTH, ROUND_OFF, eliminate, jit
+from bayesoleo.solvers.schemes.unrolled.emit import REACH, WIDTH
+from bayesoleo.solvers.schemes.unrolled.program import SIGNATURES
+from bayesoleo.solvers.status import Status
+
+#: A pivot that asks for an exchange of rows, or a recursion that grows so much that its rounding
+#: errors would spoil the closure: neither is a failure of the problem, only of this elimination.
+NEEDS_EXCHANGE = -1
+
+CONVERGED = Status.CONVERGED.value
+INADMISSIBLE = Status.INADMISSIBLE.value
+SINGULAR = Status.SINGULAR.value
+NOT_FINITE = Status.NOT_FINITE.value
+
+_call_rows, _call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
+_call_eliminate = caller(SIGNATURES["eliminate"])
+_call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
+_call_update = caller(SIGNATURES["update"])
+
+
+@jit
+def keep(source, target):
+    _copy(pointer(source, 0), pointer(target, 0), source.size)
+
+
+@jit
+def _copy(source, target, count):
+    """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
+    count references; and indices that may be negative allow no vector instructions."""
+    source, target = carray(source, (count,)), carray(target, (count,))
+    for i in range(count):
+        target[i] = source[i]
+
+
+@jit
+def take(base, dx, fraction, now):
+    """``now = base + fraction dx``; they may be the same."""
+    base, dx, now = base.reshape(base.size), dx.reshape(dx.size), now.reshape(now.size)
+    for i in range(now.size):
+        now[i] = base[i] + fraction * dx[i]
+
+
+@jit
+def evaluate(pieces, sizes, sweep, work):
+    """Equations at the present unknowns, and the recursion that solves them linearised."""
+    steps, stages = sizes.block, sizes.stages
+    reach = steps + (sizes.front + 1) * WIDTH
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
+    work.sums[:] = 0.0
+    bad, outside = 0, 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        _gather(work.now, work.x_block, sizes.unknowns, b * steps, reach)
+        _call_rows(pieces.rows, (x, length, z, steps))
+        if sizes.conditions > 0:
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
+            outside += _outside(work.out, sizes, count)
+        call_kernel(pieces.jacobian, (z, inputs, p, out, points))
+        if b == u.shape[0] - 1:
+            _silence(sizes, sweep.lengths, b, count, work.z, work.out)
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        arguments = out, x, length, z, sums, transfer, count
+        bad += _call_eliminate(pieces.eliminate, arguments)
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
+    if outside > 0:
+        return INADMISSIBLE
+    finite = True
+    for k in range(2 * sizes.d):
+        work.measures[k] = total(work.sums[k]) / (sizes.steps * stages)
+        finite = finite and work.measures[k] < np.inf
+    if not finite:
+        return NOT_FINITE
+    return NEEDS_EXCHANGE if bad > 0 else CONVERGED
+
+
+@jit
+def evaluate_again(pieces, sizes, sweep, work):
+    """Equations alone at the present unknowns, solved with the last derivatives; whether the
+    unknowns are admissible."""
+    steps, stages = sizes.block, sizes.stages
+    reach = steps + (sizes.front + 1) * WIDTH
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out = pointer(work.z, 0), pointer(work.out, 0)
+    outside = 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        _gather(work.now, work.x_block, sizes.unknowns, b * steps, reach)
+        _call_rows(pieces.rows, (x, length, z, steps))
+        if sizes.conditions > 0:
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
+            outside += _outside(work.out, sizes, count)
+        call_kernel(pieces.residual, (z, inputs, p, out, points))
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        _call_substitute(pieces.substitute, (out, x, length, transfer, count))
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
+    return outside == 0
+
+
+@jit
+def _gather(now, x, unknowns, begin, reach):
+    """Copy a block's unknowns, and those before it that its steps reach."""
+    for k in range(unknowns):
+        _copy(pointer(now, k * now.shape[1] + begin), pointer(x, k * REACH), reach)
+
+
+@jit
+def _outside(a, sizes, count):
+    """How many points break a condition; one that is not a number shows in the equations."""
+    outside = 0
+    for k in range(sizes.conditions):
+        for stage in range(sizes.stages):
+            values = carray(pointer(a, k * BLOCK + stage * sizes.block), (count,))
+            for i in range(count):
+                outside += values[i] <= 0.0
+    return outside
+
+
+@jit
+def _silence(sizes, lengths, b, count, z, out):
+    """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
+
+    They are equations of a step that stands elsewhere, and can be solved; nothing uses the result.
+    """
+    steps = sizes.block
+    begin = (sizes.rows - 1) * WIDTH - b * steps
+    for stage in range(sizes.stages):
+        for i in range(steps):
+            short = begin <= i < begin + WIDTH and lengths[i - begin] < lengths[0]
+            if i >= count or short:
+                for k in range(sizes.d):
+                    out[k, stage * steps + i] = 0.0
+                for k in range(sizes.nz):
+                    z[k, stage * steps + i] = 0.0
+
+
+@jit
+def close(sizes, sweep, work):
+    """Invert the closure of the period, from the recursion's matrices alone."""
+    D, inverse = sizes.state, work.inverse
+    product = _product(D, sizes.new, sweep, work)
+    closure, growth = np.empty((D, D)), 0.0
+    for i in range(D):
+        largest, size = 0.0, 1.0
+        for k in range(D):
+            inverse[i, k] = 1.0 if i == k else 0.0
+            closure[i, k] = inverse[i, k] - product[i, k]
+            largest = max(largest, abs(closure[i, k]))
+            size += abs(product[i, k])
+        growth = max(growth, size)
+        if not largest > ROUND_OFF * size:
+            return SINGULAR
+    if growth > LARGEST_GROWTH:
+        return NEEDS_EXCHANGE
+    return CONVERGED if eliminate(closure, inverse, ROUND_OFF) else SINGULAR
+
+
+@jit
+def _product(D, new, sweep, work):
+    """Matrix of the recursion from the period's start to its end.
+
+    All :data:`COLUMNS` are computed, needed or not: a loop of known length becomes one instruction.
+    """
+    product, following = work.products[0], work.products[1]
+    for i in range(D):
+        for k in range(COLUMNS):
+            product[i, k] = 1.0 if i == k else 0.0
+    for c in range(WIDTH):
+        first = sweep.lengths[c] * new
+        for i in range(D):
+            at = first + sweep.order[i]
+            for k in range(COLUMNS):
+                following[i, k] = 0.0
+            for o in range(D):
+                factor = work.history[at, o, c]
+                for k in range(COLUMNS):
+                    following[i, k] += factor * product[o, k]
+        product, following = following, product
+    return product
+
+
+@jit
+def start_chunks(sizes, sweep, work, initial):
+    """First state of every chunk: that of the period from its closure, or zero."""
+    D, start, end = sizes.state, work.start, work.products[0, 0]
+    start[:, 0] = 0.0
+    if not initial:
+        _pass(sizes, sweep, work, end)
+        for i in range(D):
+            value = 0.0
+            for k in range(D):
+                value += work.inverse[i, k] * end[k]
+            start[i, 0] = value
+    _pass(sizes, sweep, work, end)
+
+
+@jit
+def _pass(sizes, sweep, work, end):
+    """States at the ends of the chunks, from the first one's start."""
+    D, start = sizes.state, work.start
+    for c in range(WIDTH):
+        first = sweep.lengths[c] * sizes.new
+        for i in range(D):
+            at = first + sweep.order[i]
+            value = work.history[at, D, c]
+            for o in range(D):
+                value += work.history[at, o, c] * start[o, c]
+            if c + 1 < WIDTH:
+                start[i, c + 1] = value
+            else:
+                end[i] = value
+
+
+@jit
+def update(update, sizes, sweep, work):
+    """The Newton step block by block, and at positions that repeat a step."""
+    steps, dx = sizes.block, work.dx
+    per_row = sizes.new * (sizes.state + 1) * WIDTH
+    start, to = pointer(work.start, 0), pointer(work.dx_block, 0)
+    for b in range(sweep.inputs.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_update(update, (transfer, history, start, to, count // WIDTH, WIDTH))
+        begin = sizes.front * WIDTH + b * steps
+        for k in range(sizes.unknowns):
+            at = k * dx.shape[1] + begin
+            _copy(pointer(work.dx_block, k * BLOCK), pointer(dx, at), count)
+    for k in range(sizes.unknowns):
+        for i in range(sizes.front * WIDTH):
+            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
+        for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
+            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]

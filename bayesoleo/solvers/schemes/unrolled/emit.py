@@ -1,0 +1,143 @@
+"""Lines of generated code that all schemes share: systems without inner loops, and the recursion of
+chunks side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bayesoleo.compiled import BLOCK
+from bayesoleo.solvers.schemes.sweep import SMALL_PIVOT
+
+#: Chunks of a period that are swept side by side.
+WIDTH = 8
+#: Distance of rows of unknowns in a block: its own steps, three before and one after.
+REACH = BLOCK + 4 * WIDTH
+
+
+def rows_before(orders: Sequence[int]) -> list[int]:
+    return [sum(orders[:j]) + j for j in range(len(orders))]
+
+
+class Source:
+    """Lines of one function over pointers."""
+
+    def __init__(self, name: str, arguments: str, sizes: dict[str, int]):
+        self.lines = [f"def {name}({arguments}):"]
+        self.lines += [f"    {key} = numba.carray({key}, ({n},))" for key, n in sizes.items()]
+        self.indent = "    "
+
+    def add(self, line: str) -> None:
+        self.lines.append(self.indent + line)
+
+    def loop(self, head: str) -> None:
+        self.add(head)
+        self.indent += "    "
+
+
+def joined(terms: Sequence[str]) -> str:
+    return " + ".join(terms) if terms else "0.0"
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Where an elimination keeps what a later right-hand side needs: behind the transfer."""
+
+    first: int
+    size: int
+    steps: int
+
+    def at(self, i: int, j: int) -> str:
+        return f"transfer[{(self.first + i * self.size + j) * self.steps} + i]"
+
+
+def solve(
+    source: Source, matrix: list[list[str]], right: list[list[str]], factors: Factors
+) -> list[list[str]]:
+    """Emit elimination without exchange of rows, counting pivots that ask for one."""
+    m, k = len(matrix), len(right[0])
+    for i in range(m):
+        for j in range(m):
+            source.add(f"m{i}_{j} = {matrix[i][j]}")
+        for j in range(k):
+            source.add(f"r{i}_{j} = {right[i][j]}")
+        source.add(f"s{i} = abs(m{i}_{i})")
+        source.add(f"o{i} = s{i}")
+    for c in range(m):
+        # What is lost by cancellation shows in the pivot, what is lost beside a large multiple in
+        # the sum of sizes; both comparisons are blind to the units of rows and of columns.
+        source.add(f"size = {SMALL_PIVOT!r}*s{c}")
+        source.add(f"bad += 0 if (abs(m{c}_{c}) > size and size <= o{c}) else 1")
+        source.add(f"v{c} = 1.0/m{c}_{c}")
+        source.add(f"{factors.at(c, c)} = v{c}")
+        for i in range(c + 1, m):
+            source.add(f"f = m{i}_{c}*v{c}")
+            source.add(f"{factors.at(i, c)} = f")
+            for j in range(c + 1, m):
+                source.add(f"g = f*m{c}_{j}")
+                source.add(f"m{i}_{j} -= g")
+                if i == j:
+                    source.add(f"s{i} += abs(g)")
+            for j in range(k):
+                source.add(f"r{i}_{j} -= f*r{c}_{j}")
+        for j in range(c + 1, m):
+            source.add(f"{factors.at(c, j)} = m{c}_{j}")
+    for i in range(m - 1, -1, -1):
+        for j in range(k):
+            done = [f"m{i}_{o}*r{o}_{j}" for o in range(i + 1, m)]
+            source.add(f"r{i}_{j} = (r{i}_{j} - ({joined(done)}))*v{i}")
+    return [[f"r{i}_{j}" for j in range(k)] for i in range(m)]
+
+
+def solve_again(source: Source, right: list[str], factors: Factors) -> list[str]:
+    """Emit the solution for another right-hand side."""
+    m = len(right)
+    for i in range(m):
+        done = [f"{factors.at(i, c)}*r{c}" for c in range(i)]
+        source.add(f"r{i} = {right[i]} - ({joined(done)})")
+    for i in range(m - 1, -1, -1):
+        done = [f"{factors.at(i, o)}*r{o}" for o in range(i + 1, m)]
+        source.add(f"r{i} = (r{i} - ({joined(done)}))*{factors.at(i, i)}")
+    return [f"r{i}" for i in range(m)]
+
+
+def add_squares(source: Source, e: int, d: int, g: str, terms: Sequence[str]) -> None:
+    """Emit the sums of squares of an equation's residual and of its terms."""
+    source.add(f"total = {g}*{g}")
+    source.add(f"sums[{e * BLOCK} + i] += total")
+    for term in terms:
+        source.add(f"term = {term}")
+        source.add("total += term*term")
+    source.add(f"sums[{(d + e) * BLOCK} + i] += total")
+
+
+def chain(
+    new: int, window: int, order: Sequence[int], steps: int, constants_only: bool = False
+) -> str:
+    """Recursion of the chunks; the history is ``(t, new, D + 1, WIDTH)``, oldest first."""
+    past = len(order)
+    columns = past + 1
+    source = Source(
+        "follow" if constants_only else "chain",
+        "transfer, history, rows, width",
+        {"transfer": new * columns * steps, "history": 10**9},
+    )
+    source.loop("for t in range(rows):")
+    source.add(f"base = t*{new * columns * WIDTH}")
+    source.add(f"at = t*{WIDTH}")
+    source.loop("for c in range(width):")  # no constant, or it would be unrolled before
+    factors = [[f"a{i}_{o}" for o in range(columns)] for i in range(new)]
+    for i in range(new):
+        for o in range(columns):
+            source.add(f"{factors[i][o]} = transfer[{(i * columns + o) * steps} + at + c]")
+    for k in range(past if constants_only else 0, columns):
+        for o in range(past):
+            source.add(f"h{o} = history[base + {(order[o] * columns + k) * WIDTH} + c]")
+        for i in range(new):
+            terms = [factors[i][past]] if k == past else []
+            # The latest last: they are what the next step has to wait for.
+            terms += [f"{factors[i][o]}*h{o}" for o in sorted(range(past), key=order.__getitem__)]
+            target = f"history[base + {((window + i) * columns + k) * WIDTH} + c]"
+            source.add(f"{target} = {joined(terms)}")
+    return "\n".join(source.lines)

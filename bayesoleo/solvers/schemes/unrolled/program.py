@@ -1,0 +1,197 @@
+"""Straight-line code of one scheme for dofs of given orders: no inner loop is left but that over
+steps.
+
+A period is cut into :data:`WIDTH` chunks that are swept side by side: step ``t`` of all chunks is
+one vector instruction, and the recursion along the period, which has no parallelism of its own,
+costs no more than what is done node by node. Compiled once for a signature (scheme, orders), not
+once for a model. Rows of a block lie at constant distances, which lets the compiler prove that they
+do not overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+
+from bayesoleo.compiled import BLOCK, COMPILING, load
+from bayesoleo.solvers.schemes.tableau import Tableau
+from bayesoleo.solvers.schemes.unrolled import collocation as collocation_code
+from bayesoleo.solvers.schemes.unrolled import differences as difference_code
+from bayesoleo.solvers.schemes.unrolled.emit import WIDTH, chain
+
+#: Systems up to this size are solved by straight-line code; its length grows as the cube.
+LARGEST = 6
+
+_P, _I = types.CPointer(types.float64), types.intp
+#: Of the pieces, see :class:`Program`.
+SIGNATURES = {
+    "rows": types.void(_P, _P, _P, _I),
+    "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
+    "chain": types.void(_P, _P, _I, _I),
+    "substitute": types.void(_P, _P, _P, _P, _I),
+    "follow": types.void(_P, _P, _I, _I),
+    "update": types.void(_P, _P, _P, _P, _I, _I),
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """Compiled pieces of a Newton step, for one block of steps each, by their addresses.
+
+    Parameters
+    ----------
+    rows : int
+        ``(x, h, z, count)``: values and derivatives of the dofs at the points.
+    eliminate : int
+        ``(out, x, h, z, sums, transfer, count)``: solves for a step's own unknowns, and adds
+        squares of residuals, and of all terms, to ``sums``; returns how many pivots were too small.
+    chain : int
+        ``(transfer, history, rows, width)``: runs the recursion of all chunks through the block.
+    substitute : int
+        ``(out, x, h, transfer, count)``: other equations' constants, by the last elimination.
+    follow : int
+        As ``chain``, for constants only.
+    update : int
+        ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
+        states.
+    orders : tuple of int
+        Order of each dof.
+    stages, unknowns, state, new, window, front : int
+        Points of a step; unknowns of a step; size of the recursion's state; how many of its
+        components a step makes anew; among how many of the history they stand; rows of steps before
+        a block that it looks at.
+    order : tuple of int
+        Where in the history the components of the state stand.
+    transfer : int
+        Rows of a block's transfer, and of the factors behind it.
+    """
+
+    rows: int
+    eliminate: int
+    chain: int
+    substitute: int
+    follow: int
+    update: int
+    orders: tuple[int, ...]
+    stages: int
+    unknowns: int
+    state: int
+    new: int
+    window: int
+    front: int
+    order: tuple[int, ...]
+    transfer: int
+
+    @property
+    def steps(self) -> int:
+        """Steps in a block, a multiple of the width."""
+        return BLOCK // self.stages // WIDTH * WIDTH
+
+
+def _compile(parts: Sequence[str]) -> dict[str, int]:
+    source = "import numba\n\n\n" + "\n\n\n".join(parts) + "\n"
+    module = load(source)
+    addresses = {}
+    for name, signature in SIGNATURES.items():
+        compiler = numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})
+        function: Any = compiler(getattr(module, name))
+        _ALIVE.append(function)
+        addresses[name] = int(function.address)
+    return addresses
+
+
+#: An address does not keep what stands there.
+_ALIVE: list[Any] = []
+
+
+def differences(
+    orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
+) -> Program | None:
+    """Code for backward differences, or None where it would be too long."""
+    return _known(("differences", orders), lambda: _differences(orders, first, second))
+
+
+def collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
+    """Code for a collocation method, or None where it would be too long."""
+    return _known((method.name, orders), lambda: _collocation(method, orders))
+
+
+_PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
+
+
+def _known(key: tuple[str, tuple[int, ...]], make: Callable[[], Program | None]) -> Program | None:
+    with COMPILING:
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = make()
+        return _PROGRAMS[key]
+
+
+def _differences(
+    orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
+) -> Program | None:
+    d = len(orders)
+    if not 1 <= d <= 2:
+        return None
+    order = tuple((3 - past) * d + j for past, j in difference_code.past_nodes(orders))
+    D = len(order)
+    pieces = _compile(
+        [
+            difference_code.rows(orders, first, second),
+            difference_code.elimination(orders, first, second, BLOCK),
+            chain(d, 3 * d, order, BLOCK),
+            difference_code.substitution(orders, BLOCK),
+            chain(d, 3 * d, order, BLOCK, constants_only=True),
+            difference_code.update(orders),
+        ]
+    )
+    return Program(
+        **pieces,
+        orders=orders,
+        stages=1,
+        unknowns=d,
+        state=D,
+        new=d,
+        window=3 * d,
+        front=3,
+        order=order,
+        transfer=d * (D + 1) + d * d,
+    )
+
+
+def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
+    d, s, D = len(orders), method.stages, sum(orders)
+    if not 1 <= s * d <= LARGEST or D > 4:
+        return None
+    steps = BLOCK // s // WIDTH * WIDTH
+    pieces = _compile(
+        [
+            collocation_code.rows(orders, method, steps),
+            collocation_code.elimination(orders, method, steps),
+            chain(D, D, tuple(range(D)), steps),
+            collocation_code.substitution(orders, method, steps),
+            chain(D, D, tuple(range(D)), steps, constants_only=True),
+            collocation_code.update(orders, s, steps),
+        ]
+    )
+    return Program(
+        **pieces,
+        orders=orders,
+        stages=s,
+        unknowns=D + s * d,
+        state=D,
+        new=D,
+        window=D,
+        front=0,
+        order=tuple(range(D)),
+        transfer=(D + s * d) * (D + 1) + (s * d) ** 2,
+    )
+
+
+def chunks(n: int) -> np.ndarray:
+    """Lengths of the chunks of a period of ``n`` steps, shape (WIDTH,), the longest first."""
+    return np.array([n // WIDTH + (c < n % WIDTH) for c in range(WIDTH)], dtype=np.int64)
