@@ -99,7 +99,45 @@ def test_an_unknown_without_effect_keeps_its_prior():
     assert point.status is Status.CONVERGED
     assert point.theta[1] == 5.0
     assert point.sd[1] == pytest.approx(0.5)
-    assert np.isnan(point.covariance_likelihood).all()
+    # what is known of the other one does not suffer
+    np.testing.assert_array_equal(
+        np.isnan(point.covariance_likelihood), [[False, True], [True] * 2]
+    )
+    assert point.notes == ["the data say nothing of theta2: what is known of it is the prior's"]
+
+
+def test_a_product_is_not_taken_apart():
+    """Only a*b is determined: rounding must not pass for a standard deviation of its factors."""
+    y = 2 * TIME + 1 + 0.1 * np.cos(9 * TIME)
+    priors = [Normal(1.0, 1.0), Normal(1.0, 1e6), Normal(0.0, 1.0)]
+    problem = FunctionProblem(lambda x, t: t[0] * t[1] * x + t[2], TIME, y, priors, ["a", "b", "c"])
+    point = estimate(problem)
+    assert point.undetermined == ("a", "b")
+    assert "the data do not determine a, b, at most combinations of these" in str(point)
+    line = estimate(FunctionProblem(lambda x, t: t[0] * x + t[1], TIME, y, priors[1:], ["ab", "c"]))
+    assert line.undetermined == ()
+    np.testing.assert_allclose(
+        point.covariance_likelihood[2, 2], line.covariance_likelihood[1, 1], rtol=1e-6
+    )
+
+
+def test_without_a_prior_what_is_open_has_no_standard_deviation():
+    y = 2 * TIME + 0.1 * np.cos(9 * TIME)
+    priors = [Normal(1.0, 1.0), Normal(1.0, 1.0)]
+    problem = FunctionProblem(lambda x, t: t[0] * t[1] * x, TIME, y, priors, ["a", "b"])
+    point = estimate(problem, "levenberg-marquardt", objective="unweighted")
+    assert np.isnan(point.sd).all()
+    assert point.notes[0].endswith("(see principal_axes): there is no standard deviation")
+
+
+def test_a_fit_to_the_last_digit_is_said_to_be_one():
+    y = decay(TIME, [2.0, 1.5])
+    priors = [Normal(1, 1), Normal(1, 1)]
+    exact = estimate(FunctionProblem(decay, TIME, y, priors))
+    assert exact.exact == ("y",)
+    assert "standard deviations mean nothing" in str(exact)
+    # six digits as in a file are noise like any other
+    assert estimate(FunctionProblem(decay, TIME, np.round(y, 6), priors)).notes == []
 
 
 def test_exact_data_do_not_break_the_staged_variance():

@@ -193,6 +193,23 @@ def test_a_parameter_that_most_runs_leave_open_is_left_out_and_named(lines):
     assert level.min() < view.mean[0] < level.max()
 
 
+def test_what_a_run_does_not_show_at_all_costs_it_nothing_else():
+    """One run at rest has no slope; its level counts as it would without the slope."""
+    rng = np.random.default_rng(5)
+    problems = {}
+    for run, level, reach in (("a", 1.0, 1.0), ("b", 1.2, 0.0), ("c", 0.9, 0.0)):
+        x = np.linspace(-reach, reach, 60)
+        y = level + 2.0 * x + 0.05 * rng.standard_normal(x.size)
+        priors = [Normal(1.0, 1.0), Normal(2.0, 1.0)]
+        problems[run] = FunctionProblem(
+            lambda x, t: t[0] + t[1] * x, x, y, priors, ["level", "slope"]
+        )
+    view = between_runs(estimate_each(problems))
+    assert view.names == ("level",)
+    assert view.runs == ("a", "b", "c")
+    assert view.left_out == ("parameter slope, not determined by run b, c",)
+
+
 def test_what_is_lacking_is_said_where_nothing_can_be_compared(lines):
     each = estimate_each(lines)
     for run in "abc":

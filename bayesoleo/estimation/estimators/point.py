@@ -18,6 +18,18 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+#: Notes on estimates whose standard deviations are not what they seem.
+EXACT = (
+    "{} is fitted to the rounding of its samples: there is no noise to estimate, and standard "
+    "deviations mean nothing"
+)
+SILENT = "the data say nothing of {}"
+UNDETERMINED = "the data do not determine {}, at most combinations of these (see principal_axes)"
+FROM_PRIOR = ": what is known of it is the prior's"
+NO_SD = ": there is no standard deviation"
+_MOST_NAMES = 8
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class PointEstimate:
     """Result of an estimator.
@@ -34,7 +46,7 @@ class PointEstimate:
         Linearised with the prior's variances, ``[A + diag(w)^-1]^-1``; NaN after a failed start.
         Where the prior is log-normal, ``w`` is that of the logarithm times the squared estimate.
     covariance_likelihood : ndarray, shape (l, l)
-        Linearised without the prior, ``A^-1``; NaN where ``A`` is singular.
+        Linearised without the prior, ``A^-1``; NaN for the unknowns that the data do not determine.
     method : str
     status : Status
         ``NO_CONVERGENCE`` also where the steps became small away from the fixed point.
@@ -66,6 +78,8 @@ class PointEstimate:
     stability : Stability, optional
         Floquet multipliers of each run's periodic solution at the estimate, and how often one
         jumped to another branch on the way; None where there are no periodic solutions.
+    exact : tuple of str
+        Outputs that are fitted to the rounding of their samples.
     """
 
     names: tuple[str, ...]
@@ -91,6 +105,7 @@ class PointEstimate:
     error_covariance: Array | None = field(default=None, repr=False)
     failures: Mapping[str, int] = field(default_factory=dict)
     stability: Stability | None = field(default=None, repr=False)
+    exact: tuple[str, ...] = ()
 
     @property
     def sd(self) -> Array:
@@ -103,9 +118,22 @@ class PointEstimate:
         return 0 if self.stability is None else self.stability.branch_jumps
 
     @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Unknowns that the data alone do not determine; none after a failed start."""
+        open_ones = np.isnan(np.diag(self.covariance_likelihood)) & (len(self.history) > 0)
+        return tuple(name for name, is_open in zip(self.names, open_ones, strict=True) if is_open)
+
+    @property
     def notes(self) -> list[str]:
-        """What to know of the solutions behind the estimate, such as that one is unstable."""
-        return [] if self.stability is None else self.stability.notes()
+        """What to know of an estimate, such as that the solution behind it is unstable."""
+        notes = [] if self.stability is None else self.stability.notes()
+        if self.exact:
+            notes.append(EXACT.format(", ".join(self.exact)))
+        if self.undetermined:
+            text = SILENT if len(self.undetermined) == 1 else UNDETERMINED
+            text += FROM_PRIOR if np.isfinite(self.sd).all() else NO_SD
+            notes.append(text.format(_listed(self.undetermined)))
+        return notes
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])
@@ -133,3 +161,9 @@ class PointEstimate:
         from bayesoleo.estimation.estimators.table import to_dataset
 
         return to_dataset(self, **options)  # type: ignore[arg-type]
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """Names in a sentence; of many the first ones."""
+    rest = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")

@@ -9,11 +9,21 @@ from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
 from bayesoleo.estimation.objectives.diagonal import output_counts, staged_variance, sums_of_squares
 from bayesoleo.estimation.objectives.error_models import CommonErrors, DiagonalErrors
-from bayesoleo.estimation.objectives.linearise import Linearised, inverse_gram
+from bayesoleo.estimation.objectives.linearise import (
+    RANK,
+    Linearised,
+    inverse_gram,
+    masked,
+    pseudo_inverse_gram,
+)
 from bayesoleo.estimation.objectives.objective import Objective
 from bayesoleo.estimation.problems.problem import Array, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.prediction.stability import Stability
+
+# Residuals below this part of the largest sample are rounding: of a sum of hundreds of terms, or of
+# samples that were written with thirteen digits.
+_ROUNDING = 1e-13
 
 
 def summarise(
@@ -59,7 +69,19 @@ def summarise(
         on_limit=tuple(name for name, at in zip(problem.names, held, strict=True) if at),
         objective_name=objective.name,
         error_covariance=error,
+        exact=_exact(problem, np.diag(error)),
     )
+
+
+def _exact(problem: Problem, variance: Array) -> tuple[str, ...]:
+    """Outputs whose residuals are as small as the rounding of their samples, where those are
+    known."""
+    data = getattr(problem, "data", None)
+    if data is None:
+        return ()
+    sizes = [_ROUNDING * float(np.abs(values).max(initial=0.0)) for values in data]
+    columns = zip(problem.outputs, sizes, np.sqrt(variance), strict=True)
+    return tuple(name for name, size, sd in columns if sd <= size)
 
 
 def _stability(problem: Problem, outcome: Outcome) -> Stability | None:
@@ -103,13 +125,14 @@ def _covariances(
     units = np.outer(unit, unit)
     if isinstance(errors, CommonErrors):
         size = len(error)
-        plain = inverse_gram(errors.rows(outcome.evaluation, unit, np.ones(size))[0])
+        rows = errors.rows(outcome.evaluation, unit, np.ones(size))[0]
+        plain, undetermined = pseudo_inverse_gram(rows, RANK)
         scores = Linearised.of(outcome.evaluation, unit).whitened(1 / np.diag(error))[0]
-        likelihood = plain @ (scores.T @ scores) @ plain * units
+        likelihood = masked(plain @ (scores.T @ scores) @ plain * units, undetermined)
         return likelihood, likelihood
     held = np.diag(error) if isinstance(errors, DiagonalErrors) else error
     rows = errors.rows(outcome.evaluation, unit, held)[0]
-    likelihood = units * inverse_gram(rows)
+    likelihood = units * inverse_gram(rows, RANK)
     if not objective.prior:
         return likelihood, likelihood
     return units * inverse_gram(np.vstack((rows, scale.root))), likelihood

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from numpy.typing import NDArray
 
 from bayesoleo.estimation.problems.problem import Array, Evaluation
 
@@ -18,6 +18,9 @@ _BLOCK = 1024
 #: Singular values below this part of the largest are zero but for the derivatives' rounding, which
 #: reaches 1e-13 of a column where they are differences. Certified sets need down to 1e-9.
 RANK = 1e-11
+# Part of an unknown, its column of unit length, that lies in directions without a singular value:
+# those are known to the derivatives' rounding over the least singular value that counts.
+_TAKES_PART = 1e-3
 
 
 @dataclass(frozen=True)
@@ -95,18 +98,55 @@ def least_squares(rows: Array, target: Array, rank: float | None = None) -> Arra
     return solution / length
 
 
-def inverse_gram(rows: Array) -> Array:
-    """``(rows' rows)^-1``, shape (l, l); NaN where the columns are linearly dependent."""
-    length = np.linalg.norm(rows, axis=0)
+def inverse_gram(rows: Array, rank: float | None = None) -> Array:
+    """``(rows' rows)^-1``, NaN for the unknowns that the rows do not determine.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (k, l)
+    rank : float, optional
+        As in :func:`least_squares`.
+
+    Returns
+    -------
+    ndarray, shape (l, l)
+        Rows and columns of undetermined unknowns are NaN; the others are as if those were held.
+    """
+    return masked(*pseudo_inverse_gram(rows, rank))
+
+
+def masked(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+    """A covariance (l, l) with NaN in the rows and columns of some unknowns, shape (l,)."""
+    return np.where(undetermined | undetermined[:, None], np.nan, covariance)
+
+
+def pseudo_inverse_gram(rows: Array, rank: float | None = None) -> tuple[Array, NDArray[np.bool_]]:
+    """Moore and Penrose's inverse of ``rows' rows``, and which unknowns have none of their own.
+
+    Columns are brought to unit length first, as in :func:`least_squares`: a rank must not depend on
+    units.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (k, l)
+    rank : float, optional
+        As in :func:`least_squares`.
+
+    Returns
+    -------
+    inverse : ndarray, shape (l, l)
+        In the unknowns' units.
+    undetermined : ndarray of bool, shape (l,)
+        Unknowns that take part in a direction along which the rows do not change.
+    """
     unknowns = rows.shape[1]
-    if unknowns == 0:
-        return np.empty((0, 0))
-    missing = np.full((unknowns, unknowns), np.nan)
-    if rows.shape[0] < unknowns or not np.isfinite(length).all() or (length == 0).any():
-        return missing
-    triangle = np.linalg.qr(rows / length, mode="r")
-    singular = np.linalg.svd(triangle, compute_uv=False)
-    if singular[-1] <= np.finfo(float).eps * max(rows.shape) * singular[0]:
-        return missing
-    root = solve_triangular(triangle, np.eye(unknowns)) / length[:, None]
-    return root @ root.T
+    length = np.linalg.norm(rows, axis=0)
+    if unknowns == 0 or not np.isfinite(length).all():
+        return np.zeros((unknowns, unknowns)), np.ones(unknowns, dtype=bool)
+    unit = np.where(length > 0, length, 1.0)
+    _, singular, directions = np.linalg.svd(triangle(rows / unit))
+    limit = np.finfo(float).eps * max(rows.shape) if rank is None else rank
+    count = int(np.sum(singular > limit * singular[0])) if singular.size else 0
+    root = directions[:count].T / singular[:count] / unit[:, None]
+    open_part = np.sqrt(np.sum(directions[count:] ** 2, axis=0))
+    return root @ root.T, open_part > _TAKES_PART

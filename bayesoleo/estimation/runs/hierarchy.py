@@ -25,20 +25,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Array
+from bayesoleo.estimation.runs.comparable import check_definite, comparable
+from bayesoleo.estimation.runs.scatter import (
+    generalised_mean,
+    restricted_maximum_likelihood,
+    spread_interval,
+)
 
 _MIXED = "unit of each parameter"
-
-#: A run says nothing of a parameter where its data alone leave the standard deviation a thousand
-#: times larger than the prior does: in a mean over runs its weight would be a millionth.
-UNDETERMINED = 1e-6
-#: Smallest eigenvalue of a matrix of correlations, a parameter, that rounding can be told from.
-SINGULAR = 10 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -169,78 +168,22 @@ def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
             value="be",
             hint='estimate each run with "mbe"',
         )
-    good = each["status"].values == "converged"
-    names = each[schema.PARAMETER].values.astype(str)
-    runs = each[schema.RUN].values.astype(str)
-    covariances = each["covariance_likelihood"].values
-    # A singular covariance is lost as a whole and tells no parameter from another.
-    regular = good & np.isfinite(covariances).all(axis=(1, 2))
-    determined = _determined(each)
-    kept = 2 * determined[regular].sum(axis=0) > regular.sum()
-    covariances = covariances[:, kept][:, :, kept]
-    usable = regular & determined[:, kept].all(axis=1)
-    usable[usable] = [_is_definite(S) for S in covariances[usable]]
-    left_out = _left_out(names, runs, good, regular, determined, kept, usable)
-    if usable.sum() < 2 or not kept.any():
+    chosen = comparable(each)
+    runs, kept = chosen.runs, chosen.parameters
+    if runs.sum() < 2 or not kept.any():
         raise InputError(
             "a scatter between runs needs two runs that were estimated and determine a parameter",
-            value=runs[usable].tolist(),
-            hint="left out: " + "; ".join(left_out) if left_out else None,
+            value=each[schema.RUN].values[runs].tolist(),
+            hint="left out: " + "; ".join(chosen.left_out) if chosen.left_out else None,
         )
     view = pooled(
-        each[schema.ESTIMATE].values[usable][:, kept],
-        covariances[usable],
-        names=names[kept].tolist(),
-        runs=runs[usable].tolist(),
+        each[schema.ESTIMATE].values[runs][:, kept],
+        each["covariance_likelihood"].values[runs][:, kept][:, :, kept],
+        names=each[schema.PARAMETER].values[kept].astype(str).tolist(),
+        runs=each[schema.RUN].values[runs].astype(str).tolist(),
         level=level,
     )
-    return replace(view, left_out=left_out)
-
-
-def _determined(each: xr.Dataset) -> NDArray[np.bool_]:
-    """Which parameters a run's data determine beside the prior, shape (N, l)."""
-    alone, with_prior = (
-        np.diagonal(each[name].values, axis1=1, axis2=2)
-        for name in ("covariance_likelihood", schema.COVARIANCE)
-    )
-    possible = np.isfinite(alone) & (alone > 0)
-    # Without a finite covariance under the prior there is nothing to compare with.
-    compared = np.isfinite(with_prior) & (with_prior > 0)
-    return possible & ~(compared & (with_prior < UNDETERMINED * np.where(possible, alone, 1.0)))
-
-
-def _is_definite(covariance: Array) -> bool:
-    """Whether a covariance is positive definite, in the units of its own standard deviations."""
-    variance = np.diag(covariance)
-    if not (variance.size and np.isfinite(covariance).all() and (variance > 0).all()):
-        return False
-    sd = np.sqrt(variance)
-    return bool(np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] > SINGULAR * sd.size)
-
-
-def _left_out(
-    names: NDArray[np.str_],
-    runs: NDArray[np.str_],
-    good: NDArray[np.bool_],
-    regular: NDArray[np.bool_],
-    determined: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    usable: NDArray[np.bool_],
-) -> tuple[str, ...]:
-    """What is not compared, and why, a clause each."""
-    said = []
-    for k in np.flatnonzero(~kept) if regular.any() else ():
-        where = ", ".join(runs[regular & ~determined[:, k]])
-        said.append(f"parameter {names[k]}, not determined by run {where}")
-    for n in np.flatnonzero(~usable):
-        lacking = ", ".join(names[kept & ~determined[n]])
-        if not good[n]:
-            said.append(f"run {runs[n]}, did not converge")
-        elif regular[n] and lacking:
-            said.append(f"run {runs[n]}, does not determine {lacking}")
-        elif kept.any() or not regular[n]:
-            said.append(f"run {runs[n]}, does not tell {', '.join(names)} apart")
-    return tuple(said)
+    return replace(view, left_out=chosen.left_out)
 
 
 def pooled(
@@ -277,13 +220,13 @@ def pooled(
             "a scatter between runs needs two runs that were estimated", value=list(runs)
         )
     for run, covariance in zip(runs, S, strict=True):
-        _check_definite(run, covariance, names)
+        check_definite(run, covariance, names)
     diagonal = np.diagonal(S, axis1=1, axis2=2)
     # In units of the estimates' own size of scatter and error, in which no parameter is special.
     unit = np.sqrt(np.var(y, axis=0, ddof=1) + np.mean(diagonal, axis=0))
     y, S = y / unit, S / np.outer(unit, unit)
-    T = _restricted_maximum_likelihood(y, S)
-    mean, C, W = _generalised_mean(y, S, T)
+    T = restricted_maximum_likelihood(y, S)
+    mean, C, W = generalised_mean(y, S, T)
     r, (N, n) = y - mean, y.shape
     # Refined by the scatter that is left: one in expectation.
     C_refined = C * np.einsum("ni,nij,nj->", r, W, r) / (n * (N - 1))
@@ -292,7 +235,7 @@ def pooled(
     pull = T @ W
     rest = np.eye(n) - pull
     left = T - pull @ T + rest @ C @ rest.mT
-    alone = [_alone(y[:, k], S[:, k, k], level) for k in range(n)]
+    alone = [spread_interval(y[:, k], S[:, k, k], level) for k in range(n)]
     return Hierarchy(
         names=tuple(names),
         runs=tuple(runs),
@@ -307,68 +250,3 @@ def pooled(
         shrunken_sd=np.sqrt(np.diagonal(left, axis1=1, axis2=2)) * unit,
         level=level,
     )
-
-
-def _check_definite(run: str, covariance: Array, names: Sequence[str]) -> None:
-    """Raise where a covariance is singular, with the parameters that are to blame."""
-    if _is_definite(covariance):
-        return
-    variance = np.diag(covariance)
-    lacking = [n for n, v in zip(names, variance, strict=True) if not (np.isfinite(v) and v > 0)]
-    raise InputError(
-        "the covariance of this run's estimate is not positive definite",
-        run=run,
-        key=", ".join(lacking or names),
-        hint="leave the run or the parameter out",
-    )
-
-
-def _generalised_mean(y: Array, S: Array, T: Array) -> tuple[Array, Array, Array]:
-    """Mean (l,), its covariance (l, l) and the weights ``(S + T)^-1`` (N, l, l)."""
-    W = np.linalg.inv(S + T)
-    C = np.linalg.inv(W.sum(axis=0))
-    return C @ np.einsum("nij,nj->i", W, y), C, W
-
-
-def _restricted_maximum_likelihood(y: Array, S: Array) -> Array:
-    """Spread T, shape (l, l), through its Cholesky factor, so that it is no negative variance."""
-    n = y.shape[1]
-    rows, columns = np.tril_indices(n)
-
-    def spread(x: Array) -> tuple[Array, Array]:
-        L = np.zeros((n, n))
-        L[rows, columns] = x
-        return L @ L.T, L
-
-    def negative(x: Array) -> tuple[float, Array]:
-        T, L = spread(x)
-        mean, C, W = _generalised_mean(y, S, T)
-        Wr = np.einsum("nij,nj->ni", W, y - mean)
-        value = np.sum((y - mean) * Wr) - np.linalg.slogdet(W)[1].sum() - np.linalg.slogdet(C)[1]
-        slope = W.sum(axis=0) - Wr.T @ Wr - np.einsum("nij,jk,nkl->il", W, C, W)
-        return 0.5 * float(value), (slope @ L)[rows, columns]
-
-    # From far too much spread and from little: none at all is a stationary point.
-    starts = [factor * np.eye(n)[rows, columns] for factor in (1.0, 0.1)]
-    found = [optimize.minimize(negative, x, jac=True, method="BFGS") for x in starts]
-    return spread(min(found, key=lambda item: item.fun).x)[0]
-
-
-def _alone(y: Array, variance: Array, level: float) -> tuple[tuple[float, float], float]:
-    """Interval of one parameter's spread by Q-profile, and the probability of Cochran's Q."""
-    freedom = y.size - 1
-
-    def q(spread_squared: float) -> float:
-        w = 1.0 / (variance + spread_squared)
-        return float(np.sum(w * (y - np.sum(w * y) / w.sum()) ** 2))
-
-    def crossing(target: float) -> float:
-        if q(0.0) <= target:
-            return 0.0
-        high = 1.0
-        while q(high) > target:
-            high *= 4.0
-        return float(np.sqrt(optimize.brentq(lambda t: q(t) - target, 0.0, high, xtol=1e-14)))
-
-    low, high = (stats.chi2.ppf(p, freedom) for p in (0.5 + 0.5 * level, 0.5 - 0.5 * level))
-    return (crossing(low), crossing(high)), float(stats.chi2.sf(q(0.0), freedom))
