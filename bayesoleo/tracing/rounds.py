@@ -51,6 +51,8 @@ class Ranked:
         Whether it was.
     same : tuple of str
         Ids of effects that these data cannot tell from it.
+    refit : Refit or None
+        The extended model, where it was estimated.
     """
 
     score: Score
@@ -58,6 +60,7 @@ class Ranked:
     gain: float
     refitted: bool
     same: tuple[str, ...]
+    refit: Refit | None = None
 
     @property
     def effect(self) -> str:
@@ -155,7 +158,8 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
             fitted = None  # an estimate that failed says no more than the score
         # The excess is known up to noise: what explains all of it must not seem to explain more.
         gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
-        ranked.append(Ranked(score, corrected_p(score, tests), gain, fitted is not None, same))
+        p = corrected_p(score, tests)
+        ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted))
     # What was estimated is known better than what was only scored, and comes first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
 
