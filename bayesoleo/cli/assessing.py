@@ -160,6 +160,7 @@ def predict(
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
     as_json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Predict runs that were not used, with intervals, and score the prediction.
 
@@ -184,7 +185,7 @@ def predict(
     labels = None if runs is None else [label.strip() for label in runs.split(",")]
     found = foresee(
         read_tree(results),
-        workflow.reduce(campaign, jobs=jobs),
+        workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet)),
         model=None if model is None else load_model(model),
         runs=labels,
         draws=draws,

@@ -1,153 +1,29 @@
-"""Steps of the loop, each a command of its own: reduce, estimate, sample, trace."""
+"""Steps of the loop, each a command of its own: estimate, sample, trace."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from bayesoleo import schema
 from bayesoleo.cli import each as by_run
 from bayesoleo.cli import options, shell, tables
+from bayesoleo.cli.reducing import PANEL
 
 if TYPE_CHECKING:
     import xarray as xr
     from rich.console import Console
 
-    from bayesoleo.data import ReducedCampaign
-
-PANEL = "Single steps"
 #: Candidates that ``trace`` shows in the terminal.
 SHOWN = 12
 
 
 def add_to(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    shell.add(app, PANEL, reduce, estimate, sample, trace)
-
-
-def reduce(
-    campaign: options.CampaignPath,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE.nc",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Write samples, constants and noise to a netCDF file as well.",
-        ),
-    ] = None,
-    as_json: options.Json = False,
-    jobs: options.Jobs = None,
-    quiet: options.Quiet = False,
-) -> None:
-    """Show what the records of a campaign hold: frequencies, whole periods, harmonics and noise.
-
-    Frequencies are refined from the declared ones; leading periods that have not settled are left
-    out. Of each channel the significant harmonics are counted; its noise is the standard deviation
-    of a single sample about the periodic mean. A channel that drifts and a frequency that is half
-    the true one are warned of. Writes nothing without --out.
-
-    \b
-    Examples:
-      bayesoleo reduce shaker
-      bayesoleo reduce shaker --json > runs.json
-    """
-    from bayesoleo import workflow
-    from bayesoleo.data import findings
-
-    if out is not None:
-        shell.check_writable(out.parent)
-    found = workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet))
-    if out is not None:
-        _write_records(found, out)
-    if as_json:
-        units = {name: channel.si_unit for name, channel in found.campaign.channels.items()}
-        facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
-        facts["findings"] = findings(found.records)
-        shell.print_json(tables.plain(facts))
-    else:
-        _print_records(found, shell.console())
-        for sentence in findings(found.records):
-            shell.complain(f"warning: {sentence}")
-
-
-def _runs(reduced: ReducedCampaign) -> list[dict[str, Any]]:
-    """What there is to say of every run, SI."""
-    return [
-        {
-            "run": record.label,
-            "role": record.role,
-            "group": record.group,
-            "kind": record.kind,
-            "frequency": record.frequency,
-            "frequency_sd": record.frequency_sd,
-            "periods": record.periods,
-            "dropped_periods": record.dropped_periods,
-            "samples": record.time.size,
-            "conditions": dict(record.conditions),
-            "channels": {
-                name: {
-                    "harmonics": _orders(record.harmonics.get(name)),
-                    "noise": record.signal_noise[name],
-                }
-                for name in record.samples
-            },
-        }
-        for record in reduced.records
-    ]
-
-
-def _orders(harmonics: Any) -> int | None:
-    """Number of significant harmonics, the mean not counted."""
-    return None if harmonics is None else int((harmonics.orders > 0).sum())
-
-
-def _print_records(reduced: ReducedCampaign, console: Console) -> None:
-    from bayesoleo.plots.units import engineering
-
-    runs, channels = _runs(reduced), reduced.campaign.channels
-    head = ["run", "role", "frequency [Hz]", "± sd", "periods", "left out", "samples"]
-    cells: list[list[Any]] = [
-        [
-            run["run"],
-            run["role"],
-            f"{run['frequency']:.6g}" if run["kind"] == "periodic" else None,
-            float(run["frequency_sd"]),
-            run["periods"] or None,
-            run["dropped_periods"],
-            run["samples"],
-        ]
-        for run in runs
-    ]
-    for name, channel in channels.items():
-        noise = [run["channels"][name]["noise"] for run in runs]
-        scale = engineering(channel.si_unit, sorted(noise)[len(noise) // 2])
-        head += [f"{name}: harmonics", f"noise [{scale.unit or '1'}]"]
-        for row, run, level in zip(cells, runs, noise, strict=True):
-            row += [run["channels"][name]["harmonics"], f"{scale.factor * level:.3g}"]
-    console.print(tables.table(head, cells, words=2))
-
-
-def _write_records(reduced: ReducedCampaign, out: Path) -> None:
-    import xarray as xr
-
-    from bayesoleo.storage import provenance, write_tree
-    from bayesoleo.tracing.result import records_tree
-
-    campaign = reduced.campaign
-    tree = xr.DataTree.from_dict(records_tree(list(reduced.records), campaign))
-    about = {
-        schema.CAMPAIGN: campaign.name,
-        schema.CAMPAIGN_DESCRIPTION: campaign.description,
-        schema.CAMPAIGN_SHA256: campaign.sha256,
-    }
-    tree.attrs.update(provenance(None, **about))
-    write_tree(tree, out)
+    shell.add(app, PANEL, estimate, sample, trace)
 
 
 def estimate(

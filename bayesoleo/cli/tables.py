@@ -25,7 +25,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], words: int = 1) ->
     """
     made = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
     for column, title in enumerate(head):
-        made.add_column(Text(title), justify="left" if column < words else "right")
+        # What does not fit goes on in the next line: an ellipsis would take digits away.
+        on_left = column < words
+        made.add_column(Text(title), justify="left" if on_left else "right", overflow="fold")
     for row in rows:
         made.add_row(*(Text(cell_text(cell)) for cell in row))
     return made

@@ -1,4 +1,5 @@
-"""What deserves a look in reduced records, as sentences: drift, and a frequency too low."""
+"""What deserves a look in reduced records, as sentences: drift, and a frequency that is a multiple
+or a fraction of the true one."""
 
 from __future__ import annotations
 
@@ -6,11 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bayesoleo.data.averaging import average_on
 from bayesoleo.data.drift import Drift, drifting
+from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.prediction.records import Record
 
-#: Part of the power that harmonics off the multiples may hold: noise passes for one at times.
-STRAY_POWER = 1e-5
+#: Part of the power that harmonics off the multiples may hold, and their power over that of the
+#: noise (twice its variance), which noise exceeds twice in a thousand million: what is below either
+#: is no motion.
+STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
+#: A longer period is taken for the motion's own if no more than this part of what does not repeat
+#: in the declared period is left in it. Of noise all is left.
+LEFT = 0.25
+#: Multiples of the declared period that are tried.
+LONGER = (2, 3)
 
 
 def motions_per_period(record: Record) -> int:
@@ -26,17 +36,46 @@ def motions_per_period(record: Record) -> int:
         The greatest common divisor of the harmonics that stand above the noise of any channel; one
         for a transient.
     """
-    orders: set[int] = set()
-    power: dict[int, float] = {}
+    strong: set[int] = set()
     for harmonics in record.harmonics.values():
-        share = np.abs(harmonics.coefficients) ** 2
-        share = share / max(float(share[harmonics.orders > 0].sum()), np.finfo(float).tiny)
-        for order, part in zip(harmonics.orders, share, strict=True):
-            if order > 0:
-                orders.add(int(order))
-                power[int(order)] = max(power.get(int(order), 0.0), float(part))
-    strong = [order for order in orders if power[order] > STRAY_POWER]
-    return int(np.gcd.reduce(strong)) if strong else 1
+        power, moves = np.abs(harmonics.coefficients) ** 2, harmonics.orders > 0
+        least = STRAY_POWER * float(power[moves].sum())
+        clear = power > np.maximum(least, 2 * STRAY_RATIO * harmonics.variances)
+        strong.update(int(order) for order in harmonics.orders[moves & clear])
+    return int(np.gcd.reduce(sorted(strong))) if strong else 1
+
+
+def periods_per_motion(record: Record) -> tuple[int, str]:
+    """After how many declared periods the motion repeats: two where the frequency is double.
+
+    Parameters
+    ----------
+    record : Record
+
+    Returns
+    -------
+    periods : int
+        One for a transient, and where the record is too short to tell or has stretches left out.
+    channel : str
+        Which shows it best; empty where it is one.
+    """
+    if not record.periodic or record.kept is not None:
+        return 1, ""
+    step = record.frequency * (record.time[-1] - record.time[0]) / (record.time.size - 1)
+    for count in LONGER:
+        # Two of the longer periods at least, or there is nothing to compare.
+        if record.periods < 2 * count:
+            continue
+        basis = HarmonicBasis(record.time.size, step / count)
+        left = {
+            name: average_on(basis, values).sigma / max(record.signal_noise[name], 1e-300)
+            for name, values in record.samples.items()
+            if np.ptp(values) > 0
+        }
+        name = min(left, key=lambda name: left[name], default="")
+        if name and left[name] ** 2 < LEFT:
+            return count, name
+    return 1, ""
 
 
 def findings(records: Sequence[Record]) -> list[str]:
@@ -52,15 +91,37 @@ def findings(records: Sequence[Record]) -> list[str]:
     list of str
         Each names the run, what was found and what to write.
     """
+    found = frequency_findings(records)
+    return found + [_sentence(record, item) for record in records for item in drifting(record)]
+
+
+def frequency_findings(records: Sequence[Record]) -> list[str]:
+    """Those about declared frequencies, which make everything else that is found doubtful.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Reduced runs.
+
+    Returns
+    -------
+    list of str
+    """
     found = []
     for record in records:
         times = motions_per_period(record)
         if times > 1:
             found.append(
-                f"run {record.label}: the motion repeats {times} times in a declared period; "
-                f"write frequency = {times * record.frequency:.4g}"
+                f"run {record.label}: the motion repeats {times} times in a declared period, as if "
+                f"that were {times} periods; write frequency = {times * record.frequency:.4g}"
             )
-        found += [_sentence(record, item) for item in drifting(record)]
+        count, channel = periods_per_motion(record)
+        if count > 1:
+            found.append(
+                f"run {record.label}: {channel} repeats after {count} declared periods only, and "
+                f"what differs between them counts as noise; write frequency = "
+                f"{record.frequency / count:.4g}"
+            )
     return found
 
 

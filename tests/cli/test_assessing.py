@@ -74,8 +74,9 @@ def test_unused_run_is_predicted_and_scored(run, campaign, model, tmp_path):
     result = run("estimate", campaign, "--model", model, "--out", out, "--quiet", "--jobs", 1)
     assert result.exit_code == 0, result.output
     arguments = ["predict", out / "results.nc", campaign, "--runs", "fast", "--jobs", 1]
-    result = run(*arguments, "--figure", tmp_path / "bands.png")
+    result = run(*arguments, "--figure", tmp_path / "bands.png", "--quiet")
     assert result.exit_code == 0, result.output
+    assert result.stderr == ""
     assert "within 95 %" in result.stdout
     assert (tmp_path / "bands-displacement.png").stat().st_size > 10_000
     numbers = json.loads(run(*arguments, "--json").stdout)["data_vars"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 
 import pytest
 import typer.main
+from rich.console import Console
 
 from bayesoleo import schema, workflow
-from bayesoleo.cli import app, options
+from bayesoleo.cli import app, options, shell, tables
 from bayesoleo.cli.listing import readable
 from bayesoleo.effects import catalogue
 from bayesoleo.solvers.schemes.choose import scheme
@@ -97,13 +100,37 @@ def test_reduce(run, campaign, tmp_path):
     # 400 samples: the standard error of a standard deviation is 3.5 %.
     assert slow["channels"]["force"]["noise"] == pytest.approx(0.02, rel=0.15)
     text = run("reduce", campaign).stdout
-    assert "displacement: harmonics" in text
     assert "hold-out" in text
+    assert re.search(r"run +force \[mN\] +displacement \[µm\]", text)
+    assert re.search(r"slow +\d\S* \(1\) +\d\S* \(1\)", text)
     file = tmp_path / "records.nc"
     assert run("reduce", campaign, "--out", file).exit_code == 0
     tree = read_tree(file)
     assert tree.attrs[schema.CAMPAIGN] == "mass on a spring"
     assert list(tree[schema.NOISE].to_dataset().data_vars) == ["force", "displacement"]
+
+
+def test_tables_of_records_fit_a_terminal(run, campaign, tmp_path, monkeypatch):
+    """Three channels and times of many digits, in eighty columns: no word broken, no digit lost."""
+    toml = campaign / "campaign.toml"
+    text = toml.read_text(encoding="utf-8")
+    more = '[channels.pressure]\ncolumn = "f_N"\nunit = "Pa"\n\n[channels.force]'
+    toml.write_text(text.replace("[channels.force]", more), encoding="utf-8")
+    narrow = Console(width=80, highlight=False, soft_wrap=False)
+    monkeypatch.setattr(shell, "console", lambda: narrow)
+    text = run("reduce", campaign, "--quiet").stdout
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in text
+    assert "frequency [Hz]" in lines[0]
+    assert "pressure [mPa]" in text
+
+
+def test_what_a_narrow_terminal_cannot_hold_in_a_line_is_folded():
+    console = Console(width=20, file=io.StringIO())
+    console.print(tables.table(["run", "value"], [["abcdefghijklmnopqrstuvwxyz", 1.234e-5]]))
+    letters = re.findall(r"^[a-z]+", console.file.getvalue(), re.MULTILINE)
+    assert "".join(letters[1:]) == "abcdefghijklmnopqrstuvwxyz"
 
 
 def test_check_touches_nothing(run, campaign, model, tmp_path):

@@ -14,6 +14,7 @@ from bayesoleo.data import (
     motions_per_period,
     on_grid,
     period_search,
+    periods_per_motion,
     reduce_campaign,
     write_campaign,
 )
@@ -92,10 +93,10 @@ def test_without_trend_probabilities_are_those_of_chance(coefficient):
     assert stats.kstest(scores, "norm").statistic < 0.12
 
 
-def reduced(folder, build, frequency=FREQUENCY):
+def reduced(folder, build, frequency=FREQUENCY, force=signal, noise=0.1):
     rng = np.random.default_rng(3)
     x = build(rng)
-    force = 3 * signal(FREQUENCY * TIME) + 0.1 * rng.standard_normal(TIME.size)
+    force = 3 * force(FREQUENCY * TIME) + noise * rng.standard_normal(TIME.size)
     run = SimulatedRun("only", TIME, {"displacement": x, "force": force}, frequency)
     channels = {"displacement": ("x_m", "m"), "force": ("f_N", "N")}
     write_campaign(folder, name="one", channels=channels, runs=[run])
@@ -116,7 +117,43 @@ def test_half_the_frequency_is_found_out(tmp_path):
     (record,) = reduced(tmp_path, noisy, frequency=FREQUENCY / 2).records
     assert motions_per_period(record) == 2
     (sentence,) = findings([record])
-    assert "repeats 2 times in a declared period; write frequency = 2" in sentence
+    assert sentence.startswith("run only: the motion repeats 2 times in a declared period")
+    assert sentence.endswith("write frequency = 2")
+
+
+@pytest.mark.parametrize("part", [2, 3])
+def test_a_part_of_the_frequency_is_found_out_under_noise(tmp_path, part):
+    """A harmonic that noise lifts over the threshold once in a while is no motion."""
+    for noise in (0.3, 1.0):
+        (record,) = reduced(tmp_path / f"{noise}", noisy, FREQUENCY / part, noise=noise).records
+        assert motions_per_period(record) == part
+
+
+def test_twice_the_frequency_does_not_repeat(tmp_path):
+    with pytest.raises(InputError, match=r"does not repeat near the declared .*about 1.99. Hz"):
+        reduced(tmp_path, noisy, frequency=2 * FREQUENCY)
+
+
+def test_twice_the_frequency_is_found_out_where_one_channel_does_repeat(tmp_path):
+    """A pressure over a stroke that goes both ways has even harmonics only."""
+
+    def even(phase):
+        return np.cos(4 * np.pi * phase)
+
+    (record,) = reduced(tmp_path, noisy, 2 * FREQUENCY, even).records
+    assert record.frequency == pytest.approx(2 * FREQUENCY, rel=1e-3)
+    assert periods_per_motion(record) == (2, "displacement")
+    (sentence,) = findings([record])
+    assert "displacement repeats after 2 declared periods only" in sentence
+    assert sentence.endswith("write frequency = 2")
+
+
+def test_noise_does_not_repeat_after_two_periods_either(tmp_path):
+    def red(rng):
+        return noisy(rng, coefficient=0.9)
+
+    (record,) = reduced(tmp_path, red).records
+    assert periods_per_motion(record) == (1, "")
 
 
 def test_parabola_ends_in_the_period():
