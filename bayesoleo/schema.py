@@ -171,6 +171,21 @@ def noise(output: str) -> str:
     return f"{output}_noise"
 
 
+def expected(output: str) -> str:
+    """Name of what a draw predicts without errors: ``force_expected``."""
+    return f"{output}_expected"
+
+
+def at_estimate(output: str) -> str:
+    """Name of what the estimate predicts without errors: ``force_at_estimate``."""
+    return f"{output}_at_estimate"
+
+
+def average_sd(output: str) -> str:
+    """Name of the standard deviation of errors averaged over periods: ``force_average_sd``."""
+    return f"{output}_average_sd"
+
+
 def log_variance(output: str) -> str:
     """Name of the sampled logarithm of an output's variance."""
     return f"log_variance_{output}"

@@ -397,7 +397,7 @@ def sample(
     samples, density = _sample(task, fit, out, say, progress)
     groups = {schema.POINT: point_group(fit), **more}
     groups |= posterior_groups(fit, samples, settings.seed, density)
-    groups |= predictive_groups(fit, samples, settings.seed)
+    groups |= predictive_groups(fit, samples, density, settings.seed)
     groups[schema.COMPARISON] = compare(groups)
     return _finish(task, groups, fit, out)
 
@@ -525,7 +525,7 @@ def _result(
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
     files = {} if out is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
-    groups = {schema.POINT: point_group(fit), **loop_groups(loop, samples, seed)}
+    groups = {schema.POINT: point_group(fit), **loop_groups(loop, drawn, seed)}
     if samples is not None:
         groups |= posterior_groups(fit, samples, seed, density)
         groups[schema.COMPARISON] = compare(groups)

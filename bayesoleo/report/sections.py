@@ -126,8 +126,12 @@ def predictive_figures(tree: xr.DataTree) -> list[Shown]:
         return []
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
-        if output in tree[schema.POSTERIOR_PREDICTIVE]:
-            caption = f"Measured {output} about the prediction, with the posterior's 95 % band."
+        if schema.average_sd(output) in tree[schema.POSTERIOR_PREDICTIVE]:
+            caption = (
+                f"Measured {output}, averaged over the periods of each run, about the prediction. "
+                "Dark: what the parameters leave open; light: where 95 % of such averages would "
+                "lie if the run were repeated, with errors as the error model has them."
+            )
 
             entries.append((partial(plots.predictive, tree, output), caption))
     return _drawn(entries)

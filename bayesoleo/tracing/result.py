@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -14,21 +13,16 @@ from bayesoleo import schema
 from bayesoleo.data import Campaign
 from bayesoleo.estimation import to_dataset
 from bayesoleo.model import Coordinate
-from bayesoleo.posterior import LogDensity, Samples, choose_draws, to_datasets
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.posterior import LogDensity, Samples, to_datasets
 from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.transient import TransientRun
-from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fit import Fit
 from bayesoleo.tracing.holdout import Prediction, predict_fitted
 from bayesoleo.tracing.loop import ClosedLoop
+from bayesoleo.tracing.predictive import PHASES, predictive_group
 from bayesoleo.tracing.rounds import Ranked, Round
 from bayesoleo.tracing.state import State
 
 Array = NDArray[np.float64]
-
-PHASES = 200
-PREDICTIVE_DRAWS = 40
 
 
 def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.Dataset]:
@@ -108,16 +102,20 @@ def posterior_groups(
     return groups
 
 
-def predictive_groups(fit: Fit, samples: Samples, seed: int) -> dict[str, xr.Dataset]:
+def predictive_groups(
+    fit: Fit, samples: Samples, density: LogDensity, seed: int
+) -> dict[str, xr.Dataset]:
     """The groups prediction and posterior_predictive of the fitted runs."""
     found = predict_fitted(fit)
     return {
         schema.PREDICTION: _predictions([("before", fit, found)]),
-        schema.POSTERIOR_PREDICTIVE: _predictive(fit, found, samples, seed),
+        schema.POSTERIOR_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
     }
 
 
-def loop_groups(loop: ClosedLoop, samples: Samples | None, seed: int) -> dict[str, xr.Dataset]:
+def loop_groups(
+    loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
+) -> dict[str, xr.Dataset]:
     """The groups prediction, residual, discovery and posterior_predictive."""
     groups = {
         schema.PREDICTION: _predictions(
@@ -126,9 +124,11 @@ def loop_groups(loop: ClosedLoop, samples: Samples | None, seed: int) -> dict[st
         schema.RESIDUAL: _residuals(loop),
         schema.DISCOVERY: _discovery(loop.rounds),
     }
-    if samples is not None:
-        final = loop.final
-        groups[schema.POSTERIOR_PREDICTIVE] = _predictive(final.fit, ordered(final), samples, seed)
+    if drawn is not None:
+        final, (samples, density) = loop.final, drawn
+        groups[schema.POSTERIOR_PREDICTIVE] = predictive_group(
+            final.fit, ordered(final), samples, density.errors, seed
+        )
     return groups
 
 
@@ -320,59 +320,3 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
         )
         for name, field in names.items()
     }
-
-
-def _predictive(fit: Fit, found: Sequence[Prediction], samples: Samples, seed: int) -> xr.Dataset:
-    """Draws of the outputs over one period, noise included."""
-    theta, _ = choose_draws(samples, PREDICTIVE_DRAWS, seed=seed)
-    rng = np.random.default_rng(seed)
-    names = dict(zip(samples.parameters, theta.T, strict=True))
-    outputs = fit.predictor.outputs
-    values = np.full((len(outputs), theta.shape[0], len(found), PHASES), np.nan)
-    for r, prediction in enumerate(found):
-        vectors = np.zeros((theta.shape[0], len(prediction.theta)))
-        for k, (name, value) in enumerate(prediction.theta.items()):
-            vectors[:, k] = names.get(name, value)
-        y = _on_phases(prediction, vectors)
-        label = prediction.record.label
-        _, variance = choose_draws(samples, PREDICTIVE_DRAWS, seed=seed, run=label)
-        noise = rng.standard_normal(y.shape) * np.sqrt(variance)[:, :, None]
-        values[:, :, r] = np.moveaxis(y + noise, 1, 0)
-    data = {
-        output: xr.Variable(
-            (schema.CHAIN, schema.DRAW, schema.RUN, schema.PHASE),
-            values[b][None],
-            {
-                schema.UNITS: fit.model.outputs[output].unit,
-                schema.LONG_NAME: f"predicted {output}",
-            },
-        )
-        for b, output in enumerate(outputs)
-    }
-    coords = {schema.RUN: [p.record.label for p in found], schema.PHASE: np.arange(PHASES) / PHASES}
-    return xr.Dataset(data, coords=coords)
-
-
-def _on_phases(prediction: Prediction, theta: Array) -> Array:
-    """Outputs on a grid of one period, or of a transient's length, for many vectors, shape (K, ny,
-    PHASES)."""
-    old, record = prediction.predictor, prediction.record
-    times = np.arange(PHASES) / (PHASES if record.periodic else PHASES - 1)
-    blank = {name: np.zeros(PHASES) for name in record.samples}
-    grid: Mapping[str, Array] = blank
-    predictor = Predictor(
-        old.model,
-        [replace(record, time=record.span * times, samples=grid)],
-        steps=old.steps,
-        scheme=old.scheme,
-        backend=old.backend,
-        jobs=1,
-    )
-    run = old.runs[0]
-    if isinstance(run, TransientRun):
-        predictor.runs[0] = run.resampled(predictor.records[0])
-    predictor.runs[0].anchor = run.anchor
-    found = predictor.simulate(theta, 0)
-    y = found.y
-    y[found.status != Status.CONVERGED.value] = np.nan
-    return y

@@ -235,11 +235,12 @@ def _add_predictive(tree, rng, runs, roles):
         )
         wave = np.sin(2 * np.pi * (PHASES + rng.random((4, 30, 14, 1))))
         spread = 0.15 * NOISE[output] * rng.normal(size=(4, 30, 14, 1)) * wave
-        values[output] = (
-            ("chain", "draw", "run", "phase"),
-            mean + spread,
-            {"units": UNITS[output]},
-        )
+        dims, about = ("chain", "draw", "run", "phase"), {"units": UNITS[output]}
+        errors = NOISE[output] * rng.normal(size=spread.shape)
+        values[output] = (dims, mean + spread + errors, about)
+        values[f"{output}_expected"] = (dims, mean + spread, about)
+        values[f"{output}_at_estimate"] = (dims[2:], mean, about)
+        values[f"{output}_average_sd"] = (dims[:3], np.full((4, 30, 14), NOISE[output] / 3), about)
     coords = {"run": runs, "phase": PHASES}
     tree["posterior_predictive"] = xr.DataTree(xr.Dataset(values, coords=coords))
 

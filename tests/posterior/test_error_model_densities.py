@@ -4,13 +4,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
 from bayesoleo.posterior.error_models.correlated import covariance
 from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
+from bayesoleo.posterior.predictive import sd_of_averages
 
 
 @dataclass
@@ -222,3 +223,52 @@ def test_what_does_not_suit_is_refused():
 
     with pytest.raises(InputError, match="sums of squares only"):
         error_model("correlated", SumsOnly())
+
+
+@pytest.mark.parametrize("word", ["full", "correlated", "discrepancy"])
+def test_drawn_errors_have_the_covariance_of_the_density(word):
+    campaign = Campaign(lengths=(5, 9))
+    model = error_model(word, campaign)
+    eta = drawn(model, 1)[0]
+    samples = campaign.samples[1]
+    exact = dense(word, model, eta[0], samples.time, samples.frequency)
+    size = 40_000
+    natural = np.repeat(model.natural(eta), size, axis=0)
+    rows = model.draw(natural, "b", samples, np.random.default_rng(5)).reshape(size, -1)
+    sd = np.sqrt(np.diag(exact))
+    found = rows.T @ rows / size / np.outer(sd, sd)
+    # The largest of 171 entries, each with a standard error of at most sqrt(2 / size).
+    np.testing.assert_allclose(found, exact / np.outer(sd, sd), atol=4.5 * np.sqrt(2 / size))
+
+
+@pytest.mark.parametrize("run", ["a", "new"])
+def test_a_new_run_has_another_variance(run):
+    model = error_model("per-run", Campaign())
+    natural = np.zeros((20_000, len(model.names)))
+    natural[:, [2, 3]] = [0.5, 1.0]  # scatter of the logarithms of force and pressure
+    natural[:, 4:] = np.log(4.0)
+    e = model.draw(natural, run, RunSamples(np.arange(20.0), None), np.random.default_rng(2))
+    log_v = np.log(np.mean(e**2, axis=2))
+    # Of the logarithm of a mean of 20 squares.
+    noise = np.sqrt(special.polygamma(1, 10))
+    mean = (np.log(4.0) if run == "a" else 0.0) + special.digamma(10) - np.log(10)
+    expected = np.array([0.5, 1.0]) if run == "new" else np.zeros(2)
+    np.testing.assert_allclose(log_v.std(axis=0), np.hypot(expected, noise), rtol=0.03)
+    np.testing.assert_allclose(log_v.mean(axis=0), mean, atol=0.03)
+
+
+def test_averages_of_errors_keep_what_repeats():
+    """Noise of a sample falls by the root of the periods, a discrepancy not at all."""
+    time = np.arange(16 * 100) / 100.37
+    samples, rng = RunSamples(time, 1.0), np.random.default_rng(4)
+    campaign = Campaign(outputs=("force",), runs=("a",), lengths=(time.size,))
+    campaign.__class__ = type("Long", (Campaign,), {"samples": (samples,)})
+    in_bin = np.mean(1 / np.histogram(samples.phase % 1, 50, (0, 1))[0])
+    white = error_model("independent", campaign)
+    e = white.draw(np.zeros((300, 1)), "a", samples, rng)
+    found = sd_of_averages(e, samples.phase, 50)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(in_bin), rel=0.02)
+    repeating = error_model("discrepancy", campaign)
+    e = repeating.draw(np.tile([0.0, 0.64, 0.1], (3000, 1)), "a", samples, rng)
+    found = sd_of_averages(e, samples.phase, 50)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(0.64 + 0.36 * in_bin), rel=0.02)

@@ -267,6 +267,29 @@ class ErrorModel(ABC):
         """
         return np.exp(natural[:, : len(self.frame.outputs)])
 
+    def draw(
+        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+    ) -> Array:
+        """Errors as they would be if a run were repeated.
+
+        Parameters
+        ----------
+        natural : ndarray, shape (W, m)
+            Quantities in their units.
+        run : str
+            Whose; one that is not among the problem's is a new one.
+        samples : RunSamples
+            When ``n`` samples are taken, which need not be those of the problem's run.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (W, s, n)
+            White here, with :meth:`variance`.
+        """
+        sd = np.sqrt(self.variance(natural, run))
+        return sd[:, :, None] * rng.standard_normal((*sd.shape, samples.time.size))
+
 
 def log_mean_squares(residuals: Sequence[Array]) -> Array:
     """Logarithms of the outputs' mean squares over all runs, shape (s,), from (s, n) of each.

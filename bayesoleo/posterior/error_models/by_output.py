@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior.error_models.base import Array, ErrorModel, Frame, log_mean_squares
 from bayesoleo.posterior.error_models.fitted_start import climb
 
@@ -91,6 +92,20 @@ class ByOutput(ErrorModel):
             for b, rows in enumerate(columns)
         ]
         return np.asarray(sum(parts))
+
+    @abstractmethod
+    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+        """The part that is not white, of unit variance, shape (W, n); length (W,)."""
+
+    def draw(
+        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+    ) -> Array:
+        out = super().draw(natural, run, samples, rng)
+        for b, sd in enumerate(np.sqrt(self.variance(natural, run)).T):
+            _, share, length = (natural[:, k] for k in self._places(b))
+            out[:, b] *= np.sqrt(1 - share)[:, None]
+            out[:, b] += (sd * np.sqrt(share))[:, None] * self.draw_memory(length, samples, rng)
+        return out
 
     def start(self, residuals: Sequence[Array]) -> Array:
         s, sizes = len(self.frame.outputs), log_mean_squares(residuals)

@@ -31,6 +31,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from bayesoleo import schema
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal, Uniform
 from bayesoleo.posterior.error_models.base import Array, Frame, Quantity
 from bayesoleo.posterior.error_models.by_output import ByOutput
@@ -166,6 +167,15 @@ class CorrelatedErrors(ByOutput):
         white = np.empty_like(columns)
         _whiten(columns, *self._steps[run], eta, white)
         return np.asarray(white @ white.T)
+
+    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+        lag = np.diff(samples.time)[:, None] / length
+        decay = np.exp(-lag)
+        new = rng.standard_normal((samples.time.size, len(length)))
+        new[1:] *= np.sqrt(-np.expm1(-2 * lag))
+        for i, kept in enumerate(decay):
+            new[i + 1] += kept * new[i]
+        return new.T
 
 
 def _kinds(steps: Array) -> tuple[np.ndarray, Array]:

@@ -33,6 +33,7 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from bayesoleo import schema
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal, Uniform
 from bayesoleo.posterior.error_models.base import Array, Frame, Quantity
 from bayesoleo.posterior.error_models.by_output import ByOutput
@@ -187,3 +188,8 @@ class DiscrepancyErrors(ByOutput):
         projected = root[:, None] * (self._tables[run].T @ columns.T)
         left = columns @ columns.T - projected.T @ np.linalg.solve(inner, projected)
         return np.asarray(left / noise * np.exp(-eta[0]))
+
+    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+        table = basis(samples.phase)
+        root = np.sqrt(spectrum(length))
+        return np.asarray((root * rng.standard_normal(root.shape)) @ table.T)

@@ -20,6 +20,7 @@ from scipy.special import betaln
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior.error_models.base import (
     Array,
     ErrorModel,
@@ -147,6 +148,13 @@ class FullErrors(ErrorModel):
         inverse = np.linalg.inv(root)
         white = np.einsum("ab,bkn->akn", inverse, np.stack(columns))
         return np.asarray(np.einsum("akn,aln->kl", white, white))
+
+    def draw(
+        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+    ) -> Array:
+        white = super().draw(natural, run, samples, rng)
+        sd = np.sqrt(self.variance(natural, run))[:, :, None]
+        return np.asarray(sd * (self._factor(self.coordinates(natural)) @ (white / sd)))
 
     def start(self, residuals: Sequence[Array]) -> Array:
         every = np.concatenate(residuals, axis=1)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal
 from bayesoleo.posterior.error_models.base import (
     Array,
@@ -136,3 +137,14 @@ class PerRunErrors(ErrorModel):
         if run not in self.frame.runs:
             return super().variance(natural, run)
         return np.exp(natural[:, self._own[self.frame.runs.index(run)]])
+
+    def draw(
+        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+    ) -> Array:
+        white = super().draw(natural, run, samples, rng)
+        if run in self.frame.runs:
+            return white
+        # Nothing is known of a new run's variance but how much others scatter.
+        outputs = len(self.frame.outputs)
+        scatter = natural[:, outputs : 2 * outputs] * rng.standard_normal((len(natural), outputs))
+        return np.exp(0.5 * scatter)[:, :, None] * white
