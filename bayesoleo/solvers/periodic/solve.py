@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from bayesoleo.compiled import BlockKernel
 from bayesoleo.solvers.periodic import arrangement, measures, newton
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
+from bayesoleo.solvers.periodic.trial import Trial
 from bayesoleo.solvers.schemes.scheme import Scheme
 from bayesoleo.solvers.status import Status
 
@@ -214,46 +215,33 @@ def _compiled(
 
 
 class _Newton:
-    """State of one batched iteration; arrays are allocated once."""
+    """State of one batched iteration."""
 
     def __init__(self, problem: Boundary, p: Array, x: Array, max_iterations: int, monotone: bool):
-        self.problem, self.p, self.x = problem, p, x
+        self.trial = Trial(problem, p, x)
         self.max_iterations, self.monotone = max_iterations, monotone
-        lanes, n, _ = x.shape
-        scheme = problem.scheme
-        d, points = len(scheme.orders), problem.inputs.shape[1]
-        nz = scheme.state_size + d
-        self.step = problem.step(n)
-        self.base = np.empty_like(x)
-        self.z = np.empty((lanes, nz, points))
-        self.g = np.empty((lanes, d, points))
-        self.gz = np.empty((lanes, d, nz, points))
-        self.a = np.empty((lanes, problem.conditions, points))
-        self.squares, self.terms = np.empty((lanes, d)), np.empty((lanes, d))
-        self.inside, self.defined = np.ones(lanes, dtype=np.bool_), np.ones(lanes, dtype=np.bool_)
+        lanes = x.shape[0]
         self.status = np.full(lanes, Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(lanes, dtype=np.int64)
         self.merit = np.full(lanes, np.inf)
         self.last = np.full(lanes, np.inf)
 
     def run(self) -> Solution:
-        lanes = np.arange(self.x.shape[0])
-        good = self._evaluate(lanes)
-        outside = np.where(self.inside, Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
+        trial, lanes = self.trial, np.arange(self.status.size)
+        good = trial.evaluate(lanes)
+        outside = np.where(trial.inside, Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
         lanes = self._drop(lanes, good, outside)
-        size, least = np.empty(self.x.shape[0]), np.empty(self.x.shape[0])
+        size, least = np.empty(self.status.size), np.empty(self.status.size)
         for _ in range(self.max_iterations):
             if lanes.size == 0:
                 break
             self.iterations[lanes] += 1
-            dx, _, ok = self.problem.scheme.linear(
-                self.gz, self.g[:, :, None], self.x, lanes, self.step
-            )
-            measures.step_size(self.x, dx, lanes, self.problem.scheme.state_size, size, least)
+            dx, ok = trial.newton_step(lanes)
+            measures.step_size(trial.x, dx, lanes, trial.problem.scheme.state_size, size, least)
             lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
             lanes = self._finish(lanes, dx, size, least)
             lanes = self._advance(lanes, dx, size)
-        return Solution(self.x, self.status, self.iterations)
+        return Solution(trial.x, self.status, self.iterations)
 
     def _drop(
         self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]
@@ -262,18 +250,6 @@ class _Newton:
         self.status[bad] = reason if isinstance(reason, int) else reason[bad]
         return lanes[good]
 
-    def _evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
-        """Equations at the present unknowns; true where they are finite and admissible."""
-        equations, u = self.problem.equations, self.problem.inputs
-        self.problem.scheme.rows(self.x, lanes, self.step, self.z)
-        with np.errstate(all="ignore"):
-            equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
-            if self.problem.conditions:
-                equations.admissible(self.z, u, self.p, lanes, self.a)
-        measures.positive(self.a, lanes, self.inside, self.defined)
-        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
-        return self.inside[lanes] & self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
-
     def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
         """Whether the residual fell, in units of the equations' terms: the larger of those before
         and after.
@@ -281,11 +257,11 @@ class _Newton:
         Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid
         to leave it.
         """
-        unit = np.maximum(terms, self.terms[lanes]) + 1e-300
+        unit = np.maximum(terms, self.trial.terms[lanes]) + 1e-300
         with np.errstate(all="ignore"):
             before = np.sqrt(np.sum(squares / unit, axis=1))
-            after = np.sqrt(np.sum(self.squares[lanes] / unit, axis=1))
-            own = self.squares[lanes] / (self.terms[lanes] + 1e-300)
+            after = np.sqrt(np.sum(self.trial.squares[lanes] / unit, axis=1))
+            own = self.trial.squares[lanes] / (self.trial.terms[lanes] + 1e-300)
         # An iteration that comes back from far away has a small residual against what it left.
         self.merit[lanes] = np.sqrt(np.sum(own, axis=1))
         return after < before
@@ -296,23 +272,23 @@ class _Newton:
         falling = (sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])
         done = falling | (least[lanes] < SMALL_STEP)
         finished = lanes[done]
-        measures.keep(self.x, finished, self.base)
-        measures.take(self.base, dx, finished, np.ones(finished.size), self.x)
+        self.trial.take_whole(finished, dx)
         self.status[finished] = Status.CONVERGED.value
         self.last[lanes] = sizes
         return lanes[~done]
 
     def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
         """Take the steps, halved where they are inadmissible or do not reduce the residual."""
-        measures.keep(self.x, lanes, self.base)
-        squares, terms, fraction = self.squares[lanes], self.terms[lanes], np.ones(lanes.size)
+        trial = self.trial
+        measures.keep(trial.x, lanes, trial.base)
+        squares, terms, fraction = trial.squares[lanes], trial.terms[lanes], np.ones(lanes.size)
         pending = np.arange(lanes.size)
         for _ in range(MAXIMUM_HALVINGS):
             if pending.size == 0:
                 break
             chosen = lanes[pending]
-            measures.take(self.base, dx, chosen, fraction[pending], self.x)
-            good = self._evaluate(chosen)
+            trial.take(chosen, dx, fraction[pending])
+            good = trial.evaluate(chosen)
             falls = self._reduces(chosen, squares[pending], terms[pending])
             # Close to the solution round-off keeps the residual from falling; the step's own size
             # then decides.
@@ -321,10 +297,10 @@ class _Newton:
             fraction[pending] *= 0.5
         stuck = lanes[pending]
         outside = np.where(
-            self.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value
+            trial.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value
         )
         self.status[stuck] = outside
-        measures.keep(self.base, stuck, self.x)
+        measures.keep(trial.base, stuck, trial.x)
         self.last[lanes[fraction < 1.0]] = np.inf
         kept = np.ones(lanes.size, dtype=bool)
         kept[pending] = False

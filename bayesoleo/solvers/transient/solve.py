@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.solvers.periodic import measures
-from bayesoleo.solvers.periodic.solve import Boundary, Solution
+from bayesoleo.solvers.periodic.solve import LAST_STEP, SMALL_STEP, Boundary, Solution
+from bayesoleo.solvers.periodic.trial import Trial
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.status import Status
@@ -31,11 +32,6 @@ from bayesoleo.solvers.status import Status
 Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
 
-#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
-#: contracting leaves 1e-14.
-LAST_STEP = 1e-7
-#: Without quadratic contraction (at a kink) a step this small is taken as converged.
-SMALL_STEP = 1e-11
 #: Newton iterations on the whole time at once, before it is walked through piece by piece.
 MAXIMUM_ITERATIONS = 12
 MAXIMUM_HALVINGS = 8
@@ -80,7 +76,8 @@ def newton(
     Parameters are those of :func:`solve_transient`.
     """
     state = _State(problem, p, start.copy())
-    lanes = state.keep(np.arange(start.shape[0]), state.evaluate(np.arange(start.shape[0])))
+    lanes = np.arange(start.shape[0])
+    lanes = state.keep(lanes, state.trial.evaluate(lanes))
     last = np.full(start.shape[0], np.inf)
     for _ in range(max_iterations):
         if lanes.size == 0:
@@ -92,77 +89,52 @@ def newton(
         last[lanes] = size[lanes]
         lanes = state.finish(lanes, small, dx)
         lanes = state.advance(lanes, dx)
-    return Solution(state.x, state.status, state.iterations)
+    return Solution(state.trial.x, state.status, state.iterations)
 
 
 class _State:
-    """Unknowns, equations and statuses of one batched iteration."""
+    """State of one batched iteration."""
 
     def __init__(self, problem: Boundary, p: Array, x: Array):
-        self.problem, self.p, self.x = problem, p, x
-        count, n, _ = x.shape
-        scheme = problem.scheme
-        d, points = len(scheme.orders), problem.inputs.shape[1]
-        nz = scheme.state_size + d
-        self.step, self.base = problem.step(n), np.empty_like(x)
-        self.z, self.g = np.empty((count, nz, points)), np.empty((count, d, points))
-        self.gz = np.empty((count, d, nz, points))
-        self.a = np.empty((count, problem.conditions, points))
-        self.inside = np.ones(count, dtype=np.bool_)
-        self.defined = np.ones(count, dtype=np.bool_)
-        self.squares, self.terms = np.empty((count, d)), np.empty((count, d))
-        self.status = np.full(count, Status.NO_CONVERGENCE.value, dtype=np.int64)
-        self.iterations = np.zeros(count, dtype=np.int64)
-
-    def evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
-        """Equations at the present unknowns; true where they are finite and admissible, (L,)."""
-        equations, u = self.problem.equations, self.problem.inputs
-        self.problem.scheme.rows(self.x, lanes, self.step, self.z)
-        with np.errstate(all="ignore"):
-            equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
-            if self.problem.conditions:
-                equations.admissible(self.z, u, self.p, lanes, self.a)
-        measures.positive(self.a, lanes, self.inside, self.defined)
-        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
-        finite = self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
-        return self.inside[lanes] & finite
+        self.trial = Trial(problem, p, x)
+        self.status = np.full(x.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
+        self.iterations = np.zeros(x.shape[0], dtype=np.int64)
 
     def keep(self, lanes: Lanes, good: NDArray[np.bool_], reason: Status | None = None) -> Lanes:
         """Give up the lanes that are not good, for a reason or for what the evaluation found."""
         bad = lanes[~good]
-        outside = np.where(self.inside[bad], Status.NOT_FINITE.value, Status.INADMISSIBLE.value)
+        outside = np.where(
+            self.trial.inside[bad], Status.NOT_FINITE.value, Status.INADMISSIBLE.value
+        )
         self.status[bad] = outside if reason is None else reason.value
         return lanes[good]
 
     def direction(self, lanes: Lanes) -> tuple[Array, Array]:
         """Newton's step, and its size over the states' by lane, (L,); infinite where singular."""
-        dx, _, ok = self.problem.scheme.linear(
-            self.gz, self.g[:, :, None], self.x, lanes, self.step, initial=True
-        )
-        size = np.full(self.x.shape[0], np.inf)
+        trial, size = self.trial, np.full(self.status.size, np.inf)
+        dx, ok = trial.newton_step(lanes, initial=True)
         # Over the largest value: a piece of a transient may hardly move.
-        states, moved = self.problem.scheme.state_size, np.empty(self.x.shape[0])
-        measures.step_size(self.x, dx, lanes, states, moved, size)
+        states, moved = trial.problem.scheme.state_size, np.empty(self.status.size)
+        measures.step_size(trial.x, dx, lanes, states, moved, size)
         size[~ok] = np.inf
         return dx, size
 
     def finish(self, lanes: Lanes, small: NDArray[np.bool_], dx: Array) -> Lanes:
         """Take the last step where it is so small that what it leaves is round-off."""
         finished = lanes[small[lanes]]
-        measures.keep(self.x, finished, self.base)
-        measures.take(self.base, dx, finished, np.ones(finished.size), self.x)
+        self.trial.take_whole(finished, dx)
         self.status[finished] = Status.CONVERGED.value
         return lanes[~small[lanes]]
 
     def advance(self, lanes: Lanes, dx: Array) -> Lanes:
         """Take the steps, halved until they can be evaluated."""
-        measures.keep(self.x, lanes, self.base)
+        measures.keep(self.trial.x, lanes, self.trial.base)
         pending, fraction = lanes, np.ones(lanes.size)
         for _ in range(MAXIMUM_HALVINGS):
             if pending.size == 0:
                 break
-            measures.take(self.base, dx, pending, fraction, self.x)
-            bad = ~self.evaluate(pending)
+            self.trial.take(pending, dx, fraction)
+            bad = ~self.trial.evaluate(pending)
             pending, fraction = pending[bad], 0.5 * fraction[bad]
         return self.keep(lanes, ~np.isin(lanes, pending))
 
