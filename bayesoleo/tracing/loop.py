@@ -12,6 +12,7 @@ from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.tracing.assembly import Assembly, Step
 from bayesoleo.tracing.fit import Fit, Numerics
+from bayesoleo.tracing.projection import information_beside, squared_distance
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.rounds import Round, examine
 from bayesoleo.tracing.state import State, fit_state
@@ -163,12 +164,8 @@ def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say
     known = base.gram.shape[0] - len(names)
     chosen = []
     for k, name in enumerate(names, start=known):
-        others = [j for j in range(base.gram.shape[0]) if j != k]
-        inner = np.linalg.lstsq(
-            base.gram[np.ix_(others, others)], base.gram[others, k], rcond=None
-        )[0]
-        from_data = base.gram[k, k] - base.gram[k, others] @ inner - 1.0
-        if from_data > FREED_BY**2:
+        # In units of the tolerance, whose own information is one.
+        if information_beside(base.gram, k) - 1.0 > FREED_BY**2:
             chosen.append(name)
     if not chosen:
         return state
@@ -198,8 +195,7 @@ def _superfluous(fit: Fit, step: Step) -> bool:
     value, covariance = fit.point.theta[index], fit.point.covariance[np.ix_(index, index)]
     if not index or not np.isfinite(covariance).all():
         return False
-    distance = float(value @ np.linalg.lstsq(covariance, value, rcond=1e-12)[0])
-    return bool(stats.chi2.sf(distance, len(index)) > 0.05)
+    return bool(stats.chi2.sf(squared_distance(value, covariance), len(index)) > 0.05)
 
 
 def _warnings(fit: Fit) -> list[str]:

@@ -50,3 +50,33 @@ def remains(gram: Array, project: Array, own: Array, information: Array) -> NDAr
     before, left = np.diag(own), np.diag(information)
     kept: NDArray[np.bool_] = left > np.maximum(LEAST * before, ROUND_OFF * parts)
     return kept
+
+
+def information_beside(gram: Array, k: int) -> float:
+    """What ``J' W J`` says of one direction when all others are free.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (l, l)
+        ``J' W J``; units may differ by any factor.
+    k : int
+        Which.
+    """
+    others = np.arange(len(gram)) != k
+    cross = gram[others, k]
+    inner = coefficients(gram[np.ix_(others, others)], cross[:, None])[:, 0]
+    return float(gram[k, k] - cross @ inner)
+
+
+def squared_distance(value: Array, covariance: Array) -> float:
+    """``value' covariance^-1 value`` of values (k,) in units that may differ by any factor.
+
+    Directions that the covariance does not have, to twelve digits of its correlations, are left
+    out.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    unit = np.where(sd > 0, sd, 1.0)
+    scaled = value / unit
+    return float(
+        scaled @ np.linalg.lstsq(covariance / np.outer(unit, unit), scaled, rcond=1e-12)[0]
+    )

@@ -15,6 +15,7 @@ from bayesoleo.prediction.predictor import RunPrediction
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.projection import squared_distance
 from bayesoleo.tracing.robust import clustered_variance
 from bayesoleo.tracing.score import Base, Score, replicate
 from bayesoleo.tracing.significance import SAME
@@ -94,7 +95,7 @@ class Refit:
         free = self.freedom or np.inf
         if len(index) == 1:
             return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
-        distance = float(value @ np.linalg.lstsq(covariance, value, rcond=1e-12)[0])
+        distance = squared_distance(value, covariance)
         if self.freedom:
             return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
         return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)

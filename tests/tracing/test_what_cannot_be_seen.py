@@ -10,7 +10,7 @@ from fitted_states import fitted, options
 from small_campaigns import MASS, oscillator_campaign
 
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.tracing.projection import coefficients
+from bayesoleo.tracing.projection import coefficients, information_beside, squared_distance
 from bayesoleo.tracing.score import INVISIBLE, SPANNED, Base, RunBase, _Block, _evaluate, score_all
 
 SAMPLES = 400
@@ -120,3 +120,26 @@ def test_the_same_offset_scores_where_an_output_contains_it(linear_oscillator):
     noise = state.fit_errors.entries[0].average.sigma
     assert abs(score.expected[0]) < 100.0 * 6 * noise
     assert set(failed.values()) <= {SPANNED}
+
+
+@pytest.mark.parametrize("decades", [0, 5, 10])
+def test_units_do_not_matter_to_what_is_known_beside_others(decades):
+    """A stiffness of the gas beside one of a stop: parameters ten decades apart."""
+    rng = np.random.default_rng(0)
+    J = rng.standard_normal((3, 50))
+    J[0] += 2 * J[1] + J[2]
+    left = J[0] - J[1:].T @ np.linalg.lstsq(J[1:].T, J[0], rcond=None)[0]
+    unit = np.array([1.0, 10.0**decades, 10.0**-decades])
+    scaled = J * unit[:, None]
+    assert information_beside(scaled @ scaled.T, 0) == pytest.approx(left @ left, rel=1e-9)
+    covariance = np.linalg.inv(J @ J.T) / np.outer(unit, unit)
+    value = np.array([0.3, -0.2, 0.1])
+    assert squared_distance(value / unit, covariance) == pytest.approx(
+        float(np.sum((value @ J) ** 2)), rel=1e-9
+    )
+
+
+def test_nothing_is_known_beside_itself():
+    gram = np.ones((2, 2)) * 4.0
+    assert information_beside(gram, 0) == pytest.approx(0.0, abs=1e-12)
+    assert information_beside(gram[:1, :1], 0) == 4.0
