@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
@@ -25,14 +25,13 @@ from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import prior_precision
 from bayesoleo.estimation.problems.batch import BatchProblem
 from bayesoleo.estimation.problems.problem import Array, Problem
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import Shown
 from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
 from bayesoleo.estimation.uncertainty.redraw import DataSource, NoiseBlock, data_source
 from bayesoleo.estimation.uncertainty.replicate import estimate_many
+from bayesoleo.estimation.uncertainty.sampling_table import by_replication, moments, sampling_text
 from bayesoleo.solvers.status import Status, count
 from bayesoleo.storage.slots import Arrays, Slots
-
-_MIXED = "unit of each parameter"
 
 
 @dataclass(frozen=True)
@@ -246,62 +245,15 @@ def _fingerprint(problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], bl
 def _summarise(
     problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], parts: Arrays
 ) -> xr.Dataset:
+    """The group ``sampling_distribution`` from finished replications."""
     good = parts["status"] == Status.CONVERGED.value
-    found = parts["theta"][good]
-    used = len(found)
-    unknowns = len(problem.names)
-    covariance = np.full((unknowns, unknowns), np.nan)
-    mean = np.full(unknowns, np.nan)
-    if used > 1:
-        mean, covariance = found.mean(axis=0), np.atleast_2d(np.cov(found, rowvar=False))
     precision = None
     if find_method(work.method).fixed_prior:
         precision = prior_precision(problem.priors, work.theta)
-    weights = parts["variance"][good].mean(axis=0) if used else np.ones(len(problem.outputs))
+    weights = parts["variance"][good].mean(axis=0) if good.any() else np.ones(len(problem.outputs))
     expected, bound = propagated(blocks, weights, precision), cramer_rao(blocks)
-    sd = np.sqrt(np.diag(covariance))
-    bound_sd = np.sqrt(np.diag(bound))
-    by_parameter = {
-        "truth": (work.theta, "true value"),
-        "mean": (mean, "mean of the estimates"),
-        "bias": (mean - work.theta, "mean of the estimates less the truth"),
-        "bias_standard_error": (sd / np.sqrt(max(used, 1)), "standard error of the bias"),
-        schema.SD: (sd, "standard deviation of the estimates"),
-        "expected_sd": (np.sqrt(np.diag(expected)), "standard deviation by linearisation"),
-        "bound_sd": (bound_sd, "least standard deviation (Cramér and Rao)"),
-    }
-    square = (schema.PARAMETER, schema.PARAMETER_COLUMN)
-    tables = {
-        schema.COVARIANCE: (covariance, "covariance of the estimates"),
-        "expected_covariance": (expected, "covariance by linearisation"),
-        "bound": (bound, "least covariance (Cramér and Rao)"),
-    }
-    each = ("replication", schema.PARAMETER)
     data = xr.Dataset(
-        {
-            "replicate": _variable(each, parts["theta"], "estimate by replication", _MIXED),
-            "status": _variable(("replication",), parts["status"], "outcome", "1"),
-            schema.VARIANCE: _variable(
-                ("replication", schema.OUTPUT),
-                parts["variance"],
-                "error variance by replication",
-                "square of the output's SI unit",
-            ),
-            **{
-                name: _variable((schema.PARAMETER,), values, text, _MIXED)
-                for name, (values, text) in by_parameter.items()
-            },
-            **{
-                name: _variable(square, values, text, "product of the parameters' units")
-                for name, (values, text) in tables.items()
-            },
-            "efficiency": _variable(
-                (schema.PARAMETER,),
-                bound_sd**2 / sd**2,
-                "variance of the bound over that found",
-                "1",
-            ),
-        },
+        {**by_replication(parts), **moments(parts["theta"][good], work.theta, expected, bound)},
         coords={
             schema.PARAMETER: list(problem.names),
             schema.PARAMETER_COLUMN: list(problem.names),
@@ -312,50 +264,8 @@ def _summarise(
         "method": work.method,
         "seed": work.seed,
         "replications": len(good),
-        "converged": used,
+        "converged": int(good.sum()),
         "outcomes": json.dumps(count(parts["status"])),
         "iterations": float(parts["iterations"].mean()),
     }
     return data
-
-
-def _variable(dims: tuple[str, ...], values: NDArray, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
-
-
-def sampling_text(data: xr.Dataset) -> str:
-    """Bias and scatter against theory, one line a parameter.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        The group ``sampling_distribution``.
-    """
-    head = [
-        "parameter",
-        "truth",
-        "bias",
-        "± se",
-        "bias/sd",
-        "sd",
-        "expected",
-        "bound",
-        "efficiency",
-    ]
-    rows = []
-    for name in data[schema.PARAMETER].values:
-        one = data.sel({schema.PARAMETER: name})
-        value = {key: float(one[key]) for key in one.data_vars if one[key].ndim == 0}
-        cells = [
-            f"{value['truth']:.6g}",
-            f"{value['bias']:.2e}",
-            f"{value['bias_standard_error']:.1e}",
-        ]
-        cells += [f"{value['bias'] / value['sd']:.3f}", f"{value['sd']:.4g}"]
-        cells += [f"{value['expected_sd']:.4g}", f"{value['bound_sd']:.4g}"]
-        rows.append([str(name), *cells, f"{value['efficiency']:.3f}"])
-    about = data.attrs
-    end = (
-        f"{about['method']}, {about['converged']} of {about['replications']} replications converged"
-    )
-    return f"{columns(head, rows)}\n{end}, {about['iterations']:.1f} iterations on average"
