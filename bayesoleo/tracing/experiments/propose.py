@@ -1,0 +1,286 @@
+"""Which run, among those that the rig can do, best tells rival models apart."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.errors import CampaignError, ModelError
+from bayesoleo.parallel import single_blas_thread, thread_map
+from bayesoleo.prediction.records import Record
+from bayesoleo.solvers.status import Status
+from bayesoleo.tracing.errors_table import ErrorTable, RunError
+from bayesoleo.tracing.experiments.foresee import (
+    POINTS,
+    Knowledge,
+    Rival,
+    blank_record,
+    foresee,
+)
+from bayesoleo.tracing.experiments.rig import Limits, Motion, Planned, planned_runs
+from bayesoleo.tracing.experiments.separation import Separation, separate
+
+Array = NDArray[np.float64]
+
+#: A pair that no run separates by this many standard deviations does not count in the ranking.
+SEPARABLE = 1.0
+#: Information in bits below which two runs are as good, and their weakest pair decides.
+AS_GOOD = 0.01
+BEYOND_LIMITS = "an output beyond its limits"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run and how well it would tell the rivals apart.
+
+    Parameters
+    ----------
+    frequency : float
+        Hz.
+    mean, amplitude : float
+        Of the driving channel, SI.
+    separation : Separation
+    label : str
+        Of a run that was made, and would be repeated; empty otherwise.
+    """
+
+    frequency: float
+    mean: float
+    amplitude: float
+    separation: Separation
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """What to measure next to tell rival models apart.
+
+    Parameters
+    ----------
+    rivals : tuple of str
+        Their names.
+    drive : str
+        The channel that moves.
+    limits : Limits
+        What the rig can do.
+    trials : tuple of Trial
+        Runs that were not made, the best first.
+    repeats : tuple of Trial
+        Each run that was made, were it made once more.
+    left_out : mapping of str to int
+        Runs without a prediction by reason.
+    """
+
+    rivals: tuple[str, ...]
+    drive: str
+    limits: Limits
+    trials: tuple[Trial, ...]
+    repeats: tuple[Trial, ...]
+    left_out: Mapping[str, int]
+
+    def shortlist(self, count: int = 5) -> tuple[Trial, ...]:
+        """The best run at each frequency, the best first: neighbours on a grid say the same."""
+        best: dict[float, Trial] = {}
+        for trial in self.trials:
+            best.setdefault(trial.frequency, trial)
+        return tuple(best.values())[:count]
+
+    @property
+    def best_repeat(self) -> Trial | None:
+        """The run that was made whose repetition would tell most; None if none was solved."""
+        return max(self.repeats, key=lambda trial: trial.separation.information, default=None)
+
+    @property
+    def inseparable(self) -> tuple[tuple[str, str], ...]:
+        """Pairs that no run within the limits separates by one standard deviation."""
+        reach = _reach(self.trials, len(self.rivals))
+        first, second = np.triu_indices(len(self.rivals), 1)
+        return tuple(
+            (self.rivals[i], self.rivals[j])
+            for i, j in zip(first, second, strict=True)
+            if reach[i, j] < SEPARABLE
+        )
+
+
+def propose_runs(
+    rivals: Sequence[Rival],
+    records: Sequence[Record],
+    errors: ErrorTable,
+    limits: Limits | None = None,
+    *,
+    jobs: int | None = None,
+) -> Proposals:
+    """Rank the runs that a rig can do by how well they tell rival models apart.
+
+    Each rival was estimated from the runs that there are, and foresees a new one with what these
+    leave unknown of its parameters. The noise of the new run is that of the others, widened where
+    an error remains that no rival explains.
+
+    Parameters
+    ----------
+    rivals : sequence of Rival
+        Two or more.
+    records : sequence of Record
+        All runs that there are.
+    errors : ErrorTable
+        What the best rival leaves, and the noise.
+    limits : Limits, optional
+        What the rig can do; by default what it did.
+    jobs : int, optional
+        Threads.
+
+    Returns
+    -------
+    Proposals
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two rivals, runs are transient, or the model has several inputs,
+        so that it is not clear what a new run would be.
+    """
+    drive = drive_of(rivals, records)
+    outputs = rivals[0].fit.predictor.outputs
+    chosen = Limits.of(records, drive, outputs) if limits is None else limits
+    noise = expected_noise(errors)
+    known = [Knowledge.of(rival.fit) for rival in rivals]
+    spread = _input_variance(records, drive)
+
+    def judge(run: Planned | Record) -> Trial | str:
+        record = _blank(run, records, drive, outputs, spread)
+        found = [foresee(r, k, record, noise) for r, k in zip(rivals, known, strict=True)]
+        failed = [item for item in found if isinstance(item, Status)]
+        if failed:
+            return failed[0].message
+        solved = [item for item in found if not isinstance(item, Status)]
+        if isinstance(run, Planned) and not _inside(chosen, outputs, [y for _, y in solved]):
+            return BEYOND_LIMITS
+        move, label = Motion.of(record, drive), "" if isinstance(run, Planned) else run.label
+        separation = separate([item for item, _ in solved])
+        return Trial(record.frequency, move.mean, move.amplitude, separation, label)
+
+    with single_blas_thread():
+        planned = thread_map(judge, planned_runs(chosen, records, drive), jobs)
+        repeated = thread_map(judge, list(records), jobs)
+    return Proposals(
+        tuple(rival.name for rival in rivals),
+        drive,
+        chosen,
+        _ranked([item for item in planned if isinstance(item, Trial)], len(rivals)),
+        tuple(item for item in repeated if isinstance(item, Trial)),
+        Counter(item for item in planned if isinstance(item, str)),
+    )
+
+
+def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
+    """The one channel that drives all rivals.
+
+    Raises
+    ------
+    InputError
+        If a run that was not made cannot be foreseen by them.
+    """
+    if len(rivals) < 2:
+        hint = "name two or more effects that might be what is missing"
+        raise ModelError("fewer than two rivals to tell apart", value=len(rivals), hint=hint)
+    transient = [record.label for record in records if not record.periodic]
+    if transient:
+        raise CampaignError(
+            "what to measure next is foreseen for periodic runs only",
+            run=transient[0],
+            key="kind",
+            value="transient",
+            hint="simulate a transient of your choice with each rival, and compare them",
+        )
+    channels = {
+        name for rival in rivals for name in rival.fit.model.inputs if name in records[0].samples
+    }
+    outputs = {name for rival in rivals for name in rival.fit.predictor.outputs}
+    driving = sorted(channels - outputs)
+    if len(driving) != 1:
+        raise ModelError(
+            "what to measure next is foreseen for models with one input only",
+            value=driving,
+            hint="with several measured inputs it is not clear what they would be in a new run",
+        )
+    return driving[0]
+
+
+def expected_noise(errors: ErrorTable) -> dict[str, float]:
+    """Noise of a new run's average at each of the points compared, by output, SI.
+
+    The median over the runs of the standard error of their averages, brought to these points, times
+    the ratio of what repeats to that noise where it is above one.
+    """
+    found = {}
+    for output in errors.outputs:
+        entries = [entry for entry in errors.entries if entry.output == output]
+        ratio = float(np.sqrt(np.nanmean([entry.ratio**2 for entry in entries])))
+        found[output] = float(np.median([_at_points(entry) for entry in entries])) * max(ratio, 1.0)
+    return found
+
+
+def _at_points(entry: RunError) -> float:
+    """Noise of an averaged residual at one of so many points, the input's left out."""
+    own = entry.average.noise if entry.spectrum is None else entry.spectrum.noise
+    return float(own * np.sqrt(POINTS / entry.coefficients))
+
+
+def _input_variance(records: Sequence[Record], drive: str) -> float:
+    """Variance of a coefficient of the driving channel, the median over runs."""
+    known = [item.variances[item.orders > 0] for item in (r.harmonics[drive] for r in records)]
+    return float(np.median(np.concatenate(known)))
+
+
+def _blank(
+    run: Planned | Record,
+    records: Sequence[Record],
+    drive: str,
+    outputs: tuple[str, ...],
+    spread: float,
+) -> Record:
+    if isinstance(run, Record):
+        return blank_record(run, run.frequency, drive, run.harmonics[drive], outputs)
+    item = run.waveform
+    waveform = replace(item, variances=np.full(item.orders.size, spread))
+    near = min(records, key=lambda record: _distance(record, run, drive))
+    return blank_record(near, run.frequency, drive, waveform, outputs)
+
+
+def _distance(record: Record, run: Planned, drive: str) -> float:
+    """How far a run that was made is from one that was not: it gives the conditions."""
+    mean = Motion.of(record, drive).mean
+    apart = abs(mean - run.mean) / run.amplitude if run.amplitude else 0.0
+    return float(apart + abs(np.log(record.frequency / run.frequency)))
+
+
+def _inside(limits: Limits, outputs: Sequence[str], found: Sequence[Array]) -> bool:
+    for b, output in enumerate(outputs):
+        low, high = limits.outputs.get(output, (-np.inf, np.inf))
+        if any(y[b].min() < low or y[b].max() > high for y in found):
+            return False
+    return True
+
+
+def _reach(trials: Sequence[Trial], count: int) -> Array:
+    """Largest separation of each pair by any run, shape (count, count)."""
+    if not trials:
+        return np.zeros((count, count))
+    return np.max(np.stack([trial.separation.sigma for trial in trials]), axis=0)
+
+
+def _ranked(trials: Sequence[Trial], count: int) -> tuple[Trial, ...]:
+    """By information; where that is all there is to know, by the pair that is separated least."""
+    first, second = np.triu_indices(count, 1)
+    can = _reach(trials, count)[first, second] >= SEPARABLE
+
+    def worth(trial: Trial) -> tuple[float, float]:
+        sigma = trial.separation.sigma[first, second]
+        least = float(sigma[can].min()) if can.any() else float(sigma.min())
+        return round(trial.separation.information / AS_GOOD), least
+
+    return tuple(sorted(trials, key=worth, reverse=True))
