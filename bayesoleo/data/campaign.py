@@ -89,6 +89,8 @@ class Campaign:
         In the order declared.
     sha256 : str
         Of ``campaign.toml`` and all run files, in the order of the runs.
+    rig : mapping of str to (float, float)
+        What may be asked of the rig in a further run, SI, infinite where there is no limit.
     """
 
     name: str
@@ -98,6 +100,7 @@ class Campaign:
     channels: Mapping[str, Channel]
     runs: tuple[Run, ...]
     sha256: str
+    rig: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def run(self, label: str) -> Run:
         """The run with this label.
@@ -151,6 +154,7 @@ def load_campaign(path: str | os.PathLike[str]) -> Campaign:
         channels=dict(declaration.channels),
         runs=runs,
         sha256=_checksum(toml, [folder / run.file for run in declaration.runs]),
+        rig=declaration.rig,
     )
 
 

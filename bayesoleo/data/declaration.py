@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesoleo.data.gaps import Stretches, read_stretches
+from bayesoleo.data.rig import read_rig
 from bayesoleo.data.units import Unit, check_kind, parse_unit
 from bayesoleo.errors import CampaignError
 
@@ -22,7 +23,7 @@ FILE = "campaign.toml"
 KINDS = ("periodic", "transient")
 ROLES = ("fit", "hold-out")
 
-_TOP = ("format", "name", "description", "controlled", "dataset", "channels", "runs")
+_TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
 _CHANNEL = ("column", "unit", "scale", "offset", "accuracy")
 _RUN = (
     "label",
@@ -111,6 +112,7 @@ class Declaration:
     dataset: str | None
     channels: Mapping[str, Channel]
     runs: tuple[RunDeclaration, ...]
+    rig: Mapping[str, tuple[float, float]]
 
 
 def read_declaration(path: Path) -> Declaration:
@@ -161,6 +163,7 @@ def read_declaration(path: Path) -> Declaration:
         dataset=_get(table, "dataset", str, "a registered set's name", default=None),
         channels=channels,
         runs=runs,
+        rig=read_rig(table.get("rig", {}), FILE),
     )
 
 
