@@ -188,8 +188,12 @@ def check(
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:
         shell.print_json(tables.plain(plan))
-    else:
-        tables.print_mapping(plan, shell.console())
+        return
+    console = shell.console()
+    sentences = plan.pop("findings")
+    tables.print_mapping(plan, console)
+    for sentence in sentences:
+        console.print(sentence, style="dim", markup=False, soft_wrap=True)
 
 
 def _print(tree: xr.DataTree, folder: Path) -> None:

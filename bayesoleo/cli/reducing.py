@@ -53,7 +53,7 @@ def reduce(
       bayesoleo reduce shaker --json > runs.json
     """
     from bayesoleo import workflow
-    from bayesoleo.data import findings
+    from bayesoleo.data import findings, frequency_findings
 
     if out is not None:
         shell.check_writable(out.parent)
@@ -67,8 +67,10 @@ def reduce(
         shell.print_json(tables.plain(facts))
     else:
         _print_records(found, shell.console())
+        told = frequency_findings(found.records)
         for sentence in findings(found.records):
-            shell.complain(f"warning: {sentence}")
+            if sentence not in told:
+                shell.complain(f"warning: {sentence}")
 
 
 def _runs(reduced: ReducedCampaign) -> list[dict[str, Any]]:

@@ -17,8 +17,9 @@ from bayesoleo.prediction.records import Record
 #: is no motion.
 STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
 #: A longer period is taken for the motion's own if no more than this part of what does not repeat
-#: in the declared period is left in it. Of noise all is left.
-LEFT = 0.25
+#: in the declared period is left in it. Of noise all is left. Below a thousandth of the channel's
+#: own deviation nothing is worth a word: it may be the rounding of samples without noise.
+LEFT, LEAST = 0.25, 1e-3
 #: Multiples of the declared period that are tried.
 LONGER = (2, 3)
 
@@ -68,9 +69,9 @@ def periods_per_motion(record: Record) -> tuple[int, str]:
             continue
         basis = HarmonicBasis(record.time.size, step / count)
         left = {
-            name: average_on(basis, values).sigma / max(record.signal_noise[name], 1e-300)
+            name: average_on(basis, values).sigma / record.signal_noise[name]
             for name, values in record.samples.items()
-            if np.ptp(values) > 0
+            if record.signal_noise[name] > LEAST * np.std(values)
         }
         name = min(left, key=lambda name: left[name], default="")
         if name and left[name] ** 2 < LEFT:

@@ -57,7 +57,8 @@ def test_unknown_run_is_refused(refused, campaign, model):
     assert "did you mean 'slow'" in line
 
 
-def test_half_the_frequency_is_warned_of(run, campaign):
+@pytest.mark.filterwarnings("always::bayesoleo.errors.DataWarning")
+def test_half_the_frequency_is_warned_of(run, campaign, model):
     toml = campaign / "campaign.toml"
     text = toml.read_text(encoding="utf-8")
     assert "frequency = 2.0" in text
@@ -67,6 +68,12 @@ def test_half_the_frequency_is_warned_of(run, campaign):
     assert "warning: run fast: the motion repeats 2 times" in result.stderr
     assert "write frequency = 2" in result.stderr
     assert len(json.loads(run("reduce", campaign, "--json").stdout)["findings"]) == 1
+    assert result.stderr.count("run fast") == 1
+    # whoever goes on without looking at the records is told as well
+    result = run("check", campaign, "--model", model)
+    assert result.exit_code == 0, result.output
+    assert "warning: run fast: the motion repeats 2 times" in result.stderr
+    assert "write frequency = 2" in result.stdout
 
 
 def test_unused_run_is_predicted_and_scored(run, campaign, model, tmp_path):

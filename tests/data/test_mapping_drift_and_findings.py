@@ -156,6 +156,15 @@ def test_noise_does_not_repeat_after_two_periods_either(tmp_path):
     assert periods_per_motion(record) == (1, "")
 
 
+def test_rounding_of_samples_without_noise_is_no_longer_period(tmp_path):
+    def exact(rng):
+        return np.sin(2 * np.pi * FREQUENCY * TIME)
+
+    (record,) = reduced(tmp_path, exact, noise=0.0).records
+    assert periods_per_motion(record) == (1, "")
+    assert findings([record]) == []
+
+
 def test_parabola_ends_in_the_period():
     rng = np.random.default_rng(5)
     search = period_search(noisy(rng), STEP, 1.02 * FREQUENCY)

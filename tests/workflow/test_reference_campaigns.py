@@ -10,6 +10,8 @@ import pytest
 from bayesoleo import schema, workflow
 from bayesoleo.modelfile import load_model
 from bayesoleo.workflow import Settings
+from bayesoleo.workflow.closing import run_loop
+from bayesoleo.workflow.result import write_result
 
 pytestmark = pytest.mark.reference
 STUDIES = Path(__file__).parents[2] / "studies" / "measured"
@@ -19,8 +21,8 @@ def summary_of(folder: Path, model: str) -> dict:
     """Close the loop but for the sampling, which changes no error and no verdict."""
     reduced = workflow.reduce(folder)
     task = workflow.prepare(reduced, load_model(model), Settings())
-    loop = workflow._loop(task, Settings().max_effects, lambda _: None)
-    tree = workflow._result(task, loop, None, None, lambda _: None)
+    loop = run_loop(task, Settings().max_effects, lambda _: None)
+    tree = write_result(task, loop, None, None, lambda _: None)
     return json.loads(tree.attrs[schema.SUMMARY])
 
 

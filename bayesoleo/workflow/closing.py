@@ -1,0 +1,107 @@
+"""Look for what is missing: one round that adds nothing, or the whole loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import xarray as xr
+
+from bayesoleo.errors import CampaignError
+from bayesoleo.model import Model
+from bayesoleo.tracing.loop import ClosedLoop, close_loop
+from bayesoleo.workflow.result import write_result
+from bayesoleo.workflow.sampling import draw
+from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
+
+
+def trace(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: Path | None = None,
+    say: Say = silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Hold a fitted model's residual against the noise and rank what might be missing; add nothing.
+
+    Parameters are those of :func:`close`.
+    """
+    task = prepare(campaign, model, settings, progress=progress)
+    loop = run_loop(task, 0, say)
+    return write_result(task, loop, None, out, say)
+
+
+def close(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: Path | None = None,
+    say: Say = silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
+    and after.
+
+    Parameters
+    ----------
+    campaign : path-like, Campaign or ReducedCampaign
+        What was measured.
+    model : Model
+        In its own drive.
+    settings : Settings
+        Seed, threads, drive and so on.
+    out : Path, optional
+        Folder for ``results.nc``, ``report.html``, ``summary.json`` and the sampler's checkpoints,
+        from which a run that was stopped goes on.
+    say : callable
+        Told what is being done.
+    progress : bool
+        Whether to show bars.
+
+    Returns
+    -------
+    xarray.DataTree
+        The result; its root attribute ``summary`` is the JSON of the summary.
+
+    Raises
+    ------
+    InputError
+        If campaign, model and settings do not fit together.
+    """
+    task = prepare(campaign, model, settings, progress=progress)
+    loop = run_loop(task, settings.max_effects, say)
+    say("sample the posterior")
+    drawn = draw(task, loop.final.fit, out, say, progress)
+    return write_result(task, loop, drawn, out, say)
+
+
+def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
+    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
+
+    Raises
+    ------
+    CampaignError
+        If stretches of a run are left out.
+    """
+    settings = task.settings
+    for record in task.reduced.records:
+        if record.kept is not None:
+            raise CampaignError(
+                "the loop compares whole periods, and cannot leave stretches out of one",
+                file=task.campaign.path / "campaign.toml",
+                run=record.label,
+                key="mask",
+                hint="cut the run with start and stop, or estimate and sample only",
+            )
+    return close_loop(
+        task.assembly,
+        task.roles,
+        settings.numerics,
+        effects=settings.effects,
+        seed=settings.seed,
+        max_effects=max_effects,
+        say=say,
+    )

@@ -1,0 +1,104 @@
+"""Estimate the parameters: from all fitted runs together, or from each run by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import xarray as xr
+
+from bayesoleo import schema
+from bayesoleo.estimation.runs.per_run import by_run_dataset
+from bayesoleo.model import Model
+from bayesoleo.tracing.fit import Fit, fit_model
+from bayesoleo.tracing.inference import at_mode, mode_group, mode_of
+from bayesoleo.tracing.result import point_group
+from bayesoleo.workflow.result import finish
+from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.task import Say, Source, prepare, silent
+
+
+def estimate(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: Path | None = None,
+    say: Say = silent,
+) -> xr.DataTree:
+    """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    out : Path, optional
+        Folder for ``results.nc``.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the groups of the records and ``point``.
+    """
+    task = prepare(campaign, model, settings)
+    fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
+    fit, more = under_error_model(fit, settings, say)
+    return finish(task, {schema.POINT: point_group(fit), **more}, fit, out)
+
+
+def under_error_model(fit: Fit, settings: Settings, say: Say) -> tuple[Fit, dict[str, xr.Dataset]]:
+    """The estimate moved to the mode under the error model that was chosen, with what it found."""
+    inference = settings.inference
+    if inference.plain:
+        return fit, {}
+    say(f"posterior mode, {inference.error_model} errors")
+    density = inference.density(fit, settings.jobs)
+    mode = mode_of(density, fit.point.theta)
+    group = mode_group(density, mode, inference.error_model)
+    return at_mode(fit, density, mode, inference.error_model), {schema.ERROR_MODEL: group}
+
+
+def estimate_each(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    say: Say = silent,
+) -> xr.Dataset:
+    """Estimate a model's parameters from each run by itself, fitted and held-out runs alike.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.Dataset
+        MBE's estimates by run, see :func:`~bayesoleo.estimation.runs.per_run.by_run_dataset`, with
+        the coordinates ``group`` and ``role`` (run). A parameter that varies by run has one value a
+        run like any other. :func:`bayesoleo.estimation.between_runs` says how much the runs differ.
+    """
+    task = prepare(campaign, model, settings)
+    driven = task.assembly.model()
+    # Alone, every parameter is one of the run's own.
+    shared = {name: replace(item, by_run=False) for name, item in driven.parameters.items()}
+    driven = driven.with_parameters(**shared)
+    points, residuals = {}, {}
+    for record in task.reduced.records:
+        say(f"run {record.label}")
+        fit = fit_model(driven, [record], settings.numerics)
+        points[record.label] = fit.mbe
+        residuals[record.label] = fit.problem.evaluate(fit.mbe.theta).residual
+    units = [driven.parameters[name].unit for name in fit.problem.names]
+    records = task.reduced.records
+    return by_run_dataset(points, residuals, units).assign_coords(
+        {
+            schema.RUN_GROUP: (schema.RUN, [record.group for record in records]),
+            schema.ROLE: (schema.RUN, [record.role for record in records]),
+        }
+    )

@@ -1,0 +1,210 @@
+"""A campaign and a model brought together, and what does not fit found early."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from bayesoleo import schema
+from bayesoleo.data import (
+    Campaign,
+    ReducedCampaign,
+    findings,
+    frequency_findings,
+    load_campaign,
+    reduce_campaign,
+)
+from bayesoleo.data.units import parse_unit
+from bayesoleo.errors import CampaignError, DataWarning, ModelError
+from bayesoleo.estimation.runs.nuisance import declared_nuisance
+from bayesoleo.model import Model, driven_by, possible_drives
+from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.fit import first_steps
+from bayesoleo.tracing.roles import Roles, assign
+from bayesoleo.workflow.settings import Settings
+
+Say = Callable[[str], None]
+Source = str | os.PathLike[str] | Campaign | ReducedCampaign
+
+
+def silent(_: str) -> None:
+    """Say nothing."""
+
+
+def reduce(campaign: Source, *, jobs: int | None = None, progress: bool = False) -> ReducedCampaign:
+    """Load a campaign and reduce its runs to records.
+
+    Parameters
+    ----------
+    campaign : path-like, Campaign or ReducedCampaign
+        Folder with ``campaign.toml``, or what was loaded from one.
+    jobs : int, optional
+        Threads.
+    progress : bool
+        Whether to show a bar.
+
+    Raises
+    ------
+    CampaignError
+        If anything in it cannot be used.
+
+    Warns
+    -----
+    DataWarning
+        If a declared frequency is a part or a multiple of the true one.
+    """
+    if isinstance(campaign, ReducedCampaign):
+        return campaign
+    loaded = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    reduced = reduce_campaign(loaded, jobs=jobs, progress=progress)
+    for sentence in frequency_findings(reduced.records):
+        warnings.warn(sentence, DataWarning, stacklevel=2)
+    return reduced
+
+
+@dataclass(frozen=True)
+class Task:
+    """A campaign and a model, ready for work.
+
+    Parameters
+    ----------
+    reduced : ReducedCampaign
+    roles : Roles
+    assembly : Assembly
+        The declared model with its drive.
+    settings : Settings
+    """
+
+    reduced: ReducedCampaign
+    roles: Roles
+    assembly: Assembly
+    settings: Settings
+
+    @property
+    def campaign(self) -> Campaign:
+        """As loaded."""
+        return self.reduced.campaign
+
+    def about(self) -> dict[str, Any]:
+        """Top-level keys of the summary."""
+        return {
+            "format": schema.FORMAT,
+            "campaign": self.campaign.name,
+            "model": self.assembly.native.name,
+            "drive": self.assembly.drive or ", ".join(self.assembly.native.inputs),
+            "seed": self.settings.seed,
+        }
+
+
+def prepare(campaign: Source, model: Model, settings: Settings, *, progress: bool = False) -> Task:
+    """Bring a campaign and a model together, and find out early what does not fit.
+
+    Raises
+    ------
+    InputError
+        If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
+    """
+    model = settings.inference.declare(model)
+    reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
+    drive = choose_drive(model, reduced.campaign, settings.drive)
+    starts = not all(record.periodic for record in reduced.records)
+    assembly = Assembly(model, drive, starts=starts)
+    assembly, reduced = _with_nuisance(assembly, reduced, settings.nuisance)
+    roles = assign(reduced.records)
+    driven = assembly.model()
+    # Building a predictor of one step checks channels, conditions and priors of every run without
+    # solving anything.
+    predictor = Predictor(driven, reduced.records, steps=8, backend="numpy", jobs=1)
+    predictor.layout.priors(driven)
+    if not predictor.layout.names:
+        raise ModelError(
+            f"model {model.name!r} has no parameter to estimate",
+            hint="give at least one a prior (sd=…, relative_sd=…, bounds=…) without fixed=True",
+        )
+    _check_units(driven, reduced.campaign)
+    return Task(reduced, roles, assembly, settings)
+
+
+def _with_nuisance(
+    assembly: Assembly, reduced: ReducedCampaign, kinds: tuple[str, ...]
+) -> tuple[Assembly, ReducedCampaign]:
+    """Let what is known to a tolerance only be estimated within it."""
+    if not kinds:
+        return assembly, reduced
+    accuracy = {name: item.accuracy for name, item in reduced.campaign.channels.items()}
+    found = declared_nuisance(kinds, assembly.model(), reduced.records, accuracy)
+    records = found.complete(reduced.records)
+    return replace(assembly, nuisance=found), ReducedCampaign(reduced.campaign, records)
+
+
+def _check_units(model: Model, campaign: Campaign) -> None:
+    """Data come in SI: a model in other units, or of another quantity, is a mistake that no
+    estimate survives."""
+    declared = dict(model.inputs) | {name: output.unit for name, output in model.outputs.items()}
+    for name, unit in declared.items():
+        channel, wanted = campaign.channels[name], parse_unit(unit or "1")
+        if not unit:
+            continue
+        if wanted.si_name != channel.si_unit:
+            raise CampaignError(
+                f"channel {name!r} is in {channel.unit}, model {model.name!r} expects {unit}",
+                file=campaign.path / "campaign.toml",
+                key=f"channels.{name}.unit",
+                value=channel.unit,
+                hint=f"write a unit that converts to {unit}, or declare the model otherwise",
+            )
+        if wanted.factor != 1.0 or wanted.shift != 0.0:
+            raise ModelError(
+                f"model {model.name!r}: channel {name!r} is in {unit}, but data come in SI",
+                value=unit,
+                hint=f"declare the model in {wanted.si_name}",
+            )
+
+
+def choose_drive(model: Model, campaign: Campaign, wanted: str | None) -> str | None:
+    """The channel that is to drive a model; ``None`` for its own inputs."""
+    if wanted == "model":
+        return None
+    if wanted is not None:
+        driven_by(model, wanted)
+        return None if wanted in model.inputs else wanted
+    controlled = campaign.controlled
+    if controlled is None or controlled in model.inputs or controlled not in possible_drives(model):
+        return None
+    return controlled
+
+
+def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:
+    """Say what would be done; write nothing.
+
+    Returns
+    -------
+    dict
+        Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh, number of
+        candidate effects, and what deserves a look in the records.
+    """
+    from bayesoleo.effects import catalogue
+
+    task = prepare(campaign, model, settings)
+    driven = task.assembly.model()
+    predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
+    return {
+        **task.about(),
+        "inputs": list(driven.inputs),
+        "outputs": list(driven.outputs),
+        "fit": [record.label for record in task.roles.fitted],
+        "hold_out": [record.label for record in task.roles.held_out],
+        "strategy": task.roles.description,
+        "unknowns": list(predictor.layout.names),
+        "possible_drives": list(possible_drives(model)),
+        "steps": settings.steps or first_steps(driven, task.roles.fitted),
+        "effects": sum(
+            bool(effect.places(driven if effect.family == "sensor" else model))
+            for effect in (catalogue() if settings.effects is None else settings.effects)
+        ),
+        "findings": findings(task.reduced.records),
+    }
