@@ -17,6 +17,7 @@ from bayesoleo.plots.pairs import pairs
 from bayesoleo.plots.period_search import period_search
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.prior_sensitivities import prior_sensitivity
+from bayesoleo.plots.proposals import proposal
 from bayesoleo.plots.rankings import ranking
 from bayesoleo.plots.records import records
 from bayesoleo.plots.regions import indifference, profile
@@ -48,6 +49,7 @@ __all__ = [
     "predictive",
     "prior_sensitivity",
     "profile",
+    "proposal",
     "ranking",
     "records",
     "residual",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -13,6 +15,8 @@ from bayesoleo.plots.draws import chosen, draws, point_table, unit_of
 from bayesoleo.plots.units import Scale, engineering, format_number
 
 MOST = 10
+#: Characters of a name in one line below a panel, lines, and what each takes in inches.
+ACROSS, LINES, LINE = 15, 3, 0.13
 
 
 def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
@@ -44,7 +48,9 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
     truths = [
         s.factor * point[n][0] if n in point else None for n, s in zip(names, scales, strict=True)
     ]
-    size = max(1.05 * len(names) + 0.8, 3.2)
+    labels = [_label(name, scale) for name, scale in zip(names, scales, strict=True)]
+    margin = 0.59 + LINE * max(text.count("\n") + 1 for text in labels)
+    size = max(1.05 * len(names) + margin, 3.2)
     figure = style.blank(size, size)
     corner_package.corner(
         shown,
@@ -60,9 +66,9 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
         max_n_ticks=3,
         quiet=True,
     )
-    _arrange(figure)
+    _arrange(figure, margin)
     _mark(figure, truths)
-    _tidy(figure, names, scales, shown)
+    _tidy(figure, labels, shown)
     handles = [
         style.band(style.AFTER, "posterior"),
         style.line(style.BEFORE, "point estimate", 1.2),
@@ -96,26 +102,26 @@ def _mark(figure: Figure, truths: list[float | None]) -> None:
                 axes[row, column].axhline(y, color=style.BEFORE, lw=1.0)
 
 
-def _arrange(figure: Figure) -> None:
+def _arrange(figure: Figure, margin: float) -> None:
     """Margins in inches, as everywhere."""
     size = figure.get_figwidth()
     figure.subplots_adjust(
-        left=0.85 / size, right=1 - 0.15 / size, bottom=0.85 / size, top=1 - 0.4 / size,
+        left=margin / size, right=1 - 0.15 / size, bottom=margin / size, top=1 - 0.4 / size,
         wspace=0.07, hspace=0.07,
     )  # fmt: skip
 
 
-def _tidy(figure: Figure, names: list[str], scales: list[Scale], shown: reading.Array) -> None:
+def _tidy(figure: Figure, labels: list[str], shown: reading.Array) -> None:
     """Titles with value and spread, names and units on the outer axes, readable numbers."""
-    count, size = len(names), figure.get_figwidth()
+    count, size = len(labels), figure.get_figwidth()
     axes = np.array(figure.axes).reshape(count, count)
     for i in range(count):
         mean, sd = shown[:, i].mean(), shown[:, i].std()
         text = f"{format_number(mean, sd)} ± {format_number(sd, sd)}"
         axes[i, i].set_title(text, fontsize=style.SMALL - 0.5, color=style.INK, pad=4)
-        _axis(axes[count - 1, i], "x", _label(names[i], scales[i]), size)
+        _axis(axes[count - 1, i], "x", labels[i], size)
         if i > 0:
-            _axis(axes[i, 0], "y", _label(names[i], scales[i]), size)
+            _axis(axes[i, 0], "y", labels[i], size)
     for panel in axes.ravel():
         panel.tick_params(length=2.5, color=style.FAINT)
         for spine in panel.spines.values():
@@ -124,8 +130,14 @@ def _tidy(figure: Figure, names: list[str], scales: list[Scale], shown: reading.
 
 def _label(name: str, scale: Scale) -> str:
     """Name and unit below each other; a panel is too narrow for both in one line."""
-    text = style.plain(name.replace("log_variance_", "log var. "), 18)
-    return f"{text}\n[{scale.unit}]" if scale.unit else text
+    text = style.plain(name.replace("log_variance_", "log var. "), ACROSS * LINES)
+    lines = [""]
+    for part in re.split(r"(?<=[_ ])|(?=\[)", text):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > ACROSS and len(lines) < LINES:
+            lines.append("")
+        lines[-1] += part
+    lines = [style.plain(line.rstrip(), ACROSS + 4) for line in lines]
+    return "\n".join([*lines, f"[{scale.unit}]"] if scale.unit else lines)
 
 
 def _axis(axes: Axes, which: str, label: str, size: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
+from scipy import interpolate, stats
 
 from bayesoleo import schema
 from bayesoleo.estimation.shown import Shown
@@ -83,7 +83,8 @@ def profile(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
         if np.isfinite(half):
             x = np.linspace(centre - 1.3 * half, centre + 1.3 * half, 101)
             axes.plot(x, level * ((x - centre) / half) ** 2, "--", color=style.FAINT, lw=1.0)
-        axes.plot(value[keep], fall[keep], "o-", color=style.AFTER, lw=1.6, ms=3)
+        axes.plot(value[keep], fall[keep], "o", color=style.AFTER, ms=3)
+        axes.plot(*_smooth(value[keep], fall[keep], centre), color=style.AFTER, lw=1.6)
         axes.axhline(level, color=style.NEUTRAL, lw=0.8)
         axes.set_ylim(0, 1.6 * level)
         # The parabola of a parameter that the data leave open would squeeze all else to a point.
@@ -97,6 +98,20 @@ def profile(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     ]
     style.legend(figure, handles, f"level {100 * float(data.attrs['level']):.3g} %")
     return figure
+
+
+def _smooth(value: np.ndarray, fall: np.ndarray, centre: float) -> tuple[np.ndarray, np.ndarray]:
+    """The curve through points of a profile, the estimate among them.
+
+    Interpolated is the root of the fall with the sign of the side, which of a normal objective is a
+    straight line: few points give a smooth curve, and a monotone interpolant adds no bumps.
+    """
+    value, place = np.unique(np.append(value, centre), return_index=True)
+    root = np.sqrt(np.maximum(np.append(fall, 0.0)[place], 0.0)) * np.sign(value - centre)
+    if value.size < 2:
+        return value, root**2
+    fine = np.linspace(value[0], value[-1], 301)
+    return fine, interpolate.PchipInterpolator(value, root)(fine) ** 2
 
 
 def closed_curve(axes: Axes, curve: np.ndarray, colour: str, line: str, width: float) -> None:

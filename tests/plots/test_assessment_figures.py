@@ -49,7 +49,13 @@ def test_profile_shows_falls_and_level(fitted):
     found = profile(*fitted, ["cubic"])
     (axes,) = plots.profile(found).axes
     np.testing.assert_allclose(axes.lines[1].get_ydata(), found["fall"].values[0])
-    assert axes.lines[2].get_ydata()[0] == pytest.approx(1.92, abs=0.01)
+    # Linear in its parameters: between the points too the profile is a parabola.
+    x, fall = axes.lines[2].get_data()
+    half = float(found["linear_high"][0]) - float(found["estimate"][0])
+    exact = 1.92073 * ((x - float(found["estimate"][0])) / half) ** 2
+    # But for the variance, which is estimated anew at each point.
+    np.testing.assert_allclose(fall, exact, rtol=5e-3, atol=1e-4)
+    assert axes.lines[3].get_ydata()[0] == pytest.approx(1.92, abs=0.01)
 
 
 def test_histograms_hold_all_replications(fitted):

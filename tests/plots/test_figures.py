@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import json
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from bayesoleo import plots, schema
@@ -144,6 +146,19 @@ def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo
     assert "breakaway" in labels
     assert "offset" not in labels
     assert len(plots.corner(oleo, ["breakaway"]).axes) == 1
+
+
+def test_long_names_in_a_corner_stay_inside_it_and_apart(oleo):
+    names = ["breakaway", "correlation_time_force", "discrepancy_share_pressure"]
+    draws = oleo["posterior"].to_dataset()["breakaway"]
+    tree = xr.DataTree.from_dict({"posterior": xr.Dataset(dict.fromkeys(names, draws))})
+    figure = plots.corner(tree)
+    FigureCanvasAgg(figure).draw()
+    below = [axes.xaxis.label.get_window_extent() for axes in figure.axes[-3:]]
+    for box in (*below, *(axes.yaxis.label.get_window_extent() for axes in figure.axes[3::3])):
+        assert box.x0 > 0
+        assert box.y0 > 0
+    assert all(left.x1 < right.x0 for left, right in pairwise(below))
 
 
 def test_a_posterior_of_zero_width_is_no_error(oleo):
