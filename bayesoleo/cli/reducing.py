@@ -142,8 +142,13 @@ def _channels(
         for row, run, level in zip(cells, runs, noise, strict=True):
             harmonics = run["channels"][name]["harmonics"]
             counted = "" if harmonics is None else f" ({harmonics})"
-            row.append(f"{scale.factor * level:.3g}{counted}")
+            row.append(f"{_three_digits(scale.factor * level)}{counted}")
     return head, cells
+
+
+def _three_digits(value: float) -> str:
+    """Three digits or a few more, but no power of ten beside numbers without one."""
+    return f"{value:.0f}" if 999 < value < 1e5 else f"{value:.3g}"
 
 
 def _write_records(reduced: ReducedCampaign, out: Path) -> None:

@@ -27,7 +27,12 @@ from bayesoleo.errors import CampaignError
 
 Array = NDArray[np.float64]
 
-_TIME_COLUMNS = ("time", "time_s")
+# Names of a time column in seconds that need not be declared.
+_TIME_COLUMNS = tuple(
+    word + unit
+    for word in ("time", "Time", "TIME", "t")
+    for unit in ("", "_s", " s", " [s]", "[s]", " (s)", "(s)", "/s")
+)
 
 
 @dataclass(frozen=True)
@@ -238,8 +243,8 @@ def _time(
             return uniform_time(columns[name], name)
     raise CampaignError(
         "no time column",
-        column=" or ".join(_TIME_COLUMNS),
-        hint=f"name it with time = '...', or give sample_rate; {choose('time', columns)}",
+        hint="it is found by names such as time, time_s, time [s] or t; if yours, in seconds, has "
+        f"another, write time = '...', or give sample_rate; {choose('time', columns)}",
     )
 
 

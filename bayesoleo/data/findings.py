@@ -1,5 +1,5 @@
-"""What deserves a look in reduced records, as sentences: drift, and a frequency that is a multiple
-or a fraction of the true one."""
+"""What deserves a look in reduced records, as sentences: drift, a frequency that is a multiple or a
+part of the true one, a channel in which nothing repeats."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def findings(records: Sequence[Record]) -> list[str]:
 
 
 def frequency_findings(records: Sequence[Record]) -> list[str]:
-    """Those about declared frequencies, which make everything else that is found doubtful.
+    """Those about what repeats and when, without which everything else that is found is doubtful.
 
     Parameters
     ----------
@@ -108,22 +108,32 @@ def frequency_findings(records: Sequence[Record]) -> list[str]:
     -------
     list of str
     """
+    return [sentence for record in records for sentence in _about_period(record)]
+
+
+def _about_period(record: Record) -> list[str]:
+    """What is doubtful about the period of one run."""
     found = []
-    for record in records:
-        times = motions_per_period(record)
-        if times > 1:
-            found.append(
-                f"run {record.label}: the motion repeats {times} times in a declared period, as if "
-                f"that were {times} periods; write frequency = {times * record.frequency:.4g}"
-            )
-        count, channel = periods_per_motion(record)
-        if count > 1:
-            found.append(
-                f"run {record.label}: {channel} repeats after {count} declared periods only, and "
-                f"what differs between them counts as noise; write frequency = "
-                f"{record.frequency / count:.4g}"
-            )
-    return found
+    times = motions_per_period(record)
+    if times > 1:
+        found.append(
+            f"run {record.label}: the motion repeats {times} times in a declared period, as if "
+            f"that were {times} periods; write frequency = {times * record.frequency:.4g}"
+        )
+    count, channel = periods_per_motion(record)
+    if count > 1:
+        found.append(
+            f"run {record.label}: {channel} repeats after {count} declared periods only, and "
+            f"what differs between them counts as noise; write frequency = "
+            f"{record.frequency / count:.4g}"
+        )
+        return found
+    return found + [
+        f"run {record.label}: nothing in {name} repeats at {record.frequency:.4g} Hz above its "
+        "noise; look at the record, leave the run out, or declare it as kind = 'transient'"
+        for name, harmonics in record.harmonics.items()
+        if not (harmonics.orders > 0).any()
+    ]
 
 
 def _sentence(record: Record, item: Drift) -> str:

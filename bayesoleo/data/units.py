@@ -39,6 +39,9 @@ _SI_NAMES = {
     "kilogram": "kg",
 }
 
+#: A torque has the base units of an energy; which one is meant shows in how it is written.
+_ENERGY, TORQUE = "J", "N*m"
+
 #: Words at the end of a channel's or a condition's name that fix its SI unit.
 _EXPECTED = {
     "pressure": ("Pa", "bar"),
@@ -120,9 +123,22 @@ def parse_unit(name: str) -> Unit:
     shift = float(zero.magnitude)
     # kN is 1000 N exactly; pint's base units go through grams and may miss it by one rounding.
     factor = float(f"{float(one.magnitude) - shift:.15g}")
-    return Unit(
-        name, _SI_NAMES.get(base, base.replace(" ** ", "^").replace(" ", "")), factor, shift
-    )
+    si_name = _SI_NAMES.get(base, base.replace(" ** ", "^").replace(" ", ""))
+    if si_name == _ENERGY and _holds_force(unit):
+        si_name = TORQUE
+    return Unit(name, si_name, factor, shift)
+
+
+def _holds_force(unit: Any) -> bool:
+    """Whether a unit is written as a force times something."""
+    force = _registry().Unit("N").dimensionality
+    parts = _registry().Quantity(1.0, unit).unit_items()
+    return any(_registry().Unit(part).dimensionality == force for part, _ in parts)
+
+
+def same_quantity(first: str, second: str) -> bool:
+    """Whether two SI units measure the same, as far as units tell: a torque may be called J."""
+    return first == second or {first, second} == {_ENERGY, TORQUE}
 
 
 def check_kind(name: str, unit: Unit) -> None:

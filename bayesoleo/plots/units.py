@@ -15,10 +15,11 @@ ALLOWED = {
     "s": (*SMALL, ""),
     "K": ("m", ""),
     "mol": (*SMALL, ""),
+    "rad": (*SMALL, ""),
 } | dict.fromkeys(("N", "Pa", "V", "A", "W", "J", "Hz"), ALL)
 ALLOWED_POWERS = {"m": (*SMALL, "c", "")}
 LEADING = re.compile(
-    r"^(mol|Pa|Hz|[NmsVAWJK])(?![A-Za-zµ])\s*(?:(?:\*\*|\^)\s*)?([23²³])?(?=$|\D)(.*)$"
+    r"^(mol|rad|Pa|Hz|[NmsVAWJK])(?![A-Za-zµ])\s*(?:(?:\*\*|\^)\s*)?([23²³])?(?=$|\D)(.*)$"
 )
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DIMENSIONLESS = ("", "1", "-", "dimensionless")

@@ -17,7 +17,7 @@ from bayesoleo.data import (
     load_campaign,
     reduce_campaign,
 )
-from bayesoleo.data.units import parse_unit
+from bayesoleo.data.units import parse_unit, same_quantity
 from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
@@ -149,7 +149,7 @@ def _check_units(model: Model, campaign: Campaign) -> None:
         channel, wanted = campaign.channels[name], parse_unit(unit or "1")
         if not unit:
             continue
-        if wanted.si_name != channel.si_unit:
+        if not same_quantity(wanted.si_name, channel.si_unit):
             raise CampaignError(
                 f"channel {name!r} is in {channel.unit}, model {model.name!r} expects {unit}",
                 file=campaign.path / "campaign.toml",

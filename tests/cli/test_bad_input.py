@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import CAMPAIGN, MODEL, rows, write_rows
+from small_rig import CAMPAIGN, MODEL, rows, write_rows
 
 from bayesoleo.storage import write_tree
 

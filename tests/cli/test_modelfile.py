@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 import pytest
-from conftest import MODEL
+from small_rig import MODEL
 
 from bayesoleo.effects import catalogue
 from bayesoleo.errors import ModelError

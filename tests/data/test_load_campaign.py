@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 import scipy.io
-from conftest import TOML, table
+from small_table import TOML, table
 
 from bayesoleo.data import load_campaign
 from bayesoleo.errors import CampaignError
@@ -70,6 +70,18 @@ def test_sample_rate_and_window(make_campaign):
     run = load_campaign(folder).runs[0]
     assert run.time.size == 111
     assert run.time[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("name", ["time", "Time [s]", "time (s)", "t", "t_s"])
+def test_a_time_column_is_known_by_its_name(make_campaign, name):
+    (run,) = load_campaign(make_campaign(header=f"{name},x_mm,f_kN")).runs
+    np.testing.assert_allclose(run.time, table()[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["time_ms", "stamp"])
+def test_a_time_column_of_another_name_or_unit_has_to_be_declared(make_campaign, name):
+    with pytest.raises(CampaignError, match=r"no time column; .* write time = '...', or give"):
+        load_campaign(make_campaign(header=f"{name},x_mm,f_kN"))
 
 
 @pytest.mark.parametrize("decimals", [3, 4, 9])

@@ -157,6 +157,15 @@ def test_noise_does_not_repeat_after_two_periods_either(tmp_path):
     assert periods_per_motion(record) == (1, "")
 
 
+def test_a_channel_in_which_nothing_repeats_is_named(tmp_path):
+    def wandering(rng):
+        return np.cumsum(rng.standard_normal(TIME.size))
+
+    sentences = findings(reduced(tmp_path, wandering).records)
+    assert "run only: nothing in displacement repeats at 2 Hz above its noise" in sentences[0]
+    assert not any("force" in sentence for sentence in sentences)
+
+
 def test_rounding_of_samples_without_noise_is_no_longer_period(tmp_path):
     """Rounding repeats in some longer period, as a wrong frequency would make a motion do."""
     assert findings(damper_campaign(tmp_path).records) == []

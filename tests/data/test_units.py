@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesoleo.data.units import check_kind, parse_unit
+from bayesoleo.data.units import check_kind, parse_unit, same_quantity
 from bayesoleo.errors import CampaignError
 
 UNITS = [
@@ -38,6 +38,9 @@ UNITS = [
         ("degF", 68.0, 293.15, "K"),
         ("lbf", 1.0, 4.4482216, "N"),
         ("V", 1.0, 1.0, "V"),
+        ("mN*m", 2.0, 2e-3, "N*m"),
+        ("lbf*ft", 1.0, 1.3558179, "N*m"),
+        ("kJ", 2.0, 2000.0, "J"),
         ("Hz", 3.0, 3.0, "Hz"),
         ("1", 3.0, 3.0, "1"),
         ("W/K", 1.0, 1.0, "kilogram*meter^2/kelvin/second^3"),
@@ -65,3 +68,9 @@ def test_kind():
     check_kind("initial_pressure", parse_unit("psia"))
     with pytest.raises(CampaignError, match=r"does not measure temperature \(got 'bar'\)"):
         check_kind("ambient_temperature", parse_unit("bar"))
+
+
+def test_a_torque_may_be_called_an_energy_but_no_force():
+    assert same_quantity("N*m", "J")
+    assert same_quantity("J", "J")
+    assert not same_quantity("N*m", "N")
