@@ -5,6 +5,7 @@ from bayesoleo.posterior.density import LogDensity
 from bayesoleo.posterior.diagnostics import Comparison, compare_with_point
 from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
 from bayesoleo.posterior.hierarchy import hierarchical
+from bayesoleo.posterior.importance import Weighted, importance_sample
 from bayesoleo.posterior.laplace import Mode, find_mode, laplace_mixture
 from bayesoleo.posterior.mixture import Mixture
 from bayesoleo.posterior.predictive import choose_draws
@@ -20,12 +21,14 @@ __all__ = [
     "Mixture",
     "Mode",
     "Samples",
+    "Weighted",
     "choose_draws",
     "compare",
     "compare_with_point",
     "error_model",
     "find_mode",
     "hierarchical",
+    "importance_sample",
     "laplace_mixture",
     "prior_sensitivity",
     "sample",

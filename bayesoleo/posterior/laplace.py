@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.density import LogDensity
+from bayesoleo.posterior.differences import derivatives
 from bayesoleo.posterior.information import information_at, residuals_at
 from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM, Mixture
 from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
-#: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding
-#: and solver noise.
-STEP = 0.25
 #: A mode is found when the Newton step is shorter than this many standard deviations.
 TOLERANCE = 1e-3
 #: Longest Newton step, in standard deviations; a quadratic model is not trusted further.
@@ -116,7 +114,7 @@ def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) ->
     for _ in range(iterations):
         covariance = gauss_newton_covariance(log_density, phi)
         factor = np.linalg.cholesky(covariance)
-        height, gradient, hessian = _derivatives(log_density, phi, factor)
+        height, gradient, hessian = derivatives(lambda rows: log_density(rows)[0], phi, factor)
         if not np.isfinite(height):
             return Mode(phi, covariance, -np.inf, Status.NOT_FINITE)
         step = _newton_step(gradient, hessian)
@@ -135,26 +133,6 @@ def find_mode(log_density: LogDensity, start: Array, *, iterations: int = 25) ->
     half_log_det = float(np.sum(np.log(np.diagonal(np.linalg.cholesky(covariance)))))
     weight = height + half_log_det + 0.5 * len(phi) * np.log(2 * np.pi)
     return Mode(phi, covariance, float(weight), status)
-
-
-def _derivatives(log_density: LogDensity, phi: Array, factor: Array) -> tuple[float, Array, Array]:
-    """Height, gradient and Hessian by central differences in ``z`` of ``phi + factor @ z``."""
-    d, h = len(phi), STEP
-    unit = h * np.eye(d)
-    pairs = [(i, j) for i in range(d) for j in range(i)]
-    both = np.array([unit[i] + unit[j] for i, j in pairs]).reshape(-1, d)
-    rows = np.concatenate([np.zeros((1, d)), unit, -unit, both, -both])
-    values, _ = log_density(phi + rows @ factor.T)
-    centre, up, down = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
-    with np.errstate(invalid="ignore"):
-        gradient = (up - down) / (2 * h)
-        hessian = np.diag((up - 2 * centre + down) / h**2)
-        diagonal = up + down - 2 * centre
-        twice = values[2 * d + 1 : 2 * d + 1 + len(pairs)] + values[2 * d + 1 + len(pairs) :]
-        for (i, j), sum_of_two in zip(pairs, twice, strict=True):
-            mixed = (sum_of_two - 2 * centre - diagonal[i] - diagonal[j]) / (2 * h**2)
-            hessian[i, j] = hessian[j, i] = mixed
-    return float(centre), gradient, hessian
 
 
 def _newton_step(gradient: Array, hessian: Array) -> Array:
