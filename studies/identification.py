@@ -17,7 +17,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -202,7 +202,7 @@ def truth(campaign: Campaign, rng: np.random.Generator) -> tuple[Model, dict[str
         candidate = effect.extend(native, effect.places(native)[0], _any_scales())
         model = driven_by(candidate.model, DRIVE)
     values: dict[str, Any] = {name: grid[0] for name, grid in option.candidate.shapes.items()}
-    (sign,) = set(_signs(campaign, option)) or {0}
+    (sign,) = _signs().get(key) or {0}
     for name in candidate.parameters:
         by_run = model.parameters[name].by_run
         drawn = rng.standard_normal(len(RUNS)) if by_run else (sign or rng.choice([-1.0, 1.0]))
@@ -210,9 +210,10 @@ def truth(campaign: Campaign, rng: np.random.Generator) -> tuple[Model, dict[str
     return model, values
 
 
-def _signs(campaign: Campaign, option: Option) -> Iterator[int]:
-    own = [o for o in _of(None) if o.key == option.key] if campaign.effect else []
-    yield from (own[0].candidate.sign.values() if own else [0])
+@cache
+def _signs() -> dict[tuple[str, str], set[int]]:
+    """Sides of the null that are physical, by effect and target."""
+    return {option.key: set(option.candidate.sign.values()) for option in _of(None)}
 
 
 def _any_scales() -> Any:

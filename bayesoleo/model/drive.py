@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import sympy as sp
 
@@ -26,6 +27,7 @@ from bayesoleo.model.expressions import (
 )
 from bayesoleo.model.model import Model
 from bayesoleo.model.parameter import Dof, Output
+from bayesoleo.model.structured import Structured
 
 #: An input has exact derivatives of any order; equations need at most this many.
 MAXIMUM_DERIVATIVE = 6
@@ -62,6 +64,13 @@ def driven_by(model: Model, channel: str) -> Model:
     """
     if channel in model.inputs:
         return model
+    return _driven(Structured(model), channel).with_parameters(**model.parameters)
+
+
+@lru_cache(maxsize=512)
+def _driven(like: Structured, channel: str) -> Model:
+    """The same of any model with these equations; parameters and their values stay as they are."""
+    model = like.model
     found = _freed_input(model, channel) if channel in model.outputs else None
     if found is None:
         raise ModelError(

@@ -22,6 +22,7 @@ from bayesoleo.model.derive import Derived, derive
 from bayesoleo.model.expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model.model import Model
 from bayesoleo.model.printing import code
+from bayesoleo.model.structured import Structured
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,9 @@ class Kernels:
     source: str
 
 
-@lru_cache(maxsize=128)
-def _cached(digest: str, active: tuple[str, ...], backend: str, model: _Hashed) -> Kernels:
-    derived = derive(model.model, active)
+@lru_cache(maxsize=512)  # a search over the catalogue makes some two hundred
+def _cached(like: Structured, active: tuple[str, ...], backend: str) -> Kernels:
+    derived = derive(like.model, active)
     if backend == "numba":
         results = {name: make() for name, make in _results(derived).items()}
         source = _module(results, derived, backend)
@@ -123,20 +124,6 @@ def _counts(derived: Derived) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True)
-class _Hashed:
-    """A model that compares by its digest, so that it can key a cache."""
-
-    model: Model
-    digest: str
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Hashed) and other.digest == self.digest
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
-
-
 def kernels(model: Model, active: Sequence[str] | None = None, backend: str = "numba") -> Kernels:
     """Generate (or fetch) the kernels of a model.
 
@@ -154,8 +141,7 @@ def kernels(model: Model, active: Sequence[str] | None = None, backend: str = "n
     Kernels
     """
     chosen = tuple(model.estimated() if active is None else active)
-    digest = model.digest()
-    return _cached(digest, chosen, backend, _Hashed(model, digest))
+    return _cached(Structured(model), chosen, backend)
 
 
 def _results(derived: Derived) -> dict[str, Callable[[], list[sp.Expr]]]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import keyword
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -151,6 +152,8 @@ class Model:
         return {name: symbol(name) for name in names}
 
     def _parse(self, text: Text, where: str) -> sp.Expr:
+        if isinstance(text, sp.Expr):
+            return text
         known = self._known() | {name: symbol(name) for name in self.definitions}
         where = f"model {self.name!r}, {where}"
         return parse(text, known, self._dynamic, where, self._whole(self.definitions))
@@ -166,7 +169,8 @@ class Model:
         known, parsed = self._known(), dict[str, sp.Expr]()
         for name, text in self.definitions.items():
             where = f"model {self.name!r}, definition {name!r}"
-            parsed[name] = parse(text, known, self._dynamic, where, self._whole(parsed))
+            whole = {} if isinstance(text, sp.Expr) else self._whole(parsed)
+            parsed[name] = parse(text, known, self._dynamic, where, whole)
             known[name] = symbol(name)
         return parsed
 
@@ -217,13 +221,24 @@ class Model:
                 break
         return expression
 
+    @cached_property
+    def _expanded(self) -> dict[tuple[str, str], sp.Expr]:
+        """Equations and outputs that were asked for before."""
+        return {}
+
     def equation(self, dof: str) -> sp.Expr:
         """Left-hand side of a dof's equation, definitions expanded."""
-        return self.expand(sp.Add(*self.equations[dof].values()))
+        key = "equation", dof
+        if key not in self._expanded:
+            self._expanded[key] = self.expand(sp.Add(*self.equations[dof].values()))
+        return self._expanded[key]
 
     def output(self, name: str) -> sp.Expr:
         """Expression of an output, definitions expanded."""
-        return self.expand(sp.Add(*self.output_terms(name).values()))
+        key = "output", name
+        if key not in self._expanded:
+            self._expanded[key] = self.expand(sp.Add(*self.output_terms(name).values()))
+        return self._expanded[key]
 
     def output_terms(self, name: str) -> Terms:
         """Named terms of an output."""
@@ -296,11 +311,38 @@ class Model:
         """SHA-256 of what the model says; equal for models that say the same in the same words."""
         return hashlib.sha256(repr(self).encode()).hexdigest()
 
+    @cached_property
+    def structure(self) -> Hashable:
+        """What the model says without the values and priors of its parameters.
+
+        Models of equal structure have the same equations, and so the same compiled code.
+        """
+
+        def pairs(items: Mapping[str, Hashable]) -> Hashable:
+            return tuple(items.items())
+
+        return (
+            (self.name, self.description, tuple(self.parameters), tuple(self.admissible)),
+            pairs(self.inputs),
+            pairs(self.dofs),
+            pairs(self.conditions),
+            pairs(self.definitions),
+            pairs({dof: pairs(terms) for dof, terms in self.equations.items()}),
+            pairs({n: (o.unit, o.description) for n, o in self.outputs.items()}),
+            pairs({name: pairs(self.output_terms(name)) for name in self.outputs}),
+        )
+
     # -- changing: what effects are made of -----------------------------------------------
 
     def with_parameters(self, **parameters: Parameter) -> Model:
         """Add parameters, or replace those of the same name."""
-        return replace(self, parameters={**self.parameters, **parameters})
+        other = copy(self)  # expressions stay, and what was found out about them
+        object.__setattr__(other, "parameters", {**self.parameters, **parameters})
+        other.__dict__.pop("_coordinates", None)  # their signs follow nominal values
+        if not self.parameters.keys() >= parameters.keys():
+            other.__dict__.pop("structure", None)
+        other._check_names()
+        return other
 
     def with_term(self, kind: str, target: str, name: str, expression: Text) -> Model:
         """Add a named term to a balance, or replace the one of that name.

@@ -87,8 +87,9 @@ class RunPredictor:
 
     _fused: tuple[Any, FusedSquares | None] | None = None
 
-    #: Solutions so far that left the branch of the anchor from which they were started.
-    jumps = 0
+    #: Solutions so far that left the branch of the anchor from which they were started, and whether
+    #: they are looked for: where a solution is known, it costs more than the solution.
+    jumps, watched = 0, True
 
     def __init__(
         self,
@@ -265,7 +266,7 @@ class RunPredictor:
     ) -> NDArray[np.bool_]:
         """Whether solutions that converged left the anchor's branch, which is counted."""
         anchor = self.anchor
-        if anchor is None or anchor.monodromy is None:  # of a transient
+        if not self.watched or anchor is None or anchor.monodromy is None:  # of a transient
             return np.zeros(p.shape[0], dtype=np.bool_)
         good = status == Status.CONVERGED.value
         left = anchor.left_by(p[:, self.active] - anchor.p[self.active], x) & good

@@ -135,7 +135,7 @@ class Assembly:
         base = Assembly(declared, self.drive, nuisance=self.nuisance, starts=self.starts)
         for other in self.steps:
             if other is not step:
-                base = base._with_step(other.effect, other.target, other.scales)[1]
+                base = base.option(other.effect, other.target, other.scales).assembly
         present = self.model().parameters
         kept = {name: item for name, item in present.items() if name in base.model().parameters}
         return base.with_parameters(kept)
@@ -147,28 +147,44 @@ class Assembly:
         """
         found, driven = [], self.model()
         for effect in catalogue() if effects is None else effects:
-            base = driven if effect.on_channels else self.native
-            for place in candidates(base, scales, (effect,)):
+            base = driven if effect.on_channels else self.native  # made once for all channels
+            for candidate in candidates(base, scales, (effect,)):
                 try:
-                    candidate, assembly = self._with_step(effect, place.target, scales)
+                    assembly = self._with_candidate(effect, candidate, scales, base)
                     found.append(Option(candidate, assembly, assembly.model()))
                 except ModelError:
                     continue
         return found
 
-    def _with_step(self, effect: Effect, target: str, scales: Scales) -> tuple[Candidate, Assembly]:
-        """Add an effect: to the driven model if it sits on channels, else to the equations."""
-        sensor = effect.on_channels
-        base = self.model() if sensor else self.native
+    def option(self, effect: Effect, target: str, scales: Scales) -> Option:
+        """One effect at one place, ready to be scored or estimated.
+
+        Raises
+        ------
+        ModelError
+            If it does not apply there, or leaves no unique inverse for the drive.
+        """
+        base = self._base(effect)
         candidate = effect.extend(base, target, scales)
-        step = Step(effect, target, scales, candidate.parameters)
+        assembly = self._with_candidate(effect, candidate, scales, base)
+        return Option(candidate, assembly, assembly.model())
+
+    def _base(self, effect: Effect) -> Model:
+        """The driven model if an effect sits on channels, else the equations."""
+        return self.model() if effect.on_channels else self.native
+
+    def _with_candidate(
+        self, effect: Effect, candidate: Candidate, scales: Scales, base: Model
+    ) -> Assembly:
+        """Add an effect, given what it makes of the model that it is added to."""
+        step = Step(effect, candidate.target, scales, candidate.parameters)
         grown = replace(self, steps=(*self.steps, step), declared=self.declared or self.native)
-        if not sensor:
-            return candidate, replace(grown, native=candidate.model)
+        if not effect.on_channels:
+            return replace(grown, native=candidate.model)
         new = {
             name: item
             for name, item in candidate.model.parameters.items()
             if name not in base.parameters
         }
-        sensors = (*self.sensors, (effect, target, scales))
-        return candidate, replace(grown, sensors=sensors, parameters={**self.parameters, **new})
+        sensors = (*self.sensors, (effect, candidate.target, scales))
+        return replace(grown, sensors=sensors, parameters={**self.parameters, **new})

@@ -405,6 +405,7 @@ def _sensitivities(
             for name, value in values.items():
                 p[k, run.kernels.derived.constants.index(name)] = value
         run.motions = fit.predictor.runs[r].known_motions()
+        run.watched = False  # at the null nothing has moved
         status = run.set_anchor(p[0])
         if status is not Status.CONVERGED:
             return status
