@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from bayesoleo.workflow import close as close
     from bayesoleo.workflow import estimate as estimate
     from bayesoleo.workflow import estimate_each as estimate_each
+    from bayesoleo.workflow import propose as propose
     from bayesoleo.workflow import reduce as reduce
     from bayesoleo.workflow import sample as sample
     from bayesoleo.workflow import simulate as simulate
@@ -82,6 +83,7 @@ _HOMES = {
         "close",
         "estimate",
         "estimate_each",
+        "propose",
         "reduce",
         "sample",
         "simulate",

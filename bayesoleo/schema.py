@@ -40,6 +40,7 @@ ASSESSMENT: Final = "assessment"
 LOG_PRIOR: Final = "log_prior"
 ERROR_MODEL: Final = "error_model"
 COMPARISON: Final = "comparison"
+PROPOSAL: Final = "proposal"
 
 GROUPS: Final = (
     OBSERVED_DATA,
@@ -62,6 +63,7 @@ GROUPS: Final = (
     LOG_PRIOR,
     ERROR_MODEL,
     COMPARISON,
+    PROPOSAL,
 )
 
 # Dims; each that is not just a counter has a coordinate of the same name
@@ -79,6 +81,8 @@ PART: Final = "part"
 ROUND: Final = "round"
 EFFECT: Final = "effect"
 QUANTITY: Final = "quantity"
+MEAN: Final = "mean"
+AMPLITUDE: Final = "amplitude"
 
 # Variables and coordinates
 TIME: Final = "time"

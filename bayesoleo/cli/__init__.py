@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from bayesoleo.cli import assessing, listing, loop, reducing, results, steps
+from bayesoleo.cli import assessing, listing, loop, proposing, reducing, results, steps
 from bayesoleo.cli.shell import Commands, flowing
 
 __all__ = ["app", "main"]
@@ -64,7 +64,7 @@ def _top(
 
 
 app.callback(help=flowing(_top.__doc__ or ""))(_top)
-for _module in (loop, reducing, steps, assessing, results, listing):
+for _module in (loop, proposing, reducing, steps, assessing, results, listing):
     _module.add_to(app)
 
 

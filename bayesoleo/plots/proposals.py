@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from bayesoleo import schema
 from bayesoleo.plots import reading, style
@@ -59,10 +59,10 @@ def proposal(tree: xr.DataTree, number: int = 0) -> Figure:
     )
     bar.set_label("separation in standard deviations", fontsize=style.SMALL)
     bar.ax.tick_params(labelsize=style.SMALL)
-    bar.ax.yaxis.set_major_formatter(ScalarFormatter())
+    bar.ax.yaxis.set_major_formatter("{x:g}")
     _marks(axes, tree, data, scale)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(ScalarFormatter())
+        axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("frequency in Hz", fontsize=style.TEXT)
     drive = tree[schema.PROPOSAL].attrs["drive"]

@@ -15,6 +15,7 @@ from bayesoleo.errors import ResultsError
 from bayesoleo.plots import reading
 from bayesoleo.report import sections, sentences, tables
 from bayesoleo.report.images import encode_formula
+from bayesoleo.report.proposals import proposal_lines, proposal_table
 from bayesoleo.storage import write_text_atomic
 
 
@@ -65,6 +66,7 @@ def _content(tree: xr.DataTree) -> dict[str, Any]:
         "error_by_role": tables.error_by_role(summary, units),
         "error_by_run": tables.error_by_run(summary, units),
         "remainder": sentences.remainder(summary),
+        "proposals": list(_proposals(tree, summary)),
         "stability": sentences.stability(summary),
         "records": tables.records(tree),
         "rounds": list(_rounds(tree, summary)),
@@ -98,6 +100,16 @@ def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, An
             "reason": sentences.reason(entry),
             "table": tables.candidates(entry) if entry["candidates"] else None,
             "figures": sections.ranking_figure(tree, number),
+        }
+
+
+def _proposals(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Sentences, table and figure for each set of effects that is left to be told apart."""
+    for entry in summary.get("proposals", []):
+        yield {
+            "lines": proposal_lines(entry),
+            "table": proposal_table(entry),
+            "figures": sections.proposal_figure(tree, entry),
         }
 
 

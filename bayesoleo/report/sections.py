@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import xarray as xr
 from matplotlib.figure import Figure
@@ -13,6 +14,7 @@ from bayesoleo import plots, schema
 from bayesoleo.plots import reading
 from bayesoleo.plots.residuals import Against
 from bayesoleo.report.images import Image, encode_figure
+from bayesoleo.report.proposals import proposal_table
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,22 @@ def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
     if entry["accepted"]:
         caption += " These data cannot tell the effects marked ≈ from the accepted one."
     return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
+
+
+def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
+    """Where on the rig's range the rivals of one round would be told apart."""
+    group = reading.group(tree, schema.PROPOSAL)
+    if group is None or proposal_table(entry) is None:
+        return []
+    rounds = [int(number) for number in group[schema.ROUND].values]
+    if entry["round"] not in rounds:
+        return []
+    caption = (
+        "Standard deviations by which a run would separate the least separated pair of "
+        f"{', '.join(entry['rivals'])}, at the mean position that is best for it. Where it is "
+        "blank the rig cannot go."
+    )
+    return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 
 
 def error_figure(tree: xr.DataTree) -> list[Shown]:

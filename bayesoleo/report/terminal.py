@@ -12,6 +12,7 @@ from rich.text import Text
 from bayesoleo import schema
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report import sentences, tables
+from bayesoleo.report.proposals import proposal_lines
 
 COLOURS = {
     schema.NOTHING_MISSING: "green",
@@ -38,6 +39,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             console.print(_accepted(number, entry))
     for line in sentences.remainder(summary):
         console.print(Text(line, style="dim"))
+    for entry in summary.get("proposals", []):
+        console.print(Text(" ".join(proposal_lines(entry)[:2]), style="dim"))
     for line in _warnings(summary):
         console.print(Text(line, style="yellow"))
     files = summary.get("files", {})

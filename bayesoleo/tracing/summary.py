@@ -70,6 +70,7 @@ def _round(item: Round) -> dict[str, Any]:
         "accepted": item.accepted.effect if item.accepted else None,
         "accepted_target": item.accepted.target if item.accepted else None,
         "reason": item.reason,
+        "failed": dict(item.failed),
     }
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import xarray as xr
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
+from bayesoleo.tracing.experiments.questions import Question, questions_of
 from bayesoleo.tracing.loop import ClosedLoop, close_loop
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.sampling import draw
@@ -30,7 +32,7 @@ def trace(
     """
     task = prepare(campaign, model, settings, progress=progress)
     loop = run_loop(task, 0, say)
-    return write_result(task, loop, None, out, say)
+    return write_result(task, loop, None, out, say, what_next(task, loop, say))
 
 
 def close(
@@ -73,9 +75,10 @@ def close(
     """
     task = prepare(campaign, model, settings, progress=progress)
     loop = run_loop(task, settings.max_effects, say)
+    found = what_next(task, loop, say)
     say("sample the posterior")
     drawn = draw(task, loop.final.fit, out, say, progress)
-    return write_result(task, loop, drawn, out, say)
+    return write_result(task, loop, drawn, out, say, found)
 
 
 def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
@@ -105,3 +108,28 @@ def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
         max_effects=max_effects,
         say=say,
     )
+
+
+def what_next(
+    task: Task,
+    loop: ClosedLoop,
+    say: Say,
+    *,
+    rivals: Sequence[str] = (),
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> tuple[Question, ...]:
+    """The runs that would tell apart what the loop could not.
+
+    Parameters
+    ----------
+    task : Task
+    loop : ClosedLoop
+    say : callable
+        Told what is being done.
+    rivals : sequence of str, optional
+        Effects of the last round to be told apart; by default those that each round leaves.
+    limits : mapping of str to (float, float), optional
+        Of the rig, SI, before those of the campaign.
+    """
+    rig = {**task.campaign.rig, **(limits or {})}
+    return questions_of(loop, rig, task.settings.numerics, effects=rivals, say=say)

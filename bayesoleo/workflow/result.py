@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.report import write_report
 from bayesoleo.storage import provenance, write_text_atomic, write_tree
 from bayesoleo.systems import equations, equations_latex
+from bayesoleo.tracing.experiments.questions import Question
+from bayesoleo.tracing.experiments.stored import proposals_entry, proposals_group
 from bayesoleo.tracing.fit import Fit
 from bayesoleo.tracing.loop import ClosedLoop
 from bayesoleo.tracing.result import loop_groups, point_group, posterior_groups, records_tree
@@ -31,6 +33,7 @@ def write_result(
     drawn: tuple[Samples, LogDensity] | None,
     out: Path | None,
     say: Say,
+    questions: Sequence[Question] = (),
 ) -> xr.DataTree:
     """The tree of a closed loop, with its summary; with a folder, its three files.
 
@@ -44,6 +47,8 @@ def write_result(
         The folder.
     say : callable
         Told what is being done.
+    questions : sequence of Question, optional
+        What it left to be told apart, and by which runs that could be done.
     """
     seed, fit = task.settings.seed, loop.final.fit
     samples, density = drawn or (None, None)
@@ -52,7 +57,10 @@ def write_result(
     files = {} if out is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
     summary["notes"] = [*summary["notes"], *findings(task.reduced.records)]
+    unit = _drive_unit(task, loop)
+    summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     groups = {schema.POINT: point_group(fit), **loop_groups(loop, drawn, seed)}
+    groups |= proposals_group(questions, unit)
     if samples is not None:
         groups |= posterior_groups(fit, samples, seed, density)
         groups[schema.COMPARISON] = compare(groups)
@@ -64,6 +72,13 @@ def write_result(
         write_report(tree, out / REPORT)
         write_text_atomic(out / SUMMARY, schema.summary_json(summary))
     return tree
+
+
+def _drive_unit(task: Task, loop: ClosedLoop) -> str:
+    """SI unit of the channel that drives the model."""
+    (channel, *_) = loop.final.fit.model.inputs or ("",)
+    found = task.campaign.channels.get(task.assembly.drive or channel)
+    return "" if found is None else found.si_unit
 
 
 def finish(

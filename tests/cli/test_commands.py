@@ -24,6 +24,7 @@ COMMANDS = tuple(typer.main.get_command(app).commands)
 def test_the_commands_are_these():
     expected = {"demo", "close", "check", "reduce", "estimate", "sample", "trace"}
     expected |= {"simulate", "report", "systems", "effects", "assess", "replicate", "predict"}
+    expected |= {"propose"}
     assert set(COMMANDS) == expected
 
 

@@ -78,7 +78,7 @@ def test_the_truth_lies_in_the_posteriors_interval(closed):
 
 
 #: What a closed loop fills; the others come of a study of the estimate, and that of the errors
-#: where an error model remembers.
+#: where an error model remembers, or of effects that the data cannot tell apart.
 CLOSED = set(schema.GROUPS) - {
     schema.SAMPLING_DISTRIBUTION,
     schema.INDIFFERENCE,
@@ -86,6 +86,7 @@ CLOSED = set(schema.GROUPS) - {
     schema.PROFILE,
     schema.SENSITIVITY,
     schema.ERROR_MODEL,
+    schema.PROPOSAL,
 }
 
 

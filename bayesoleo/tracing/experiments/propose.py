@@ -159,9 +159,11 @@ def propose_runs(
         solved = [item for item in found if not isinstance(item, Status)]
         if isinstance(run, Planned) and not _inside(chosen, outputs, [y for _, y in solved]):
             return BEYOND_LIMITS
-        move, label = Motion.of(record, drive), "" if isinstance(run, Planned) else run.label
         separation = separate([item for item, _ in solved])
-        return Trial(record.frequency, move.mean, move.amplitude, separation, label)
+        if isinstance(run, Planned):
+            return Trial(run.frequency, run.mean, run.amplitude, separation)
+        move = Motion.of(run, drive)
+        return Trial(run.frequency, move.mean, move.amplitude, separation, run.label)
 
     with single_blas_thread():
         planned = thread_map(judge, planned_runs(chosen, records, drive), jobs)

@@ -18,6 +18,8 @@ Range = tuple[float, float]
 
 #: Points of a period at which a motion is looked at.
 POINTS = 256
+#: A mean below this part of the amplitude is none.
+ROUND_OFF = 1e-9
 #: Part of a motion's power that its fundamental must hold to be taken as a sine.
 NEARLY_A_SINE = 0.9
 #: Values tried of frequency and amplitude, each a constant factor apart, and of the mean.
@@ -157,8 +159,9 @@ class Motion:
         phase = np.arange(POINTS) / POINTS
         x, v = (item.evaluate(phase, frequency, n) for n in (0, 1))
         low, high = float(x.min()), float(x.max())
-        mean = float(item.coefficients[item.orders == 0].real.sum())
-        return cls((high - low) / 2, mean, low, high, float(np.abs(v).max()))
+        mean, half = float(item.coefficients[item.orders == 0].real.sum()), (high - low) / 2
+        mean = mean if abs(mean) > ROUND_OFF * half else 0.0
+        return cls(half, mean, low, high, float(np.abs(v).max()))
 
     def possible(self, limits: Limits) -> bool:
         """Whether a rig can do it; a rounding error is no obstacle."""

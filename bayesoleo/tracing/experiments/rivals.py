@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 
 import numpy as np
 
+from bayesoleo.errors import InputError
 from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.experiments.foresee import Rival
 from bayesoleo.tracing.fit import Numerics
@@ -44,12 +46,25 @@ def standing(item: Round, most: int = MOST_RIVALS) -> tuple[Ranked, ...]:
 
 
 def named(item: Round, effects: Sequence[str]) -> tuple[Ranked, ...]:
-    """Candidates by their ids, or by ``effect@target`` where there are several with one id."""
-    wanted = [text.replace(" ", "") for text in effects]
-    return tuple(
-        next(one for one in item.ranking if text in (one.effect, f"{one.effect}@{one.target}"))
-        for text in wanted
-    )
+    """Candidates by their ids, or by ``effect@target`` where there are several with one id.
+
+    Raises
+    ------
+    InputError
+        If a round has no such candidate.
+    """
+    return tuple(_named(item, text) for text in effects)
+
+
+def _named(item: Round, text: str) -> Ranked:
+    wanted = text.replace(" ", "")
+    for one in item.ranking:
+        if wanted in (one.effect, f"{one.effect}@{one.target}"):
+            return one
+    known = dict.fromkeys(one.effect for one in item.ranking)
+    close = get_close_matches(wanted, known, 3)
+    hint = f"write one of: {', '.join(close or known)}"
+    raise InputError("no such candidate in the last round", value=text, hint=hint)
 
 
 def rivals_of(

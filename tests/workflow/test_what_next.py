@@ -1,0 +1,85 @@
+"""What to measure next, from a campaign to the result and its page."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from small_campaigns import damper, damper_campaign
+
+from bayesoleo import plots, schema, workflow
+from bayesoleo.effects import find_effect
+from bayesoleo.errors import InputError
+from bayesoleo.report import render_report
+from bayesoleo.workflow import Settings
+
+RUNS = (("a", 1.0, 0.010, "fit"), ("b", 2.0, 0.010, "fit"), ("c", 1.5, 0.010, "hold-out"))
+SPRINGS = tuple(map(find_effect, ("linear_stiffness", "cubic_stiffness")))
+SETTINGS = Settings(jobs=1, effects=SPRINGS)
+WIDE = {"amplitude": (0.005, 0.05), "force": (-np.inf, np.inf)}
+
+
+@pytest.fixture(scope="module")
+def reduced(tmp_path_factory):
+    """A linear spring is missing, in motions of one amplitude."""
+    folder = tmp_path_factory.mktemp("springs")
+    return damper_campaign(
+        folder, lambda x, v, t: 200 * v + 1000 * x, runs=RUNS, noise=40.0, periods=16
+    )
+
+
+@pytest.fixture(scope="module")
+def proposed(reduced):
+    model = damper(cubic=False, linear=False)
+    return workflow.propose(reduced, model, SETTINGS, limits=WIDE)
+
+
+def test_the_group_holds_every_run_with_its_place(proposed):
+    group = proposed[schema.PROPOSAL].to_dataset()
+    assert group.sizes == {"round": 1, "mean": 1, "amplitude": 6, "frequency": 6}
+    assert group["amplitude"].attrs["units"] == "m"
+    ranks = group["rank"].values[np.isfinite(group["rank"].values)]
+    assert sorted(ranks) == list(range(1, ranks.size + 1))
+    best = group["sigma"].values[group["rank"].values == 1]
+    assert best == pytest.approx(np.nanmax(group["sigma"].values), rel=1e-3)
+
+
+def test_summary_and_group_agree(proposed):
+    (entry,) = json.loads(proposed.attrs[schema.SUMMARY])["proposals"]
+    group = proposed[schema.PROPOSAL].to_dataset().isel(round=0)
+    first = entry["runs"][0]
+    at = group.sel({key: first[key] for key in ("mean", "amplitude", "frequency")})
+    assert float(at["rank"]) == 1
+    assert float(at["sigma"]) == pytest.approx(first["sigma"])
+    assert entry["question"] == "open"
+    assert set(entry["rivals"]) == {"linear_stiffness", "cubic_stiffness"}
+
+
+def test_page_and_figure_show_it(proposed):
+    page = render_report(proposed)
+    assert "What to measure next" in page
+    assert "amplitude 50.0 mm would separate" in page
+    figure = plots.proposal(proposed)
+    assert figure.axes[0].get_ylabel() == "amplitude of displacement in mm"
+
+
+def test_trace_asks_the_question_by_itself(reduced):
+    found = workflow.trace(reduced, damper(cubic=False, linear=False), SETTINGS)
+    (entry,) = json.loads(found.attrs[schema.SUMMARY])["proposals"]
+    assert entry["runs"][0]["amplitude"] == pytest.approx(0.01, rel=1e-3)
+
+
+def test_nothing_is_asked_where_nothing_is_missing(reduced):
+    found = workflow.trace(reduced, damper(cubic=False), SETTINGS)
+    assert json.loads(found.attrs[schema.SUMMARY])["proposals"] == []
+    assert schema.PROPOSAL not in found.children
+    assert "What to measure next" not in render_report(found)
+
+
+def test_a_limit_of_no_channel_is_refused(reduced):
+    with pytest.raises(InputError, match=r"no such limit.*force"):
+        workflow.propose(
+            reduced, damper(cubic=False, linear=False), SETTINGS,
+            rivals=["linear_stiffness", "cubic_stiffness"], limits={"stroke": (0.0, 1.0)},
+        )  # fmt: skip
