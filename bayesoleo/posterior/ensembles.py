@@ -47,10 +47,11 @@ class MoveWeights:
     def tuned(cls, acceptance: float) -> MoveWeights:
         """Weights for an acceptance of the independence move.
 
-        An accepted independence move is worth a hundred of the others; where few are accepted, the
-        others carry walkers through what the mixture does not describe.
+        An accepted independence move is worth a hundred of the others. Where some are refused they
+        are not refused alike everywhere: a walker in a tail that the mixture misses, the tip of a
+        bent ridge, refuses nearly all, and only the others bring it back.
         """
-        share = float(np.clip(2 * acceptance, 0.3, 0.9))
+        share = float(np.clip(2 * acceptance - 0.9, 0.3, 0.9))
         return cls(share, 0.75 * (1 - share), 0.25 * (1 - share))
 
 

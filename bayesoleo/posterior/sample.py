@@ -186,8 +186,9 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
         return True
     if len(rounds) < 2:
         return False
-    # More than half of the proposals that forget where a walker was are taken: so it did.
-    if _independence(rounds[-1]) > 0.5:
+    # Nearly all proposals that forget where a walker was are taken: so it did, and none is left in
+    # a tail that the mixture misses.
+    if _independence(rounds[-1]) > 0.8:
         return True
     times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
     return bool(np.all(rounds[-1].draws >= 10 * times))

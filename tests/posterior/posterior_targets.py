@@ -36,3 +36,19 @@ class Banana(Gaussian):
         straight = np.array(phi)
         straight[:, 1:] -= 0.5 * (phi[:, :1] ** 2 - 1.0)
         return super().__call__(straight)
+
+
+class BentRidge(Gaussian):
+    """Long in its first coordinate, a thirtieth as wide and bent in the second.
+
+    What volume and exponent of a gas spring look like: a straight proposal along the ridge leaves
+    it within two standard deviations.
+    """
+
+    def __init__(self) -> None:
+        super().__init__([1.0, 0.033, 1.0, 1.0])
+
+    def __call__(self, phi):
+        straight = np.array(phi)
+        straight[:, 1] -= 0.045 * phi[:, 0] ** 2
+        return super().__call__(straight)

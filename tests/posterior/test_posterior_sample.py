@@ -1,9 +1,11 @@
 """Sampling against closed forms and quadrature, and when it stops."""
 
+from itertools import groupby
+
 import numpy as np
 import pytest
 from posterior_gas_spring import gas_spring, quadrature
-from posterior_targets import Banana, Gaussian
+from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
@@ -57,6 +59,24 @@ def test_a_curved_density_that_no_mixture_fits():
     assert samples.reached
     # Variance of x^2 / 2 is 1/2, so the curved coordinates have variance 3/2.
     within_error(samples, np.zeros(4), np.sqrt([1, 1.5, 1.5, 1.5]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quick", [True, False])
+def test_no_walker_is_left_at_the_tip_of_a_bent_ridge(quick):
+    target = BentRidge()
+    samples = sample(target, normal_mixture(target.sd), seed=1, quick=quick, progress=False)
+    assert samples.reached
+    stays = np.diff(samples.log_density, axis=1) == 0
+    longest = max(
+        max((len(list(g)) for same, g in groupby(row) if same), default=0) for row in stays
+    )
+    # Where the mixture proposes nothing the other moves are taken every seventh draw; among 60 000
+    # draws of which a twentieth lies there one stays for about 60. It was 900.
+    assert longest < 150
+    first = samples.draws[:, :, 0].ravel()
+    tail, exact = np.mean(np.abs(first) > 2), 0.0455
+    assert abs(tail - exact) < 3 * np.sqrt(exact / samples.effective_size[0])
 
 
 def grid(problem):
