@@ -233,7 +233,7 @@ def run(campaign: Campaign) -> dict[str, Any]:
     except bayesoleo.BayesoleoError as error:
         return asdict(campaign) | {"failed": str(error).splitlines()[0]}
     assembly = Assembly(system(SYSTEM), DRIVE)
-    loop = close_loop(assembly, assign(reduced.records), NUMERICS, max_effects=2)
+    loop = close_loop(assembly, assign(reduced.records), NUMERICS, max_effects=2, unnamed=False)
     accepted = [entry.accepted for entry in loop.rounds if entry.accepted]
     ranking = loop.rounds[0].ranking
     own = [k for k, item in enumerate(ranking) if item.effect == campaign.effect]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 if TYPE_CHECKING:
-    from bayesoleo.tracing.score import Base, RunBase
+    from bayesoleo.tracing.base import Base, RunBase
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,11 @@ from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import RunPrediction
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.base import Base, replicate
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.projection import squared_distance
 from bayesoleo.tracing.robust import clustered_variance
-from bayesoleo.tracing.score import Base, Score, replicate
+from bayesoleo.tracing.score import Score
 from bayesoleo.tracing.significance import SAME
 
 Array = NDArray[np.float64]

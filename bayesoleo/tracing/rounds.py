@@ -11,12 +11,13 @@ import numpy as np
 from bayesoleo.effects import Effect
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
+from bayesoleo.tracing.base import Base
 from bayesoleo.tracing.fit import Numerics
 from bayesoleo.tracing.holdout import crossed
 from bayesoleo.tracing.refit import Refit, refit
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.scales import scales_of
-from bayesoleo.tracing.score import Base, Score, score_all
+from bayesoleo.tracing.score import Score, score_all
 from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
 from bayesoleo.tracing.state import State, fit_state
 

@@ -12,12 +12,12 @@ from bayesoleo.model import Model
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.base import Base, base_of
 from bayesoleo.tracing.errors_table import ErrorTable, error_table
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.floor import is_at_floor
 from bayesoleo.tracing.holdout import Prediction, predict_fitted, predict_held_out
 from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.score import Base, base_of
 
 
 @dataclass(frozen=True)

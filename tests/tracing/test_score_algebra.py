@@ -24,8 +24,9 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics
 from bayesoleo.systems import system
 from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.base import RunBase
 from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.score import RunBase, score_all
+from bayesoleo.tracing.score import score_all
 from bayesoleo.tracing.state import fit_state
 
 

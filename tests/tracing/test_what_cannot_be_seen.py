@@ -10,8 +10,10 @@ from fitted_states import fitted, options
 from small_campaigns import MASS, oscillator_campaign
 
 from bayesoleo.model import Model, Output, Parameter
+from bayesoleo.tracing.base import Base, RunBase
 from bayesoleo.tracing.projection import coefficients, information_beside, squared_distance
-from bayesoleo.tracing.score import INVISIBLE, SPANNED, Base, RunBase, _Block, _evaluate, score_all
+from bayesoleo.tracing.score import INVISIBLE, SPANNED, _evaluate, score_all
+from bayesoleo.tracing.sensitivities import Block
 
 SAMPLES = 400
 
@@ -30,7 +32,7 @@ def base_with(J, rng):
 
 def score_of(base, direction):
     option = SimpleNamespace(candidate=SimpleNamespace(sign={}))
-    return _evaluate(base, option, {}, _Block(("a",), [direction[None, None]]))
+    return _evaluate(base, option, {}, Block(("a",), [direction[None, None]]))
 
 
 # Products of directions hold half the digits of a number, some eight.
