@@ -151,6 +151,7 @@ def load_campaign(path: str | os.PathLike[str]) -> Campaign:
     declaration = read_declaration(toml)
     folder = _data_folder(declaration, toml.parent)
     runs = tuple(_load_run(run, declaration.channels, folder) for run in declaration.runs)
+    _check_shared(runs)
     return Campaign(
         name=declaration.name,
         description=declaration.description,
@@ -161,6 +162,23 @@ def load_campaign(path: str | os.PathLike[str]) -> Campaign:
         sha256=_checksum(toml, [folder / run.file for run in declaration.runs]),
         rig=declaration.rig,
     )
+
+
+def _check_shared(runs: tuple[Run, ...]) -> None:
+    """Raise where two runs are the same stretch of a file: it would count twice, or be held out
+    from itself."""
+    for later, run in enumerate(runs):
+        for other in runs[:later]:
+            common = min(run.time[-1], other.time[-1]) - max(run.time[0], other.time[0])
+            shorter = min(np.ptp(run.time), np.ptp(other.time))
+            if run.file == other.file and common > 0.5 * shorter:
+                raise CampaignError(
+                    f"holds the same samples as run {other.label}",
+                    file=run.file,
+                    run=run.label,
+                    key="file",
+                    hint="name its own file, or cut both with start and stop",
+                )
 
 
 def _data_folder(declaration: Declaration, folder: Path) -> Path:
@@ -184,9 +202,10 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         wanted |= {declared.time} if declared.time else set(_TIME_COLUMNS)
         file = folder / declared.file
         columns = read_columns(file, declared.delimiter, declared.header_delimiter, wanted)
-        whole = _time(declared, columns, channels)
+        whole, column = _time(declared, columns, channels)
+        # Cut first: what lies outside may have gaps.
         part = window(whole, declared.start, declared.stop)
-        time = _frozen(whole[part])
+        time = _frozen(uniform_time(whole[part], column, part.start) if column else whole[part])
         samples = {
             name: _samples(channel, columns, whole, part) for name, channel in channels.items()
         }
@@ -232,15 +251,16 @@ def _column(columns: Mapping[str, Array], name: str) -> Array:
 
 def _time(
     declared: RunDeclaration, columns: Mapping[str, Array], channels: Mapping[str, Channel]
-) -> Array:
+) -> tuple[Array, str | None]:
+    """Times as written, and their column; None where they follow from a sample rate."""
     if declared.sample_rate is not None:
         first = _column(columns, next(iter(channels.values())).column)
-        return np.arange(first.size) / declared.sample_rate
+        return np.arange(first.size) / declared.sample_rate, None
     if declared.time is not None:
-        return uniform_time(_column(columns, declared.time), declared.time)
+        return _column(columns, declared.time), declared.time
     for name in _TIME_COLUMNS:
         if name in columns:
-            return uniform_time(columns[name], name)
+            return columns[name], name
     raise CampaignError(
         "no time column",
         hint="it is found by names such as time, time_s, time [s] or t; if yours, in seconds, has "

@@ -194,6 +194,9 @@ def _slip(path: Path, problem: str) -> str | None:
     key, _, value = (part.strip() for part in line.partition("="))
     if re.match(r"[^\s\"'\[{#]*[A-Za-z]", value) and value not in ("true", "false"):
         return f'text needs quotes: {key} = "{value}"'
+    number = re.match(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*[A-Za-z/%°]+$", value)
+    if number:
+        return f"a number stands alone: {key} = {number[1]}"
     return None
 
 

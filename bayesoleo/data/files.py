@@ -13,6 +13,8 @@ from bayesoleo.errors import CampaignError
 
 Array = NDArray[np.float64]
 
+_SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
+
 
 def read_columns(
     path: Path,
@@ -46,6 +48,10 @@ def read_columns(
         raise CampaignError("no such file", file=path.name, hint=_neighbours(path))
     if path.stat().st_size == 0:
         raise CampaignError("file is empty", file=path.name, hint="record the run again")
+    if path.suffix.lower() in _SPREADSHEETS:
+        raise CampaignError(
+            "is a spreadsheet", file=path.name, value=path.suffix, hint="export it as CSV"
+        )
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         return read_text(path, delimiter, header_delimiter, wanted)

@@ -10,7 +10,7 @@ from bayesoleo.errors import CampaignError
 Array = NDArray[np.float64]
 
 
-def uniform_time(time: Array, column: str) -> Array:
+def uniform_time(time: Array, column: str, before: int = 0) -> Array:
     """Replace written time stamps by the equidistant times they were rounded from.
 
     Parameters
@@ -19,6 +19,8 @@ def uniform_time(time: Array, column: str) -> Array:
         As written, s.
     column : str
         Name of the column, for messages.
+    before : int, optional
+        Rows of the file that were cut off before the first, for messages.
 
     Returns
     -------
@@ -34,7 +36,7 @@ def uniform_time(time: Array, column: str) -> Array:
         raise CampaignError("fewer than three samples", column=column, value=time.size)
     missing = np.flatnonzero(~np.isfinite(time))
     if missing.size:
-        raise CampaignError(f"no time in row {missing[0] + 1}", column=column)
+        raise CampaignError(f"no time in row {before + missing[0] + 1}", column=column)
     spacing = np.diff(time)
     back = np.flatnonzero(spacing <= 0)
     # Stamps rounded more coarsely than the spacing repeat; say so rather than that time stands
@@ -50,7 +52,10 @@ def uniform_time(time: Array, column: str) -> Array:
     if back.size:
         row = int(back[0])
         raise CampaignError(
-            f"time does not increase in row {row + 2}", column=column, value=float(time[row + 1])
+            f"time does not increase in row {before + row + 2}",
+            column=column,
+            value=float(time[row + 1]),
+            hint="sort the rows by time, or keep one part with start and stop",
         )
     _check_gaps(time, spacing, resolution, column)
     index = np.arange(time.size) - 0.5 * (time.size - 1)
@@ -108,17 +113,19 @@ def window(time: Array, start: float | None, stop: float | None) -> slice:
     Parameters
     ----------
     time : ndarray, shape (N,)
-        Equidistant times, s.
+        As written, s.
     start, stop : float, optional
         Ends of the part to keep, s, on the file's own time.
 
     Raises
     ------
     CampaignError
-        If nothing is left.
+        If nothing is left, or there was nothing.
     """
+    if time.size < 3:
+        raise CampaignError("fewer than three samples", value=time.size)
     # A thousandth of a sample keeps an end that was meant to be on a sample on it.
-    slack = 1e-3 * (time[1] - time[0])
+    slack = 1e-3 * abs(float(np.nanmedian(np.diff(time))))
     low = -np.inf if start is None else start - slack
     high = np.inf if stop is None else stop + slack
     inside = np.flatnonzero((time >= low) & (time <= high))
@@ -127,6 +134,6 @@ def window(time: Array, start: float | None, stop: float | None) -> slice:
             "nothing is left between start and stop",
             key="start" if start is not None else "stop",
             value=(start, stop),
-            hint=f"the file runs from {time[0]:.6g} to {time[-1]:.6g} s",
+            hint=f"the file runs from {np.nanmin(time):.6g} to {np.nanmax(time):.6g} s",
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)

@@ -60,9 +60,7 @@ def read_text(
     """
     header_line, skip, sample = _find_header(path)
     separator = _NAMED.get(delimiter or "", delimiter) or sniff_delimiter(sample)
-    names = _header_names(
-        path, header_line, separator, header_delimiter, len(_split(sample[0], separator))
-    )
+    names = _header_names(path, header_line, separator, header_delimiter, _width(sample, separator))
     table = _read_cells(path, skip, separator, len(names))
     columns = {
         name: _numbers(path, name, table[index], skip)
@@ -74,7 +72,7 @@ def read_text(
 
 
 def sniff_delimiter(lines: list[str]) -> str:
-    """The delimiter that splits all lines alike, into the most cells.
+    """The delimiter that splits lines alike, all if possible, into the most cells.
 
     Parameters
     ----------
@@ -86,12 +84,14 @@ def sniff_delimiter(lines: list[str]) -> str:
     str
         A character, or ``whitespace``.
     """
-    best, most = ",", (0.0, 1)
+    best, most = ",", (False, 0.0, 1)
     for candidate in _SNIFFED:
-        counts = {len(_split(line, candidate)) for line in lines}
-        rank = (_numeric_share(lines, candidate), max(counts))
+        counts = [len(_split(line, candidate)) for line in lines]
+        usual = max(counts, key=counts.count)
         # The one that leaves numbers comes first: a decimal comma, too, splits all lines alike.
-        if len(counts) == 1 and max(counts) > 1 and rank > most:
+        # A line that is longer than the others is told as such once the others have their cells.
+        rank = (len(set(counts)) == 1, _numeric_share(lines, candidate), usual)
+        if usual > 1 and rank > most:
             best, most = candidate, rank
     return best
 
@@ -100,6 +100,12 @@ def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == WHITESPACE:
         return [cell.strip('"') for cell in line.split()]
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [""])]
+
+
+def _width(lines: list[str], delimiter: str) -> int:
+    """The usual number of cells in a line."""
+    counts = [len(_split(line, delimiter)) for line in lines]
+    return max(counts, key=counts.count)
 
 
 def _is_number(cell: str) -> bool:
@@ -194,9 +200,22 @@ def _read_cells(path: Path, skip: int, separator: str, width: int) -> pd.DataFra
                 low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
-        raise CampaignError(
-            f"lines differ in their number of cells: {error}", file=path.name, key="delimiter"
-        ) from error
+        raise _ragged(path, skip, separator, width) from error
+
+
+def _ragged(path: Path, skip: int, separator: str, width: int) -> CampaignError:
+    """Which line has too many cells."""
+    with path.open(encoding="utf-8-sig") as stream:
+        for number, line in enumerate(stream, 1):
+            cells = len(_split(line.split("#")[0].rstrip("\r\n"), separator))
+            if number > skip and cells > width:
+                return CampaignError(
+                    f"line {number} has {cells} cells, the header {width}",
+                    file=path.name,
+                    value=line.strip()[:60],
+                    hint="correct that line, or set the delimiter of this run",
+                )
+    return CampaignError("lines differ in their number of cells", file=path.name, key="delimiter")
 
 
 def _numbers(path: Path, name: str, column: pd.Series, skip: int) -> Array:
@@ -208,9 +227,10 @@ def _numbers(path: Path, name: str, column: pd.Series, skip: int) -> Array:
     wrong = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
     if wrong.size:
         cell = str(column.iloc[wrong[0]])
-        hint = (
-            "write decimal points" if _DECIMAL_COMMA.match(cell.strip()) else "write numbers only"
-        )
+        comma = _DECIMAL_COMMA.match(cell.strip())
+        hint = "write decimal points" if comma else "write numbers only"
+        if wrong[0] == 0 and not comma:
+            hint += "; a line of units below the header has to go"
         raise CampaignError(
             f"not a number in {_place(path, skip, int(wrong[0]), cell)}",
             file=path.name,

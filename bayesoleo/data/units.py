@@ -1,12 +1,13 @@
 """Units: what a file is written in, and SI.
 
-Any unit that pint reads, and two that test rigs write and pint does not: ``psia`` (absolute) and
-``psig`` (above ambient). Both become pascal with no offset, because the ambient pressure is not in
-the unit: a gauge pressure stays one.
+Any unit that pint reads, and those that test rigs write and pint does not: ``psia`` and ``bara``
+(absolute), ``psig`` and ``barg`` (above ambient). All become pascal with no offset, because the
+ambient pressure is not in the unit: a gauge pressure stays one.
 """
 
 from __future__ import annotations
 
+import re
 import threading
 from dataclasses import dataclass
 from functools import cache
@@ -49,6 +50,12 @@ _EXPECTED = {
     "temperature": ("K", "degC"),
 }
 
+# Units that are told by their letters whatever their case.
+_COMMON = (
+    *("mm", "N", "kN", "Pa", "kPa", "MPa", "bar", "mbar", "psi", "rad", "deg", "rpm"),
+    *("Hz", "kHz", "V", "mV", "A", "mA", "W", "kW", "kg", "K", "degC"),
+)
+
 _lock = threading.Lock()
 
 
@@ -83,8 +90,9 @@ def _registry() -> Any:
     import pint
 
     registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
-    registry.define("psia = psi")
-    registry.define("psig = psi")
+    for pressure in ("psi", "bar"):
+        registry.define(f"{pressure}a = {pressure}")
+        registry.define(f"{pressure}g = {pressure}")
     return registry
 
 
@@ -117,7 +125,7 @@ def parse_unit(name: str) -> Unit:
             raise CampaignError(
                 "unknown unit",
                 value=name,
-                hint="write one that pint reads, such as mm, kN, bar, psig",
+                hint=_suggestion(name) + "one that pint reads, such as mm, kN, N*m, m/s**2, psig",
             ) from error
     base = str(one.units)
     shift = float(zero.magnitude)
@@ -127,6 +135,35 @@ def parse_unit(name: str) -> Unit:
     if si_name == _ENERGY and _holds_force(unit):
         si_name = TORQUE
     return Unit(name, si_name, factor, shift)
+
+
+def _suggestion(wrong: str) -> str:
+    """What an unknown unit was meant to be: another case, powers without ``**``, products without
+    ``*``."""
+    case = next((unit for unit in _COMMON if unit.lower() == wrong.lower()), wrong)
+    powers = re.sub(r"(?<=[A-Za-z])\^?(-?\d)", r"**\1", wrong)
+    words = re.split(r"([A-Za-zµ]+)", powers)
+    split = "".join(_split_product(word) for word in words)
+    for trial in (case, powers, split):
+        if trial != wrong and _is_known(trial):
+            return f"did you mean {trial}? or write "
+    return "write "
+
+
+def _split_product(word: str) -> str:
+    """Two units written as one word, with the star between them."""
+    if not word.isalpha() or _is_known(word):
+        return word
+    cuts = (f"{word[:k]}*{word[k:]}" for k in range(len(word) - 1, 0, -1))
+    return next((cut for cut in cuts if _is_known(cut)), word)
+
+
+def _is_known(text: str) -> bool:
+    try:
+        _registry().Unit(text)
+    except Exception:  # as above
+        return False
+    return True
 
 
 def _holds_force(unit: Any) -> bool:

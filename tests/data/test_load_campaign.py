@@ -94,6 +94,24 @@ def test_rounded_time_stamps_are_forgiven(make_campaign, decimals):
     assert np.ptp(np.diff(run.time)) < 1e-12
 
 
+def test_a_cut_leaves_out_what_is_wrong_before_it(make_campaign):
+    """What the errors about gaps and clocks advise has to work."""
+    late = {"frequency = 1.0": "frequency = 1.0\nstart = 0.6"}
+    whole = load_campaign(make_campaign(late)).runs[0]
+    gap = np.delete(table(), slice(10, 20), axis=0)
+    back = table()
+    back[5, 0] = 0.0
+    unknown = table()
+    unknown[3, 0] = np.nan
+    for rows in (gap, back, unknown):
+        (run,) = load_campaign(make_campaign(late, rows)).runs
+        np.testing.assert_allclose(run.time, whole.time, atol=1e-12)
+    bad = table()
+    bad[60, 0] = 0.1
+    with pytest.raises(CampaignError, match=r"time does not increase in row 61 .* sort the rows"):
+        load_campaign(make_campaign(late, bad))
+
+
 def changed(column, row, value):
     rows = table()
     rows[row, column] = value
@@ -131,6 +149,7 @@ BAD_TOML = [
     ({"format = 1": ""}, "key format: unknown campaign format .*write format = 1"),
     ({"format = 1": "format = ="}, "campaign.toml: not valid TOML"),
     ({'"mm"': "mm"}, 'not valid TOML: .*; text needs quotes: unit = "mm"'),
+    ({"= 1.0": "= 1.0 Hz"}, "not valid TOML: .*; a number stands alone: frequency = 1.0"),
     ({'name = "small"': ""}, "key name: missing"),
     ({'name = "small"': "name = 3"}, r"key name: wrong kind of value \(got 3\)"),
     (
@@ -209,6 +228,17 @@ def test_bad_declarations(make_campaign, replace, message):
     with pytest.raises(CampaignError, match=message) as caught:
         load_campaign(make_campaign(replace))
     assert "\n" not in str(caught.value)
+
+
+def test_two_runs_of_the_same_samples(make_campaign):
+    """A slip of the pen in a file's name would hold a run out from itself."""
+    end = 'initial_pressure = { value = 4.9, unit = "bar", sd = 0.1 }\n'
+    again = TOML[TOML.index("[[runs]]") :].replace('label = "a"', 'label = "b"')
+    with pytest.raises(CampaignError, match=r"a.csv, run b, key file: .*the same samples as run a"):
+        load_campaign(make_campaign({end: end + again}))
+    second = again.replace("frequency = 1.0", "frequency = 1.0\nstart = 2.0")
+    first = {"frequency = 1.0": "frequency = 1.0\nstop = 2.0", end: end + second}
+    assert len(load_campaign(make_campaign(first, table(4.0))).runs) == 2
 
 
 def test_two_runs_of_one_label(make_campaign):

@@ -81,7 +81,9 @@ def test_text_in_a_column_that_is_not_wanted_does_not_matter(tmp_path):
             "t,a,b\n0,1,\n1,2,\n2,3,\n",
             "column b, key delimiter: column is more than half empty when split by ','",
         ),
-        ("t,a\n0,1\n1,2,3\n", "key delimiter: lines differ in their number of cells"),
+        ("t,a\n0,1\n1,2,3\n", r"line 3 has 3 cells, the header 2 \(got '1,2,3'\); correct that"),
+        ("t;a\n0;1\n\n# a;b;c\n1;2;3\n2;3\n", "line 5 has 3 cells, the header 2"),
+        ("t,a\ns,mm\n0,1\n", r"line 2 \(got 's'\); .*a line of units below the header has to go"),
     ],
 )
 def test_bad_text(tmp_path, content, message):
@@ -99,8 +101,15 @@ def test_broken_binary_file(tmp_path, suffix):
         read_columns(path)
 
 
+def test_a_spreadsheet_has_to_be_exported(tmp_path):
+    path = tmp_path / "run.xlsx"
+    path.write_bytes(b"PK" + bytes(20))
+    with pytest.raises(CampaignError, match=r"spreadsheet \(got '.xlsx'\); export it as CSV"):
+        read_columns(path)
+
+
 def test_not_text(tmp_path):
-    path = tmp_path / "run.xls"
+    path = tmp_path / "run.dat"
     path.write_bytes(bytes(range(128, 256)))
     with pytest.raises(CampaignError, match="not a text file"):
         read_columns(path)

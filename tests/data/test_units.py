@@ -1,5 +1,7 @@
 """Units: SI factors and names, pounds per square inch of both kinds, and inverses."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,6 +19,8 @@ UNITS = [
     "psi",
     "psia",
     "psig",
+    "bara",
+    "barg",
     "degC",
     "K",
     "mV",
@@ -62,6 +66,25 @@ def test_inverse(name, value):
 def test_unknown_unit():
     with pytest.raises(CampaignError, match=r"unknown unit \(got 'foo/bar'\)"):
         parse_unit("foo/bar")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        ("Nm", "N*m"),
+        ("mNm", "mN*m"),
+        ("m/s2", "m/s**2"),
+        ("Ns/m", "N*s/m"),
+        ("kg/m3", "kg/m**3"),
+        ("KN", "kN"),
+        ("MPA", "MPa"),
+        ("Bar", "bar"),
+    ],
+)
+def test_an_unknown_unit_gets_a_suggestion_that_is_known(wrong, meant):
+    with pytest.raises(CampaignError, match=re.escape(f"did you mean {meant}?")):
+        parse_unit(wrong)
+    assert parse_unit(meant).factor > 0
 
 
 def test_kind():
