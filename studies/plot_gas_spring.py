@@ -88,7 +88,8 @@ for mode in modes:
 # The figure shows the log posterior :math:`\Phi_B(\theta, v)`, dark where it is high, and the way
 # that each estimator took, as figures 3.2 and 3.3 do. On the right BE ends at the upper mode; the
 # others pass by it and go on to the maximum of the likelihood, close to the lower one. From there a
-# few steps of BE reach that mode: what the package calls the estimate.
+# few steps of BE reach that mode: what the package calls the estimate. :doc:`plot_two_modes` weighs
+# the modes against each other.
 
 
 def height(problem, exponents, log_v):
