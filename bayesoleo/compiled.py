@@ -172,6 +172,20 @@ def _pointer(typing_context, array, offset):
 pointer: Any = intrinsic(_pointer)
 
 
+def _after(typing: Any, start: Any, offset: Any) -> tuple[Any, Any]:
+    """Address so many numbers behind another: an array that is passed instead has its references
+    counted, which costs more than a short loop.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        return builder.gep(values[0], [values[1]])
+
+    return _POINTER(_POINTER, types.intp), generate
+
+
+after: Any = intrinsic(_after)
+
+
 def caller(signature: Any) -> Any:
     """How compiled code calls a compiled function at an address: ``call(address, arguments)``.
 

@@ -8,20 +8,22 @@ step of the next.
 
 from __future__ import annotations
 
+import math
+import threading
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BLOCK
-from bayesoleo.solvers.schemes.unrolled.emit import REACH, WIDTH
+from bayesoleo.solvers.schemes.unrolled.emit import COLUMNS, REACH, WIDTH
 from bayesoleo.solvers.schemes.unrolled.program import Program, chunks
 
 Array = NDArray[np.float64]
 
-#: At least as many as a state has components.
-COLUMNS = 8
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH
 
@@ -92,13 +94,16 @@ class Pieces(NamedTuple):
     chain: int
     substitute: int
     follow: int
+    product: int
+    begin: int
     update: int
 
 
 class Sweep(NamedTuple):
-    """Order of the steps, inputs and lengths of steps, as they are swept."""
+    """Order of the steps, inputs and lengths of steps, as they are swept; ``again`` is where the
+    step of each position stands for good."""
 
-    place: Any
+    again: Any
     source: Any
     lengths: Any
     order: Any
@@ -122,38 +127,66 @@ class Work(NamedTuple):
     history: Any
     start: Any
     products: Any
+    closure: Any
     inverse: Any
     measures: Any
     before: Any
     constants: Any
 
 
+#: Numbers in a cache line.
+LINE = 8
+
+
 def work_space(sizes: Sizes, sweep: Sweep) -> Work:
-    """Arrays for lanes of given sizes."""
-    positions, w, D, d = sweep.source.size, sizes.unknowns, sizes.state, sizes.d
-    rows = max(d * (1 + sizes.nz), sizes.conditions)
-    blocks = sweep.inputs.shape[0]
+    """Arrays for lanes of given sizes; a thread keeps those it used last."""
+    key = sizes, sweep.source.size, sweep.inputs.shape[0], sweep.order.tobytes()
+    if getattr(_kept, "key", None) != key:
+        _kept.key, _kept.work = key, _allocate(*key[:3], sweep.order)
+    work: Work = _kept.work
+    return work
+
+
+_kept = threading.local()
+
+
+def _allocate(sizes: Sizes, positions: int, blocks: int, order: NDArray[np.int64]) -> Work:
+    """Zeros, each array from the beginning of a cache line on: vector instructions that straddle
+    two lines take twice as long."""
+    shapes = _shapes(sizes, positions, blocks)
+    ends = list(accumulate(-(-math.prod(shape) // LINE) * LINE for shape in shapes))
+    room = np.zeros(ends[-1] + LINE)
+    room = room[-(room.ctypes.data // room.itemsize) % LINE :]
+    begins = zip(shapes, [0, *ends], strict=False)
+    work = Work(*[room[at : at + math.prod(shape)].reshape(shape) for shape, at in begins])
+    own = np.arange(sizes.state)
+    work.history[order, own] = 1.0  # a chunk's first state, in terms of itself
+    work.products[0, own, own] = 1.0
+    return work
+
+
+def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
+    w, D, d = sizes.unknowns, sizes.state, sizes.d
     length = (blocks * sizes.block // WIDTH + 1) * sizes.new + sizes.window
-    history = np.zeros((length, D + 1, WIDTH))
-    history[sweep.order, np.arange(D)] = 1.0  # a chunk's first state, in terms of itself
     return Work(
-        now=np.empty((w, positions)),
-        base=np.empty((w, positions)),
-        dx=np.zeros((w, positions)),
-        x_block=np.zeros((w, REACH)),
-        dx_block=np.zeros((w, BLOCK)),
-        z=np.zeros((sizes.nz, BLOCK)),
-        out=np.zeros((rows, BLOCK)),
-        sums=np.zeros((2 * d, BLOCK)),
-        scratch=np.zeros(positions),
-        transfer=np.zeros((blocks, sizes.transfer * sizes.block)),
-        history=history,
-        start=np.zeros((D, WIDTH)),
-        products=np.zeros((2, D, COLUMNS)),
-        inverse=np.zeros((D, D)),
-        measures=np.zeros(2 * d),
-        before=np.zeros(2 * d),
-        constants=np.zeros(max(sizes.constants, 1)),
+        now=(w, positions),
+        base=(w, positions),
+        dx=(w, positions),
+        x_block=(w, REACH),
+        dx_block=(w, BLOCK),
+        z=(sizes.nz, BLOCK),
+        out=(max(d * (1 + sizes.nz), sizes.conditions), BLOCK),
+        sums=(2 * d, BLOCK),
+        scratch=(positions,),
+        transfer=(blocks, sizes.transfer * sizes.block),
+        history=(length, D + 1, WIDTH),
+        start=(D, WIDTH),
+        products=(WIDTH + 1, D, COLUMNS),
+        closure=(D, D),
+        inverse=(D, D),
+        measures=(2 * d,),
+        before=(2 * d,),
+        constants=(max(sizes.constants, 1),),
     )
 
 
@@ -213,12 +246,12 @@ class Arranged:
                 blocks[b, :nu, part] = inputs[:, chosen * s + stage]
         return Arranged(program, layout, blocks, of_steps)
 
-    @property
+    @cached_property
     def sweep(self) -> Sweep:
         """The same for compiled code."""
         layout, order = self.layout, np.array(self.program.order, dtype=np.int64)
-        place, source = layout.place, layout.source
-        return Sweep(place, source, layout.lengths, order, self.inputs, self.lengths)
+        source = layout.source
+        return Sweep(layout.place[source], source, layout.lengths, order, self.inputs, self.lengths)
 
     def sizes(self, inputs: int, constants: int, conditions: int) -> Sizes:
         """Sizes for a model with so many inputs, constants and admissibility conditions."""

@@ -18,6 +18,7 @@ from bayesoleo.solvers.periodic.recursion import (
     evaluate,
     evaluate_again,
     keep,
+    move,
     start_chunks,
     take,
     update,
@@ -61,9 +62,22 @@ def solve_lanes(pieces, sizes, sweep, work, options, p, x, line, status, iterati
                     now[k, i] = x[lane, sweep.source[i], k]
         status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
         if status[lane] != NEEDS_EXCHANGE:
-            for m in range(sizes.steps):
-                for k in range(sizes.unknowns):
-                    x[lane, m, k] = now[k, sweep.place[m]]
+            _in_order(sizes, sweep, now, pointer(x, lane * sizes.steps * sizes.unknowns))
+
+
+@jit
+def _in_order(sizes, sweep, now, x):
+    """Copy a solution, step by step and unknown by unknown."""
+    unknowns, row = sizes.unknowns, now.shape[1]
+    x, swept = carray(x, (sizes.steps * unknowns,)), carray(pointer(now, 0), (now.size,))
+    for k in range(unknowns):
+        to = k
+        for c in range(WIDTH):
+            at = k * row + sizes.front * WIDTH + c
+            for _ in range(sweep.lengths[c]):
+                x[to] = swept[at]
+                to += unknowns
+                at += WIDTH
 
 
 @jit
@@ -99,7 +113,7 @@ def _iterate(pieces, sizes, sweep, work, options):
         if not size < np.inf:
             return SINGULAR, iteration
         if least < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
-            take(work.now, work.dx, 1.0, work.now)
+            move(work.now, work.dx)
             return CONVERGED, iteration
         if chords and last < CHORD_FROM and _chord_suffices(size, last):
             keep(work.now, work.base)
@@ -129,10 +143,10 @@ def _chords(pieces, sizes, sweep, work, options, size):
     """
     last = size
     for count in range(1, MOST_CHORDS + 1):
-        take(work.now, work.dx, 1.0, work.now)
+        move(work.now, work.dx)
         if not evaluate_again(pieces, sizes, sweep, work):
             return count, np.inf
-        start_chunks(sizes, sweep, work, options.initial)
+        start_chunks(pieces, sizes, work, options.initial)
         update(pieces.update, sizes, sweep, work)
         size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
         if not size < SLOW_CHORD * last:
@@ -140,7 +154,7 @@ def _chords(pieces, sizes, sweep, work, options, size):
         # What is left is a geometric series, twice as steep as seen where the first of the two
         # steps was one of Newton's.
         if least < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
-            take(work.now, work.dx, 1.0, work.now)
+            move(work.now, work.dx)
             return count, 0.0
         last = size
     return MOST_CHORDS, last
@@ -181,9 +195,9 @@ def _advance(pieces, sizes, sweep, work, monotone, size):
 @jit
 def _step(pieces, sizes, sweep, work, initial):
     """The Newton step at all positions, from the recursion of the last evaluation."""
-    outcome = CONVERGED if initial else close(sizes, sweep, work)
+    outcome = CONVERGED if initial else close(pieces, sizes, work)
     if outcome == CONVERGED:
-        start_chunks(sizes, sweep, work, initial)
+        start_chunks(pieces, sizes, work, initial)
         update(pieces.update, sizes, sweep, work)
     return outcome
 

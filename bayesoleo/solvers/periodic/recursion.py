@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import carray
 
-from bayesoleo.compiled import BLOCK, call_kernel, caller, pointer
-from bayesoleo.solvers.periodic.arrangement import COLUMNS
+from bayesoleo.compiled import BLOCK, after, call_kernel, caller, pointer
 from bayesoleo.solvers.periodic.measures import total
 from bayesoleo.solvers.schemes.sweep import LARGEST_GROWTH, ROUND_OFF, eliminate, jit
 from bayesoleo.solvers.schemes.unrolled.emit import REACH, WIDTH
@@ -29,6 +28,7 @@ NOT_FINITE = Status.NOT_FINITE.value
 _call_rows, _call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
 _call_eliminate = caller(SIGNATURES["eliminate"])
 _call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
+_call_product, _call_begin = caller(SIGNATURES["product"]), caller(SIGNATURES["begin"])
 _call_update = caller(SIGNATURES["update"])
 
 
@@ -48,10 +48,21 @@ def _copy(source, target, count):
 
 @jit
 def take(base, dx, fraction, now):
-    """``now = base + fraction dx``; they may be the same."""
-    base, dx, now = base.reshape(base.size), dx.reshape(dx.size), now.reshape(now.size)
-    for i in range(now.size):
-        now[i] = base[i] + fraction * dx[i]
+    """``now = base + fraction dx``, two different arrays."""
+    size = now.size
+    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
+    begin = carray(pointer(base, 0), (size,))
+    for i in range(size):
+        to[i] = begin[i] + fraction * change[i]
+
+
+@jit
+def move(now, dx):
+    """``now += dx``. In :func:`take` they would overlap, which forbids vector instructions."""
+    size = now.size
+    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
+    for i in range(size):
+        to[i] += change[i]
 
 
 @jit
@@ -67,11 +78,11 @@ def evaluate(pieces, sizes, sweep, work):
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        _gather(work.now, work.x_block, sizes.unknowns, b * steps, reach)
+        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
         _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
-            outside += _outside(work.out, sizes, count)
+            outside += _outside(out, sizes, count)
         call_kernel(pieces.jacobian, (z, inputs, p, out, points))
         if b == u.shape[0] - 1:
             _silence(sizes, sweep.lengths, b, count, work.z, work.out)
@@ -104,11 +115,11 @@ def evaluate_again(pieces, sizes, sweep, work):
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        _gather(work.now, work.x_block, sizes.unknowns, b * steps, reach)
+        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
         _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
-            outside += _outside(work.out, sizes, count)
+            outside += _outside(out, sizes, count)
         call_kernel(pieces.residual, (z, inputs, p, out, points))
         transfer = pointer(work.transfer, b * work.transfer.shape[1])
         _call_substitute(pieces.substitute, (out, x, length, transfer, count))
@@ -118,10 +129,10 @@ def evaluate_again(pieces, sizes, sweep, work):
 
 
 @jit
-def _gather(now, x, unknowns, begin, reach):
+def _gather(now, row, x, unknowns, reach):
     """Copy a block's unknowns, and those before it that its steps reach."""
     for k in range(unknowns):
-        _copy(pointer(now, k * now.shape[1] + begin), pointer(x, k * REACH), reach)
+        _copy(after(now, k * row), after(x, k * REACH), reach)
 
 
 @jit
@@ -130,7 +141,7 @@ def _outside(a, sizes, count):
     outside = 0
     for k in range(sizes.conditions):
         for stage in range(sizes.stages):
-            values = carray(pointer(a, k * BLOCK + stage * sizes.block), (count,))
+            values = carray(after(a, k * BLOCK + stage * sizes.block), (count,))
             for i in range(count):
                 outside += values[i] <= 0.0
     return outside
@@ -155,18 +166,20 @@ def _silence(sizes, lengths, b, count, z, out):
 
 
 @jit
-def close(sizes, sweep, work):
+def close(pieces, sizes, work):
     """Invert the closure of the period, from the recursion's matrices alone."""
-    D, inverse = sizes.state, work.inverse
-    product = _product(D, sizes.new, sweep, work)
-    closure, growth = np.empty((D, D)), 0.0
+    D, inverse, closure, products = sizes.state, work.inverse, work.closure, work.products
+    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
+    _call_product(pieces.product, (history, pointer(products, 0), whole, rest, WIDTH))
+    growth = 0.0
     for i in range(D):
         largest, size = 0.0, 1.0
         for k in range(D):
+            value = products[WIDTH, i, k]
             inverse[i, k] = 1.0 if i == k else 0.0
-            closure[i, k] = inverse[i, k] - product[i, k]
+            closure[i, k] = inverse[i, k] - value
             largest = max(largest, abs(closure[i, k]))
-            size += abs(product[i, k])
+            size += abs(value)
         growth = max(growth, size)
         if not largest > ROUND_OFF * size:
             return SINGULAR
@@ -176,59 +189,11 @@ def close(sizes, sweep, work):
 
 
 @jit
-def _product(D, new, sweep, work):
-    """Matrix of the recursion from the period's start to its end.
-
-    All :data:`COLUMNS` are computed, needed or not: a loop of known length becomes one instruction.
-    """
-    product, following = work.products[0], work.products[1]
-    for i in range(D):
-        for k in range(COLUMNS):
-            product[i, k] = 1.0 if i == k else 0.0
-    for c in range(WIDTH):
-        first = sweep.lengths[c] * new
-        for i in range(D):
-            at = first + sweep.order[i]
-            for k in range(COLUMNS):
-                following[i, k] = 0.0
-            for o in range(D):
-                factor = work.history[at, o, c]
-                for k in range(COLUMNS):
-                    following[i, k] += factor * product[o, k]
-        product, following = following, product
-    return product
-
-
-@jit
-def start_chunks(sizes, sweep, work, initial):
+def start_chunks(pieces, sizes, work, initial):
     """First state of every chunk: that of the period from its closure, or zero."""
-    D, start, end = sizes.state, work.start, work.products[0, 0]
-    start[:, 0] = 0.0
-    if not initial:
-        _pass(sizes, sweep, work, end)
-        for i in range(D):
-            value = 0.0
-            for k in range(D):
-                value += work.inverse[i, k] * end[k]
-            start[i, 0] = value
-    _pass(sizes, sweep, work, end)
-
-
-@jit
-def _pass(sizes, sweep, work, end):
-    """States at the ends of the chunks, from the first one's start."""
-    D, start = sizes.state, work.start
-    for c in range(WIDTH):
-        first = sweep.lengths[c] * sizes.new
-        for i in range(D):
-            at = first + sweep.order[i]
-            value = work.history[at, D, c]
-            for o in range(D):
-                value += work.history[at, o, c] * start[o, c]
-            if c + 1 < WIDTH:
-                start[i, c + 1] = value
-            else:
-                end[i] = value
+    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
+    inverse, start = pointer(work.inverse, 0), pointer(work.start, 0)
+    _call_begin(pieces.begin, (history, inverse, start, whole, rest, 0 if initial else 1))
 
 
 @jit
@@ -248,6 +213,6 @@ def update(update, sizes, sweep, work):
             _copy(pointer(work.dx_block, k * BLOCK), pointer(dx, at), count)
     for k in range(sizes.unknowns):
         for i in range(sizes.front * WIDTH):
-            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
+            dx[k, i] = dx[k, sweep.again[i]]
         for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
-            dx[k, i] = dx[k, sweep.place[sweep.source[i]]]
+            dx[k, i] = dx[k, sweep.again[i]]

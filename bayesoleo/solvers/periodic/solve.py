@@ -204,7 +204,7 @@ def _compiled(
     pieces = arrangement.Pieces(
         equations.residual.address, equations.jacobian.address, equations.admissible.address,
         program.rows, program.eliminate, program.chain, program.substitute, program.follow,
-        program.update,
+        program.product, program.begin, program.update,
     )  # fmt: skip
     sweep = arranged.sweep
     newton.solve_lanes(

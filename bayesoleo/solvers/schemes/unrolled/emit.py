@@ -14,6 +14,8 @@ from bayesoleo.solvers.schemes.sweep import SMALL_PIVOT
 WIDTH = 8
 #: Distance of rows of unknowns in a block: its own steps, three before and one after.
 REACH = BLOCK + 4 * WIDTH
+#: At least as many as a state has components: a loop of this length is one vector instruction.
+COLUMNS = 8
 
 
 def rows_before(orders: Sequence[int]) -> list[int]:
@@ -141,3 +143,67 @@ def chain(
             target = f"history[base + {((window + i) * columns + k) * WIDTH} + c]"
             source.add(f"{target} = {joined(terms)}")
     return "\n".join(source.lines)
+
+
+def product(new: int, order: Sequence[int]) -> str:
+    """Products of the chunks' matrices, ``(WIDTH + 1, D, COLUMNS)``, from the identity on."""
+    D = len(order)
+    source = Source("product", "history, products, whole, rest, width", {
+        "history": 10**9, "products": (WIDTH + 1) * D * COLUMNS,
+    })  # fmt: skip
+    source.loop(f"for c in range({WIDTH}):")
+    source.add(_end_of_chunk(new, D))
+    source.add(f"at = c*{D * COLUMNS}")
+    for i in range(D):
+        for o in range(D):
+            source.add(f"a{i}_{o} = {_entry(order, i, o)}")
+    source.loop("for k in range(width):")
+    for o in range(D):
+        source.add(f"h{o} = products[at + {o * COLUMNS} + k]")
+    for i in range(D):
+        terms = [f"a{i}_{o}*h{o}" for o in range(D)]
+        source.add(f"products[at + {(D + i) * COLUMNS} + k] = {joined(terms)}")
+    return "\n".join(source.lines)
+
+
+def begin(new: int, order: Sequence[int]) -> str:
+    """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing."""
+    D = len(order)
+    source = Source("begin", "history, inverse, start, whole, rest, closed", {
+        "history": 10**9, "inverse": D * D, "start": D * WIDTH,
+    })  # fmt: skip
+    states = range(D)
+
+    def through_chunks(*before: str) -> None:
+        source.loop(f"for c in range({WIDTH}):")
+        for line in (*before, _end_of_chunk(new, D)):
+            source.add(line)
+        for i in states:
+            terms = [_entry(order, i, D)] + [f"{_entry(order, i, o)}*s{o}" for o in states]
+            source.add(f"n{i} = {joined(terms)}")
+        for i in states:
+            source.add(f"s{i} = n{i}")
+        source.indent = source.indent[:-4]
+
+    for i in states:
+        source.add(f"s{i} = 0.0")
+    source.loop("if closed > 0:")
+    through_chunks()
+    for i in states:
+        source.add(f"n{i} = {joined([f'inverse[{i * D + k}]*s{k}' for k in states])}")
+    for i in states:
+        source.add(f"s{i} = n{i}")
+    source.indent = source.indent[:-4]
+    through_chunks(*[f"start[{i * WIDTH} + c] = s{i}" for i in states])
+    return "\n".join(source.lines)
+
+
+def _end_of_chunk(new: int, D: int) -> str:
+    """Where in the history a chunk's last state begins; ``rest`` chunks are a step longer."""
+    row = new * (D + 1) * WIDTH
+    return f"base = (whole + (1 if c < rest else 0))*{row} + c"
+
+
+def _entry(order: Sequence[int], i: int, column: int) -> str:
+    """Of the matrix from a chunk's first state to its last, or its constant in the last column."""
+    return f"history[base + {(order[i] * (len(order) + 1) + column) * WIDTH}]"

@@ -22,7 +22,7 @@ from bayesoleo.compiled import BLOCK, COMPILING, load
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.schemes.unrolled import collocation as collocation_code
 from bayesoleo.solvers.schemes.unrolled import differences as difference_code
-from bayesoleo.solvers.schemes.unrolled.emit import WIDTH, chain
+from bayesoleo.solvers.schemes.unrolled.emit import WIDTH, begin, chain, product
 
 #: Systems up to this size are solved by straight-line code; its length grows as the cube.
 LARGEST = 6
@@ -35,6 +35,8 @@ SIGNATURES = {
     "chain": types.void(_P, _P, _I, _I),
     "substitute": types.void(_P, _P, _P, _P, _I),
     "follow": types.void(_P, _P, _I, _I),
+    "product": types.void(_P, _P, _I, _I, _I),
+    "begin": types.void(_P, _P, _P, _I, _I, _I),
     "update": types.void(_P, _P, _P, _P, _I, _I),
 }
 
@@ -56,6 +58,11 @@ class Program:
         ``(out, x, h, transfer, count)``: other equations' constants, by the last elimination.
     follow : int
         As ``chain``, for constants only.
+    product : int
+        ``(history, products, whole, rest, width)``: products of the chunks' matrices, of which
+        ``rest`` are of ``whole + 1`` steps.
+    begin : int
+        ``(history, inverse, start, whole, rest, closed)``: the chunks' first states.
     update : int
         ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
         states.
@@ -76,6 +83,8 @@ class Program:
     chain: int
     substitute: int
     follow: int
+    product: int
+    begin: int
     update: int
     orders: tuple[int, ...]
     stages: int
@@ -146,6 +155,8 @@ def _differences(
             chain(d, 3 * d, order, BLOCK),
             difference_code.substitution(orders, BLOCK),
             chain(d, 3 * d, order, BLOCK, constants_only=True),
+            product(d, order),
+            begin(d, order),
             difference_code.update(orders),
         ]
     )
@@ -175,6 +186,8 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
             chain(D, D, tuple(range(D)), steps),
             collocation_code.substitution(orders, method, steps),
             chain(D, D, tuple(range(D)), steps, constants_only=True),
+            product(D, range(D)),
+            begin(D, range(D)),
             collocation_code.update(orders, s, steps),
         ]
     )
