@@ -140,7 +140,7 @@ def close(
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
 
-    folder = shell.output_folder(out, lambda: f"bayesoleo-{shell.campaign_name(campaign)}")
+    folder = shell.output_folder(out, campaign)
     chosen = options.settings(
         seed=seed,
         jobs=jobs,

@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer.core import TyperGroup
 
+from bayesoleo import schema
 from bayesoleo.errors import BayesoleoError, InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 DEBUG = "BAYESOLEO_DEBUG"
+RESULTS = "results.nc"
 
 #: Exit statuses: input that cannot be used; stopped by the user (128 + SIGINT).
 UNUSABLE, STOPPED = 2, 130
@@ -171,30 +173,58 @@ def campaign_name(campaign: Path) -> str:
     CampaignError
         If the declaration cannot be used.
     """
+    return re.sub(r"[^\w.-]+", "-", _declared_name(campaign)).strip("-.") or "campaign"
+
+
+def _declared_name(campaign: Path) -> str:
     from bayesoleo.data.declaration import FILE, read_declaration
 
     toml = campaign if campaign.suffix == ".toml" else campaign / FILE
-    return re.sub(r"[^\w.-]+", "-", read_declaration(toml).name).strip("-.") or "campaign"
+    return read_declaration(toml).name
 
 
-def output_folder(out: Path | None, default: Callable[[], str]) -> Path:
-    """Where to write, checked before any work is done; nothing is made yet.
+def output_folder(out: Path | None, campaign: Path, ending: str = "") -> Path:
+    """Where to write results of a campaign, checked before any work is done; nothing is made yet.
 
     Parameters
     ----------
     out : Path or None
-        As the user gave it.
-    default : callable
-        Gives the name of a folder in the current one, used without ``out``.
+        As the user gave it; by default a folder in the current one, with the campaign's name.
+    campaign : Path
+        Its folder, or its ``campaign.toml``.
+    ending : str, optional
+        Of the default's name.
 
     Raises
     ------
     InputError
-        If a folder cannot be made there or cannot be written to.
+        If a folder cannot be made there, cannot be written to, or holds results of another
+        campaign.
     """
-    folder = Path(default()) if out is None else out.expanduser()
+    if out is None:
+        out = Path(f"bayesoleo-{campaign_name(campaign)}{ending}")
+    folder = out.expanduser()
     check_writable(folder)
+    _check_own(folder, campaign)
     return folder
+
+
+def _check_own(folder: Path, campaign: Path) -> None:
+    """Raise where the results of another campaign would be lost."""
+    from bayesoleo.storage import read_attributes
+
+    older = folder / RESULTS
+    if not older.is_file():
+        return
+    name = read_attributes(older).get(schema.CAMPAIGN)
+    if name is not None and name != _declared_name(campaign):
+        raise InputError(
+            "holds results of another campaign",
+            file=older,
+            key=schema.CAMPAIGN,
+            value=name,
+            hint="choose another folder with --out, or remove that file",
+        )
 
 
 def check_writable(folder: Path) -> None:

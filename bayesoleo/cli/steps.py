@@ -57,7 +57,7 @@ def estimate(
     from bayesoleo.modelfile import load_model
 
     if out is not None:
-        shell.check_writable(out)
+        out = shell.output_folder(out, campaign)
     chosen = options.settings(
         jobs=jobs,
         scheme=scheme,
@@ -167,7 +167,7 @@ def sample(
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
 
-    folder = shell.output_folder(out, lambda: f"bayesoleo-{shell.campaign_name(campaign)}-sample")
+    folder = shell.output_folder(out, campaign, "-sample")
     chosen = options.settings(
         seed=seed,
         jobs=jobs,
@@ -239,7 +239,7 @@ def trace(
     from bayesoleo.report.tables import candidates
 
     if out is not None:
-        shell.check_writable(out)
+        out = shell.output_folder(out, campaign)
     chosen = options.settings(
         seed=seed,
         jobs=jobs,
@@ -267,6 +267,6 @@ def trace(
 
 def _print_written(out: Path | None, console: Console) -> None:
     """Say where the result is."""
-    if out is not None and (out / "results.nc").exists():
+    if out is not None and (out / shell.RESULTS).exists():
         console.print()
-        console.print(f"result    {out / 'results.nc'}", markup=False, soft_wrap=True)
+        console.print(f"result    {out / shell.RESULTS}", markup=False, soft_wrap=True)

@@ -2,6 +2,6 @@
 
 from bayesoleo.storage.atomic import write_text_atomic
 from bayesoleo.storage.provenance import provenance
-from bayesoleo.storage.tree import read_tree, write_tree
+from bayesoleo.storage.tree import read_attributes, read_tree, write_tree
 
-__all__ = ["provenance", "read_tree", "write_text_atomic", "write_tree"]
+__all__ = ["provenance", "read_attributes", "read_tree", "write_text_atomic", "write_tree"]

@@ -80,6 +80,15 @@ def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
     return tree.map_over_datasets(_clean)
 
 
+def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a netCDF result says of itself, without its arrays; nothing if it cannot be read."""
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as root:
+            return dict(root.attrs)
+    except Exception:  # as above: damage has many faces
+        return {}
+
+
 def _storable(tree: xr.DataTree) -> xr.DataTree:
     """A copy without remembered encodings and with the marks by which a reader knows the file."""
     copy = tree.map_over_datasets(_clean)

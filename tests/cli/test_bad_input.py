@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from small_rig import CAMPAIGN, MODEL, rows, write_rows
 
-from bayesoleo.storage import write_tree
+from bayesoleo import schema
+from bayesoleo.storage import read_tree, write_tree
 
 
 def change(path, old, new):
@@ -161,6 +163,26 @@ def test_bad_simulations(refused, campaign, tmp_path, name):
     out = tmp_path / "simulated"
     line = refused("simulate", "duffing", "--like", campaign, "--out", out, *arguments)
     assert message in line
+
+
+@pytest.mark.parametrize("command", ["estimate", "sample", "trace", "close"])
+def test_results_of_another_campaign_are_spared(refused, campaign, model, tmp_path, command):
+    out = tmp_path / "mine"
+    out.mkdir()
+    write_tree(xr.DataTree(xr.Dataset(attrs={schema.CAMPAIGN: "shaker"})), out / "results.nc")
+    line = refused(command, campaign, "--model", model, "--out", out)
+    assert f"file {out / 'results.nc'}, key campaign: holds results of another campaign" in line
+    assert "(got 'shaker'); choose another folder with --out" in line
+
+
+def test_results_of_the_same_campaign_give_way(run, campaign, model, tmp_path):
+    out = tmp_path / "mine"
+    out.mkdir()
+    own = xr.Dataset(attrs={schema.CAMPAIGN: "mass on a spring"})
+    write_tree(xr.DataTree(own), out / "results.nc")
+    result = run("estimate", campaign, "--model", model, "--out", out, "--quiet", "--jobs", 1)
+    assert result.exit_code == 0, result.output
+    assert schema.POINT in read_tree(out / "results.nc").children
 
 
 def test_simulation_spares_what_is_there(refused, campaign):
