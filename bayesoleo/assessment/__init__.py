@@ -19,6 +19,7 @@ from bayesoleo.assessment.residual_tests import (
 )
 from bayesoleo.assessment.scores import Score, score_draws, score_normal
 from bayesoleo.assessment.series import Series, series_of_problem, series_of_tree
+from bayesoleo.assessment.whereabouts import whereabouts
 
 __all__ = [
     "Score",
@@ -40,4 +41,5 @@ __all__ = [
     "score_normal",
     "series_of_problem",
     "series_of_tree",
+    "whereabouts",
 ]

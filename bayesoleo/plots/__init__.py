@@ -15,6 +15,7 @@ from bayesoleo.plots.forest import point_against_posterior
 from bayesoleo.plots.histories import history
 from bayesoleo.plots.pairs import pairs
 from bayesoleo.plots.period_search import period_search
+from bayesoleo.plots.places import whereabouts
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.prior_sensitivities import prior_sensitivity
 from bayesoleo.plots.proposals import proposal
@@ -58,4 +59,5 @@ __all__ = [
     "sensitivity",
     "trace",
     "trajectory",
+    "whereabouts",
 ]

@@ -14,6 +14,7 @@ from bayesoleo import schema
 from bayesoleo.errors import ResultsError
 from bayesoleo.plots import reading
 from bayesoleo.report import sections, sentences, tables
+from bayesoleo.report.case import case
 from bayesoleo.report.images import encode_formula
 from bayesoleo.report.proposals import proposal_lines, proposal_table
 from bayesoleo.storage import write_text_atomic
@@ -65,6 +66,7 @@ def _content(tree: xr.DataTree) -> dict[str, Any]:
         "tiles": sentences.tiles(summary, units),
         "error_by_role": tables.error_by_role(summary, units),
         "error_by_run": tables.error_by_run(summary, units),
+        "case": case(summary, units, tree),
         "remainder": sentences.remainder(summary),
         "proposals": list(_proposals(tree, summary)),
         "stability": sentences.stability(summary),
@@ -99,6 +101,7 @@ def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, An
             "accepted": entry["accepted"],
             "reason": sentences.reason(entry),
             "table": tables.candidates(entry) if entry["candidates"] else None,
+            "failed": tables.failed(entry),
             "figures": sections.ranking_figure(tree, number),
         }
 
@@ -117,6 +120,7 @@ def _figures(tree: xr.DataTree) -> dict[str, list[sections.Shown]]:
     return {
         "data": sections.data_figures(tree),
         "fit": sections.fit_figures(tree),
+        "where": sections.whereabouts_figure(tree),
         "residual": sections.residual_figures(tree),
         "posterior": sections.posterior_figures(tree),
         "predictive": sections.predictive_figures(tree),

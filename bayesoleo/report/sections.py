@@ -11,10 +11,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import plots, schema
+from bayesoleo.assessment.whereabouts import whereabouts
+from bayesoleo.errors import InputError
 from bayesoleo.plots import reading
 from bayesoleo.plots.residuals import Against
 from bayesoleo.report.images import Image, encode_figure
 from bayesoleo.report.proposals import proposal_table
+from bayesoleo.report.sentences import FLOOR
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,23 @@ def fit_figures(tree: xr.DataTree) -> list[Shown]:
 
         entries.append((partial(plots.fit, tree, output), caption))
     return _drawn(entries)
+
+
+def whereabouts_figure(tree: xr.DataTree) -> list[Shown]:
+    """Where the error lives that repeats; nothing without a periodic run that has any."""
+    try:
+        excess = whereabouts(tree)["excess"].values
+    except (InputError, KeyError):
+        return []
+    if not (excess > FLOOR**2 - 1).any():
+        return []
+    caption = (
+        "Where the error lives that repeats beyond its noise, all runs together: at which "
+        "harmonics, and what of it a function of one coordinate explains that is the same in all "
+        "runs - of run and group, a constant for each. Constants point to conditions and sensors, "
+        "a function of velocity to friction and damping, of position to stiffness and gas."
+    )
+    return _drawn([(lambda: plots.whereabouts(tree), caption)])
 
 
 def residual_figures(tree: xr.DataTree) -> list[Shown]:

@@ -161,6 +161,12 @@ def candidates(entry: Mapping[str, Any]) -> Table:
     return Table(head, rows, 2, marked, LEADING_CANDIDATES)
 
 
+def failed(entry: Mapping[str, Any]) -> Table | None:
+    """Candidates of a round that have no score, with the reason; None where all have one."""
+    rows = [[label, reason] for label, reason in entry.get("failed", {}).items()]
+    return Table(["effect", "why it has no score"], sorted(rows), 2) if rows else None
+
+
 def expected_text(expected: Mapping[str, float | None]) -> str:
     """Expected values with their names; those of a parameter of every run as a range."""
     runs: dict[str, list[float]] = {}

@@ -1,0 +1,198 @@
+"""The case in a few sentences: what was wrong, where, what it is, how sure that is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import schema
+from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, whereabouts
+from bayesoleo.errors import InputError
+from bayesoleo.plots.rankings import chosen, format_p, name
+from bayesoleo.report.proposals import proposal_lines
+from bayesoleo.report.sentences import FLOOR, role_shown
+from bayesoleo.report.tables import error_scale, format_short, parameters
+
+#: A harmonic or a coordinate is named if it holds this part of the excess.
+WORTH_NAMING = 0.2
+_CONSTANTS = {RUN: "a constant for each run", GROUP: "a constant for each group",
+              "direction": "the direction of motion"}  # fmt: skip
+
+
+def case(
+    summary: Mapping[str, Any], units: Mapping[str, str], tree: xr.DataTree
+) -> list[tuple[str, str]]:
+    """Questions that a sceptical reader asks, each with its answer in numbers.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``.
+    units : mapping of str to str
+        SI unit of each output.
+    tree : DataTree
+        The result; where the error lives is told if it holds residuals of periodic runs.
+
+    Returns
+    -------
+    list of (str, str)
+        Those that have an answer.
+    """
+    found = [
+        ("Was anything wrong?", _wrong(summary)),
+        ("Where?", _where(tree)),
+        ("What is it?", " ".join(_what(summary))),
+        ("How large?", _large(summary)),
+        ("Does it hold on data not used?", _holds(summary, units)),
+        ("What is left?", _left(summary)),
+        ("What would settle it?", " ".join(_next(summary))),
+        ("What could not be tried?", _untried(summary)),
+    ]
+    return [(question, answer) for question, answer in found if answer]
+
+
+def _wrong(summary: Mapping[str, Any]) -> str:
+    runs = [
+        (entry["ratio_to_noise"], output, run)
+        for output, by_run in summary["rounds"][0]["error"].items()
+        for run, entry in by_run.items()
+        if entry["ratio_to_noise"] is not None
+    ]
+    if not runs:
+        return "No run repeats, so that there is no noise to hold the error against."
+    worst, output, run = max(runs)
+    above = len({label for ratio, _, label in runs if ratio > FLOOR})
+    of = f"{above} of {len({label for _, _, label in runs})} runs"
+    what = (
+        f"the largest is the error of {output} in run {run}, {format_short(worst)} times its noise"
+    )
+    if not above:
+        return f"No: no error that repeats is above {FLOOR} times its noise; {what}."
+    return f"In {of} an error repeats that is more than {FLOOR} times its noise; {what}."
+
+
+def _where(tree: xr.DataTree) -> str:
+    try:
+        data = whereabouts(tree)
+    except (InputError, KeyError):
+        return ""
+    texts = []
+    for output in data[schema.OUTPUT].values:
+        one = data.sel({schema.OUTPUT: output}).isel(stage=0)
+        # An excess that noise alone may feign has no place.
+        if not float(one["excess"]) > FLOOR**2 - 1:
+            continue
+        orders = _named(one["power"].values, [*map(str, range(ORDERS)), f"{ORDERS} and above"])
+        places = [str(place) for place in one["coordinate"].values]
+        words = [_CONSTANTS.get(place, f"one function of {place}") for place in places]
+        shares = _named(one["share"].values, words)[:2]
+        text = f"Of what repeats of {output} beyond its noise, "
+        text += ", ".join(f"{share} stands at harmonic {word}" for word, share in orders)
+        text += ("; " if orders else "") + ", ".join(f"{word} explains {s}" for word, s in shares)
+        texts.append(f"{text}." if orders or shares else "")
+    return " ".join(filter(None, texts))
+
+
+def _named(shares: np.ndarray, words: list[str]) -> list[tuple[str, str]]:
+    """Those worth naming, the largest first, with their share."""
+    order = [k for k in np.argsort(-shares) if shares[k] >= WORTH_NAMING]
+    return [(words[k], f"{100 * min(shares[k], 1.0):.0f} %") for k in order]
+
+
+def _what(summary: Mapping[str, Any]) -> Iterator[str]:
+    for entry in summary["rounds"]:
+        added = chosen(entry)
+        if added is None:
+            continue
+        others = [c for c in entry["candidates"] if c is not added]
+        alike = added["indistinguishable_from"]
+        apart = [c for c in others if c["effect"] not in alike and name(c) not in alike]
+        p = format_p(added["p_value"])
+        text = f"{name(added)} explains {100 * added['gain']:.0f} % of the excess"
+        text += (
+            f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"
+            if p
+            else ""
+        )
+        if apart:
+            second = max(apart, key=lambda c: c["gain"])
+            text += f"; the next, {name(second)}, {100 * second['gain']:.0f} %"
+        yield f"{text}."
+        if alike:
+            yield f"These data cannot tell it from {', '.join(alike)}."
+
+
+def _large(summary: Mapping[str, Any]) -> str:
+    """The new parameters as the table shows them."""
+    new = {key.split("[")[0] for entry in summary["rounds"]
+           for key in (chosen(entry) or {}).get("expected", {})}  # fmt: skip
+    table, texts = parameters(summary), []
+    for row in table.rows:
+        if row[0].split("[")[0] in new:
+            cells = dict(zip(table.head, row, strict=True))
+            interval = cells["95 % interval"]
+            text = f"{row[0]} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
+            known = any(character.isdigit() for character in interval)
+            texts.append(f"{text} (95 %: {interval})" if known else text)
+    most = 6
+    rest = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return f"{', '.join(texts[:most])}{rest}." if texts else ""
+
+
+def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    role = role_shown(summary)
+    if not summary["effects"] or role == schema.FIT:
+        return "" if not summary["effects"] else "Nothing could be held out: that is not known."
+    texts = []
+    for output, last in summary["error_after"][role].items():
+        first = summary["error_before"][role].get(output, last)
+        key = "rms" if last["repeating"] is None else "repeating"
+        scale = error_scale(units.get(output, ""), (first, last))
+        before, after = (
+            format_short(scale.factor * e[key]) for e in (first, last) if e[key] is not None
+        )
+        text = f"{output} {before} → {after} {scale.unit}".rstrip()
+        ratios = [format_short(e["ratio_to_noise"]) for e in (first, last)]
+        texts.append(
+            text + (f" ({' → '.join(ratios)} times the noise)" if last["ratio_to_noise"] else "")
+        )
+    said = summary.get("hold_out", "")
+    return f"On the {role} runs: {', '.join(texts)}{f' ({said})' if said else ''}."
+
+
+def _left(summary: Mapping[str, Any]) -> str:
+    last = summary["rounds"][-1]
+    ratios = [
+        (entry["ratio_to_noise"], output, run)
+        for output, runs in last["error"].items()
+        for run, entry in runs.items()
+        if entry["ratio_to_noise"] is not None
+    ]
+    text = ""
+    if ratios:
+        worst, output, run = max(ratios)
+        text = f"At most {format_short(worst)} times the noise, of {output} in run {run}"
+    if last["candidates"]:
+        best = max(last["candidates"], key=lambda candidate: candidate["gain"])
+        lead = "; the" if text else "The"
+        share = f"{100 * best['gain']:.0f} %"
+        text += f"{lead} best remaining candidate, {name(best)}, would explain {share} of it"
+    return f"{text}." if text else ""
+
+
+def _next(summary: Mapping[str, Any]) -> Iterator[str]:
+    for entry in summary.get("proposals", []):
+        yield " ".join(proposal_lines(entry)[1:2])
+
+
+def _untried(summary: Mapping[str, Any]) -> str:
+    """Candidates of the first round without a score, by reason."""
+    failed = summary["rounds"][0].get("failed", {})
+    if not failed:
+        return ""
+    texts = [f"{count} ({reason})" for reason, count in Counter(failed.values()).most_common()]
+    return f"{len(failed)} candidates have no score: {', '.join(texts)}."

@@ -1,0 +1,61 @@
+"""The case on the first page: each question with its answer in numbers."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from bayesoleo import schema
+from bayesoleo.report import render_report
+from bayesoleo.report.case import case
+from bayesoleo.report.tables import failed, output_units
+
+
+@pytest.fixture(scope="module")
+def answers(oleo):
+    summary = json.loads(oleo.attrs[schema.SUMMARY])
+    summary["rounds"][0]["failed"] = {
+        "backlash at stroke": "singular", "gap at stroke": "singular", "mass_error": "spanned"
+    }  # fmt: skip
+    return dict(case(summary, output_units(oleo, summary), oleo)), summary
+
+
+def test_what_it_is_how_large_and_whether_it_holds(answers):
+    found, summary = answers
+    accepted = summary["rounds"][0]["accepted"]
+    assert f"{accepted}" in found["What is it?"]
+    assert "corrected for the search of" in found["What is it?"]
+    assert "the next, " in found["What is it?"]
+    assert "95 %" in found["How large?"]
+    assert "→" in found["Does it hold on data not used?"]
+    assert "times its noise" in found["Was anything wrong?"]
+    assert "best remaining candidate" in found["What is left?"]
+
+
+def test_candidates_without_a_score_are_counted_by_reason(answers):
+    found, summary = answers
+    expected = "3 candidates have no score: 2 (singular), 1 (spanned)."
+    assert found["What could not be tried?"] == expected
+    table = failed(summary["rounds"][0])
+    assert ["gap at stroke", "singular"] in table.rows
+    assert failed({"candidates": []}) is None
+
+
+def test_nothing_wrong_is_said_so(answers, two_runs):
+    _, summary = answers
+    quiet = json.loads(json.dumps(summary))
+    for runs in quiet["rounds"][0]["error"].values():
+        for entry in runs.values():
+            entry["ratio_to_noise"] = 1.01
+    quiet["rounds"], quiet["effects"] = quiet["rounds"][:1], []
+    quiet["rounds"][0]["accepted"] = None
+    found = dict(case(quiet, {}, two_runs))
+    assert found["Was anything wrong?"].startswith("No: no error that repeats is above 1.15")
+    assert "What is it?" not in found
+    assert "Does it hold on data not used?" not in found
+
+
+def test_page_begins_with_the_case(oleo):
+    page = render_report(oleo)
+    assert page.index("Was anything wrong?") < page.index("Data and noise floor")
