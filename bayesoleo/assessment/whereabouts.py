@@ -92,8 +92,8 @@ def _by_order(mean: Array) -> Array:
     """Mean square by harmonic less that of noise, the last with all above, shape (ORDERS + 1,)."""
     count = mean.shape[1]
     squares = np.abs(np.fft.rfft(mean, axis=1) / count) ** 2
-    # White noise of unit mean square holds as much in each real coefficient: two of most orders, one
-    # of the mean and, with an even number of phases, of the last.
+    # White noise of unit mean square holds as much in each real coefficient: two of most orders,
+    # one of the mean and, with an even number of phases, of the last.
     coefficients = np.full(squares.shape[1], 2.0)
     coefficients[[0] if count % 2 else [0, -1]] = 1.0
     squares *= coefficients
