@@ -230,6 +230,11 @@ def discrepancy_length(output: str) -> str:
     return f"discrepancy_length_{output}"
 
 
+def discrepancy_common(output: str) -> str:
+    """Name of the part of an output's discrepancy that all runs share."""
+    return f"discrepancy_common_{output}"
+
+
 _ERROR_QUANTITIES: Final = (
     log_variance(""),
     spread(log_variance("")),
@@ -237,6 +242,7 @@ _ERROR_QUANTITIES: Final = (
     correlated_share(""),
     discrepancy_share(""),
     discrepancy_length(""),
+    discrepancy_common(""),
 )
 
 

@@ -142,7 +142,8 @@ ErrorModel = Annotated[
         metavar="NAME",
         rich_help_panel=SOLVING,
         help="What errors have in common: independent (one variance an output), per-run, full "
-        "(outputs correlated), correlated (in time), discrepancy (repeats every period).",
+        "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
+        "shared-discrepancy (and is partly alike in all runs).",
     ),
 ]
 BetweenRuns = Annotated[

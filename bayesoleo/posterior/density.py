@@ -207,6 +207,8 @@ class LogDensity:
 
     def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
         """Log-likelihood by run (W, N) and statuses (W,), in blocks of runs and rows."""
+        if self.errors.over_runs:
+            return self._of_all_residuals(theta, eta)
         problem, count = cast(ResidualProblem, self.problem), len(theta)
         by_run = np.full((count, len(self.runs)), np.nan)
         status = np.zeros(by_run.shape, dtype=np.int64)
@@ -223,6 +225,25 @@ class LogDensity:
                 by_run[rows, run] = self.errors.of_run(run, residual, eta[rows])
 
         thread_map(work, blocks, self.jobs)
+        return by_run, status.max(axis=1)
+
+    def _of_all_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        """The same where runs have errors in common, in blocks of rows."""
+        problem, count = cast(ResidualProblem, self.problem), len(theta)
+        by_run = np.full((count, len(self.runs)), np.nan)
+        status = np.zeros(by_run.shape, dtype=np.int64)
+
+        def work(rows: slice) -> None:
+            found = []
+            for run in range(len(self.runs)):
+                residual, status[rows, run] = problem.residuals(theta[rows], run)
+                found.append(residual)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                by_run[rows] = self.errors.of_runs(found, eta[rows])
+
+        thread_map(
+            work, [slice(k, min(k + LANES, count)) for k in range(0, count, LANES)], self.jobs
+        )
         return by_run, status.max(axis=1)
 
     def _mark_failures(

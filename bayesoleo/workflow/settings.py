@@ -44,7 +44,7 @@ class Settings:
     nuisance : tuple of {"conditions", "offset", "gain"}
         What is estimated within its declared tolerance: conditions by run (``sd``), offset and gain
         of sensors (``accuracy``).
-    error_model : {"independent", "per-run", "full", "correlated", "discrepancy"}
+    error_model : {"independent", "per-run", "full", "correlated", "discrepancy", ...}
         What the errors of the outputs have in common; see :mod:`bayesoleo.posterior.error_models`.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated; see

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 
 import numpy as np
@@ -151,7 +151,7 @@ class CampaignProblem:
     def samples(self) -> tuple[RunSamples, ...]:
         """When the samples of each run were taken, s."""
         return tuple(
-            RunSamples(self.kept(r, record.time), record.frequency if record.periodic else None)
+            _samples_of(record, self.kept(r, record.time), self.predictor.model.inputs)
             for r, record in enumerate(self.predictor.records)
         )
 
@@ -240,6 +240,21 @@ class CampaignProblem:
             np.sum([part.sums for part in parts], axis=0),
             np.stack([part.status for part in parts]).max(axis=0),
         )
+
+
+def _samples_of(record: Record, time: Array, inputs: Iterable[str]) -> RunSamples:
+    """When samples of a run were taken, and where in its cycle: by the first input that swings."""
+    if not record.periodic:
+        return RunSamples(time, None)
+    first = record.frequency * float(time[0] - record.time[0])
+    for channel in inputs:
+        harmonics = record.harmonics.get(channel)
+        swing = None if harmonics is None else harmonics.coefficients[harmonics.orders == 1]
+        if swing is not None and swing.size:
+            return RunSamples(
+                time, record.frequency, first + float(np.angle(swing[0])) / (2 * np.pi)
+            )
+    return RunSamples(time, record.frequency, first)
 
 
 def _count(record: Record) -> int:

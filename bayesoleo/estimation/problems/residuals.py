@@ -24,10 +24,13 @@ class RunSamples:
     frequency : float or None
         Of the motion that repeats itself, in cycles per unit of ``time``; None for a run that does
         not.
+    origin : float
+        Cycles from the crest of what drives the run to the first sample.
     """
 
     time: Array
     frequency: float | None
+    origin: float = 0.0
 
     @property
     def phase(self) -> Array:

@@ -9,6 +9,8 @@ word            errors
 ``correlated``  white noise and an Ornstein-Uhlenbeck process in time, for each output
 ``discrepancy`` white noise and a Gaussian process over phase that repeats itself, for each output
 =============== ====================================================================================
+
+``shared-discrepancy`` is the last with a part of the process that all runs share.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from bayesoleo.posterior.error_models.correlated import CorrelatedErrors
 from bayesoleo.posterior.error_models.discrepancy import DiscrepancyErrors
 from bayesoleo.posterior.error_models.full import FullErrors
 from bayesoleo.posterior.error_models.independent import IndependentErrors, PerRunErrors
+from bayesoleo.posterior.error_models.shared import SharedDiscrepancyErrors
 
 __all__ = [
     "ERROR_MODELS",
@@ -35,6 +38,7 @@ __all__ = [
     "IndependentErrors",
     "PerRunErrors",
     "Quantity",
+    "SharedDiscrepancyErrors",
     "check_word",
     "error_model",
 ]
@@ -45,6 +49,7 @@ _KINDS: tuple[type[ErrorModel], ...] = (
     FullErrors,
     CorrelatedErrors,
     DiscrepancyErrors,
+    SharedDiscrepancyErrors,
 )
 #: The words that choose them; the first is the default.
 ERROR_MODELS: tuple[str, ...] = tuple(kind.word for kind in _KINDS)

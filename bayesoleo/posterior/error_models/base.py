@@ -166,12 +166,15 @@ class ErrorModel(ABC):
         What it is called where it is chosen.
     by_sums : bool
         Whether sums of squares by run and output are all it needs.
+    over_runs : bool
+        Whether runs have errors in common, so that :meth:`of_runs` needs all of them at once.
     quantities : tuple of Quantity, length m
         The first ``s`` are the logarithms of the outputs' total variances.
     """
 
     word: ClassVar[str]
     by_sums: ClassVar[bool] = False
+    over_runs: ClassVar[bool] = False
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
@@ -230,6 +233,18 @@ class ErrorModel(ABC):
             Coordinates.
         """
         raise NotImplementedError(f"{self.word} needs sums only")
+
+    def of_runs(self, residuals: Sequence[Array], eta: Array) -> Array:
+        """Normalised log-likelihood of each run given those before it, shape (L, N).
+
+        Parameters
+        ----------
+        residuals : sequence over runs of ndarray, shape (L, s, n)
+            ``y - yhat`` of ``L`` parameter vectors.
+        eta : ndarray, shape (L, m)
+            Coordinates.
+        """
+        return np.stack([self.of_run(r, e, eta) for r, e in enumerate(residuals)], axis=1)
 
     @abstractmethod
     def products(self, run: int, columns: Sequence[Array], eta: Array) -> Array:

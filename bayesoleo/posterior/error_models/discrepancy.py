@@ -77,7 +77,7 @@ def basis(phase: Array) -> Array:
 
 
 @jit
-def _project(rows, table, out, squares):
+def project(rows, table, out, squares):
     """Products of rows ``(L, n)`` with the basis ``(n, R)``, and their sums of squares."""
     for lane in range(rows.shape[0]):
         squares[lane] = 0.0
@@ -91,7 +91,7 @@ def _project(rows, table, out, squares):
 
 
 @jit
-def _factorise(gram, root, noise, factor):
+def factorise(gram, root, noise, factor):
     """Cholesky factor of ``noise + D G D`` with ``D = diag(root)``, in place, and ln det."""
     size, logs = root.size, 0.0
     for i in range(size):
@@ -116,7 +116,7 @@ def _log_likelihood(projected, squares, count, gram, weight, eta, out):
         noise = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
         for j in range(size):
             root[j] = np.sqrt(share * weight[lane, j])
-        logs = _factorise(gram, root, noise, factor)
+        logs = factorise(gram, root, noise, factor)
         explained = 0.0
         for i in range(size):
             total = root[i] * projected[lane, i]
@@ -175,7 +175,7 @@ class DiscrepancyErrors(ByOutput):
     def of_output(self, run: int, residual: Array, eta: Array) -> Array:
         table, gram = self._tables[run], self._grams[run]
         projected, squares = np.empty((len(residual), len(gram))), np.empty(len(residual))
-        _project(residual, table, projected, squares)
+        project(residual, table, projected, squares)
         out = np.empty(len(residual))
         weight = spectrum(np.exp(eta[:, 2]))
         _log_likelihood(projected, squares, residual.shape[1], gram, weight, eta, out)
