@@ -166,6 +166,21 @@ def test_a_channel_in_which_nothing_repeats_is_named(tmp_path):
     assert not any("force" in sentence for sentence in sentences)
 
 
+def test_a_start_that_dies_out_slowly_is_no_longer_period(tmp_path):
+    """Free motion at two thirds of the frequency, a hundredth as large, comes back every third
+    period."""
+    time = STEP * np.arange(int(12 * PER_PERIOD))
+    free = 0.01 * np.exp(-0.02 * time) * np.cos(4 / 3 * np.pi * FREQUENCY * time)
+    answer = np.sin(2 * np.pi * FREQUENCY * time) + free
+    samples = {"displacement": answer, "force": np.cos(2 * np.pi * FREQUENCY * time)}
+    run = SimulatedRun("only", time, samples, FREQUENCY)
+    channels = {"displacement": ("x_m", "m"), "force": ("f_N", "N")}
+    write_campaign(tmp_path, name="one", channels=channels, runs=[run])
+    (record,) = reduce_campaign(load_campaign(tmp_path), jobs=1).records
+    assert record.periods >= 6
+    assert periods_per_motion(record) == (1, "")
+
+
 def test_rounding_of_samples_without_noise_is_no_longer_period(tmp_path):
     """Rounding repeats in some longer period, as a wrong frequency would make a motion do."""
     assert findings(damper_campaign(tmp_path).records) == []
