@@ -18,8 +18,8 @@ from bayesoleo.prediction.records import Record
 STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
 #: A longer period is taken for the motion's own if no more than this part of what does not repeat
 #: in the declared period is left in it. Of noise all is left. And what does not repeat must be this
-#: part of the channel's deviation: twice the frequency leaves out half of a motion, a start that has
-#: not quite settled a per cent, the rounding of samples without noise nothing.
+#: part of the channel's deviation: twice the frequency leaves out half of a motion, a start that
+#: has not quite settled a per cent, the rounding of samples without noise nothing.
 LEFT, LEAST = 0.25, 0.05
 #: Multiples of the declared period that are tried.
 LONGER = (2, 3)
