@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 from bayesoleo.effects.effect import Amplitude, Effect, Names
 from bayesoleo.effects.places import substitute
+from bayesoleo.effects.unnamed import COEFFICIENT
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import symbol
 
 
 def _shared(model: Model) -> Sequence[str]:
-    """Estimated parameters that all runs have in common."""
-    return tuple(name for name in model.estimated() if not model.parameters[name].by_run)
+    """Estimated parameters that all runs share; a curve's coefficients mean nothing alone."""
+    shared = {n: model.parameters[n] for n in model.estimated() if not model.parameters[n].by_run}
+    return tuple(n for n, item in shared.items() if not item.description.startswith(COEFFICIENT))
 
 
 def _vary(model: Model, target: str, names: Names) -> Model:

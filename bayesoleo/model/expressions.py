@@ -17,6 +17,60 @@ import sympy as sp
 
 from bayesoleo.errors import ModelError
 
+
+class bspline(sp.Function):  # noqa: N801 - its name in expressions
+    r"""The cardinal cubic B-spline: a bump on -2 to 2, twice continuously differentiable.
+
+    :math:`B(t) = \frac{1}{6}[(2 - |t|)_+^3 - 4 (1 - |t|)_+^3]` (de Boor 1978). Shifted by whole
+    numbers and weighted, it makes up any smooth curve; unlike the powers that it is made of it has
+    no switch that an integrator would have to stop at.
+    """
+
+    nargs = 1
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Slope."""
+        return bspline_slope(self.args[0])
+
+    def _eval_evalf(self, prec: int) -> sp.Expr:
+        far, near = _reaches(self.args[0])
+        return ((far**3 - 4 * near**3) / 6)._eval_evalf(prec)
+
+    def _eval_is_real(self) -> bool:
+        return True
+
+    def _latex(self, printer: sp.printing.latex.LatexPrinter) -> str:
+        return rf"B\left({printer.doprint(self.args[0])}\right)"
+
+
+class bspline_slope(sp.Function):  # noqa: N801
+    """First derivative of :class:`bspline`.
+
+    A function of its own: written with powers of maxima it takes computer algebra minutes to see
+    that nothing simplifies.
+    """
+
+    nargs = 1
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Curvature of the B-spline, in the powers that it consists of."""
+        far, near = _reaches(self.args[0])
+        return far - 4 * near
+
+    def _eval_evalf(self, prec: int) -> sp.Expr:
+        far, near = _reaches(self.args[0])
+        return (-sp.sign(self.args[0]) * (far**2 - 4 * near**2) / 2)._eval_evalf(prec)
+
+    def _eval_is_real(self) -> bool:
+        return True
+
+
+def _reaches(t: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
+    """How far inside two and inside one a B-spline's argument lies."""
+    size = sp.Abs(t)
+    return sp.Max(2 - size, 0), sp.Max(1 - size, 0)
+
+
 #: Functions an expression may use. The derivative at a kink is the mean of those on its two sides.
 FUNCTIONS: dict[str, object] = {
     "abs": sp.Abs,
@@ -33,6 +87,8 @@ FUNCTIONS: dict[str, object] = {
     "min": sp.Min,
     "max": sp.Max,
     "positive": lambda x: sp.Max(x, 0),
+    "bspline": bspline,
+    "bspline_slope": bspline_slope,
     "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
 }
 

@@ -49,6 +49,20 @@ class _Printer(PythonCodePrinter):
     def _print_Abs(self, expr: sp.Abs) -> str:
         return f"np.abs({self._print(expr.args[0])})"
 
+    def _print_bspline(self, expr: sp.Expr) -> str:
+        far, near, _ = self._reaches(expr)
+        return f"(({far}**3 - 4.0*{near}**3)/6.0)"
+
+    def _print_bspline_slope(self, expr: sp.Expr) -> str:
+        far, near, place = self._reaches(expr)
+        return f"(-0.5*np.sign({place})*({far}**2 - 4.0*{near}**2))"
+
+    def _reaches(self, expr: sp.Expr) -> tuple[str, str, str]:
+        """How far inside its supports of two and of one a B-spline's argument lies, and that."""
+        place = self._print(expr.args[0])
+        far, near = (f"np.maximum({edge} - np.abs({place}), 0.0)" for edge in (2.0, 1.0))
+        return far, near, place
+
     def _extremum(self, name: str, arguments: Sequence[sp.Expr]) -> str:
         text = self._print(arguments[0])
         for argument in arguments[1:]:

@@ -10,12 +10,14 @@ from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.assembly import Assembly, Step
 from bayesoleo.tracing.fit import Fit, Numerics
 from bayesoleo.tracing.projection import information_beside, squared_distance
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.rounds import Round, examine
 from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.unnamed_round import with_unnamed
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
@@ -82,6 +84,7 @@ def close_loop(
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
     max_effects: int = 4,
+    unnamed: bool = True,
     say: Say = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model, and add the effects that it lacks one after the other.
@@ -100,6 +103,8 @@ def close_loop(
         For the correction for the search.
     max_effects : int
         Effects added at most.
+    unnamed : bool
+        Whether a smooth function may be added where no named effect explains what is left.
     say : callable
         Told what is being done.
 
@@ -115,8 +120,12 @@ def close_loop(
     first, rounds = state, list[Round]()
     while True:
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
-        limit = _limit(len(state.assembly.steps), len(rounds), max_effects)
+        limit = _limit(state.assembly.steps, len(rounds), max_effects)
         outcome = examine(state, roles, numerics, effects=effects, seed=seed, limit=limit, say=say)
+        if outcome.after is None and unnamed and max_effects > 0:
+            opening = rounds[0] if rounds else outcome
+            room = len(state.assembly.steps) < max_effects
+            outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
         rounds.append(outcome)
         if outcome.after is None:
             break
@@ -131,10 +140,13 @@ def close_loop(
     return ClosedLoop(tuple(rounds), first, state, roles, tuple(notes))
 
 
-def _limit(added: int, rounds: int, max_effects: int) -> str:
+def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:
     """Why a round may only rank; empty where it may add an effect."""
+    added = len(steps)
     if max_effects == 0:
         return "effects were to be ranked only, and none added"
+    if any(step.effect.family == FAMILY for step in steps):
+        return "an effect without a name was added: what is left may be what its splines leave"
     if added >= max_effects:
         return f"as many effects as allowed, {max_effects}, have been added"
     if rounds > 2 * max_effects:

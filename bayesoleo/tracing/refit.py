@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import RunPrediction
@@ -204,6 +205,8 @@ def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
             for key, v in zip(score.names, score.expected, strict=True)
             if key.split("[")[0] == name
         ]
+        if score.option.candidate.family == FAMILY:
+            own = [abs(v) for v in score.expected]  # a curve's coefficients are of one size
         size = max(max(own), 1e-30)
         sign = score.option.candidate.sign.get(name, 0)
         value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.base import Base
@@ -20,6 +21,7 @@ from bayesoleo.tracing.scales import scales_of
 from bayesoleo.tracing.score import Score, score_all
 from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
 from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.unnamed import Search
 
 #: The search ends at the floor if no candidate explains this part of the excess.
 FLOOR_SHARE = 0.10
@@ -54,6 +56,8 @@ class Ranked:
         Ids of effects that these data cannot tell from it.
     refit : Refit or None
         The extended model, where it was estimated.
+    closest : tuple of (str, float)
+        Of an unnamed effect: the named ones most like it, with the cosine between what they change.
     """
 
     score: Score
@@ -62,6 +66,7 @@ class Ranked:
     refitted: bool
     same: tuple[str, ...]
     refit: Refit | None = None
+    closest: tuple[tuple[str, float], ...] = ()
 
     @property
     def effect(self) -> str:
@@ -93,6 +98,8 @@ class Round:
         One sentence.
     tests : float
         Effective number of independent tests of the search.
+    unnamed : Search or None
+        The smooth functions that were tried where no named effect explains what is left.
     """
 
     before: State
@@ -102,6 +109,7 @@ class Round:
     after: State | None
     reason: str
     tests: float
+    unnamed: Search | None = None
 
 
 def examine(
@@ -133,6 +141,9 @@ def examine(
     say : callable
         Told what is being done.
     """
+    if limit and any(step.effect.family == FAMILY for step in state.assembly.steps):
+        # A curve takes up what named effects would have explained: to rank them says nothing.
+        return Round(state, (), {}, None, None, limit, 1.0)
     scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
     options = state.assembly.options(scales, None if effects is None else tuple(effects))
     say(f"score {len(options)} candidates")
@@ -232,33 +243,36 @@ def _choose(
         near = [item for item in tried if item.gain >= max(tried[0].gain, 0.0) - AS_GOOD]
         item = min(near, key=lambda one: refits[id(one.score)].size)
         tried.remove(item)
-        result = refits[id(item.score)]
-        if not np.isfinite(result.share):
-            reasons.append(f"{item.effect} could not be estimated")
-            continue
-        if result.share < LEAST_SHARE:
-            reasons.append(
-                f"{item.effect} would explain only {100 * result.share:.0f} % of the excess"
-            )
-            continue
-        if not result.excludes_null():
-            reasons.append(f"the posterior of {item.effect} does not exclude its null")
-            continue
-        say(f"confirm {item.effect} on runs that were not used")
-        after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
-        old, new = judged(state, after)
-        fall, error = fall_on_hold_out(old, new)
-        # Parameters estimated on the very samples that they are judged by fit their noise: each
-        # lowers the sum by one on average, and by more where noise is coloured, which scatters the
-        # sum more too.
-        more = sum(p.re_estimated for p in new.held_out)
-        more -= sum(p.re_estimated for p in old.held_out)
-        error *= float(np.sqrt(item.score.inflation))
-        if after.hold_errors.entries and not fall - item.score.inflation * more > error:
-            reasons.append(f"{item.effect} does not lower the error on hold-out runs")
-            continue
-        return item, after, _accepted_reason(state, after, item, fall, error)
+        after, reason = confirmed(state, item, refits[id(item.score)], roles, numerics, say)
+        if after is not None:
+            return item, after, reason
+        reasons.append(reason)
     return None, None, "; ".join(reasons) or "no candidate could be estimated"
+
+
+def confirmed(
+    state: State, item: Ranked, result: Refit, roles: Roles, numerics: Numerics, say: Say
+) -> tuple[State | None, str]:
+    """The state with an estimated effect in, if runs that were not used confirm it, and why."""
+    if not np.isfinite(result.share):
+        return None, f"{item.effect} could not be estimated"
+    if result.share < LEAST_SHARE:
+        share = f"{100 * result.share:.0f} % of the excess"
+        return None, f"{item.effect} would explain only {share}"
+    if not result.excludes_null():
+        return None, f"the posterior of {item.effect} does not exclude its null"
+    say(f"confirm {item.effect} on runs that were not used")
+    after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+    old, new = judged(state, after)
+    fall, error = fall_on_hold_out(old, new)
+    # Parameters estimated on the very samples that they are judged by fit their noise: each lowers
+    # the sum by one on average, and by more where noise is coloured, which scatters the sum more
+    # too.
+    more = sum(p.re_estimated for p in new.held_out) - sum(p.re_estimated for p in old.held_out)
+    error *= float(np.sqrt(item.score.inflation))
+    if after.hold_errors.entries and not fall - item.score.inflation * more > error:
+        return None, f"{item.effect} does not lower the error on hold-out runs"
+    return after, _accepted_reason(after, item, fall, error)
 
 
 def judged(before: State, after: State) -> tuple[State, State]:
@@ -304,7 +318,7 @@ def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
     return fall, float(np.sqrt(variance))
 
 
-def _accepted_reason(before: State, after: State, item: Ranked, fall: float, error: float) -> str:
+def _accepted_reason(after: State, item: Ranked, fall: float, error: float) -> str:
     text = f"{item.effect} explains {100 * item.gain:.0f} % of the excess"
     if after.hold_errors.entries:
         text += (

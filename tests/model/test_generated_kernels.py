@@ -58,6 +58,8 @@ CALLS = {
     "max": "max(a*x, b, x)",
     "positive": "positive(a*x)",
     "step": "step(a*x)",
+    "bspline": "bspline(a*x)",
+    "bspline_slope": "bspline_slope(a*x)",
 }
 
 
