@@ -101,9 +101,10 @@ def test_a_row_depends_on_itself_alone(even):
     np.testing.assert_array_equal(alone[0], whole[4])
 
 
-def test_runs_that_share_nothing_have_discrepancies_of_their_own():
+@pytest.mark.parametrize("even", [True, False])
+def test_runs_that_share_nothing_have_discrepancies_of_their_own(even):
     """The first run always has: the others tell nothing of it yet."""
-    problem = Runs(False)
+    problem = Runs(even)
     model, own = error_model(WORD, problem), error_model("discrepancy", problem)
     eta, residuals = drawn(model, 3)
     apart = eta.copy()

@@ -12,7 +12,8 @@ do. Each run has its own :math:`\delta`; size and length are common to an output
 
 The correlation is Matérn's of order 3/2 around the circle, with length :math:`\ell` in cycles: once
 differentiable, because friction and contacts leave kinks. It is written as a Fourier series that is
-cut off, so a record costs one projection on its harmonics and one small factorisation. Of a run
+cut off, so a record costs one projection on its harmonics and, unless it holds whole periods of
+equal steps, one small factorisation. Of a run
 that does not repeat itself the record is half a cycle, over which a periodic function can be any.
 
 References
@@ -42,6 +43,8 @@ from bayesoleo.posterior.error_models.by_output import ByOutput
 HARMONICS = 24
 #: Prior of the length in cycles: within a factor of four of a tenth.
 _LENGTH = LogNormal(0.1, 0.7)
+# Products of two functions of the basis, over those with themselves, that count as none.
+_NONE = 1e-10
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -129,6 +132,36 @@ def _log_likelihood(projected, squares, count, gram, weight, eta, out):
         out[lane] = -0.5 * (logs + misfit)
 
 
+@jit
+def _without_products(projected, squares, count, gram, weight, eta, out):
+    """The same where no two functions of the basis have a product."""
+    size = gram.shape[0]
+    for lane in range(projected.shape[0]):
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        noise = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
+        logs = explained = 0.0
+        for j in range(size):
+            power = share * weight[lane, j]
+            pivot = noise + power * gram[j, j]
+            explained += power * projected[lane, j] ** 2 / pivot
+            logs += np.log(pivot)
+        logs += (count - size) * np.log(noise) + count * (_LOG_2_PI + eta[lane, 0])
+        misfit = (squares[lane] - explained) / noise * np.exp(-eta[lane, 0])
+        out[lane] = -0.5 * (logs + misfit)
+
+
+def without_products(gram: Array) -> bool:
+    """Whether functions of the basis have none with each other: whole periods of equal steps.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (..., R, R)
+    """
+    diagonal = np.einsum("...ii->...i", gram)
+    beside = np.abs(gram - diagonal[..., None] * np.eye(gram.shape[-1]))
+    return bool(beside.max() <= _NONE * diagonal.min())
+
+
 class DiscrepancyErrors(ByOutput):
     """White noise and a Gaussian process over phase for each output; every run has its own.
 
@@ -140,8 +173,11 @@ class DiscrepancyErrors(ByOutput):
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
-        self._tables = [basis(run.phase) for run in frame.sampled()]
+        self._tables = [basis(self._phase(run)) for run in frame.sampled()]
         self._grams = [table.T @ table for table in self._tables]
+        self._kernels = [
+            _without_products if without_products(gram) else _log_likelihood for gram in self._grams
+        ]
 
     def _declare(self) -> tuple[Quantity, ...]:
         outputs = self.frame.outputs
@@ -172,13 +208,17 @@ class DiscrepancyErrors(ByOutput):
         """The white part: of a curve that repeats itself nothing is new for long."""
         return np.asarray(log_ndtr(-share))
 
+    def _phase(self, run: RunSamples) -> Array:
+        """Where a run's samples lie in its cycle."""
+        return run.phase
+
     def of_output(self, run: int, residual: Array, eta: Array) -> Array:
         table, gram = self._tables[run], self._grams[run]
         projected, squares = np.empty((len(residual), len(gram))), np.empty(len(residual))
         project(residual, table, projected, squares)
         out = np.empty(len(residual))
         weight = spectrum(np.exp(eta[:, 2]))
-        _log_likelihood(projected, squares, residual.shape[1], gram, weight, eta, out)
+        self._kernels[run](projected, squares, residual.shape[1], gram, weight, eta, out)
         return out
 
     def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:

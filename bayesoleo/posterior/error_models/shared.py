@@ -34,21 +34,19 @@ import numba
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Uniform
 from bayesoleo.posterior.error_models.base import Array, Frame, Quantity
 from bayesoleo.posterior.error_models.discrepancy import (
     DiscrepancyErrors,
-    basis,
     factorise,
     project,
     spectrum,
+    without_products,
 )
 
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
-# Products of two functions of the basis, over those with themselves, that count as none: records of
-# whole periods with equal steps.
-_NONE = 1e-10
 # Least part of a run's own: less is rounded away.
 _LEAST_OWN = 1e-9
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -171,12 +169,8 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
-        self._tables = [basis(run.phase + run.origin) for run in frame.sampled()]
-        self._grams = [table.T @ table for table in self._tables]
         self._stack = np.stack(self._grams)
-        diagonal = np.einsum("rii->ri", self._stack)
-        beside = np.abs(self._stack - np.einsum("ri,ij->rij", diagonal, np.eye(diagonal.shape[1])))
-        self._kernel = _diagonal if beside.max() <= _NONE * diagonal.min() else _dense
+        self._kernel = _diagonal if without_products(self._stack) else _dense
 
     def _declare(self) -> tuple[Quantity, ...]:
         common = tuple(
@@ -191,6 +185,9 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
             for output in self.frame.outputs
         )
         return (*super()._declare(), *common)
+
+    def _phase(self, run: RunSamples) -> Array:
+        return run.phase + run.origin
 
     def start(self, residuals: Sequence[Array]) -> Array:
         eta = super().start(residuals)  # of discrepancies of the runs' own
