@@ -131,7 +131,7 @@ def parse_unit(name: str) -> Unit:
     shift = float(zero.magnitude)
     # kN is 1000 N exactly; pint's base units go through grams and may miss it by one rounding.
     factor = float(f"{float(one.magnitude) - shift:.15g}")
-    si_name = _SI_NAMES.get(base, base.replace(" ** ", "^").replace(" ", ""))
+    si_name = _SI_NAMES.get(base, f"{one.units:~C}")
     if si_name == _ENERGY and _holds_force(unit):
         si_name = TORQUE
     return Unit(name, si_name, factor, shift)
