@@ -49,7 +49,7 @@ UNITS = [
         ("kJ", 2.0, 2000.0, "J"),
         ("Hz", 3.0, 3.0, "Hz"),
         ("1", 3.0, 3.0, "1"),
-        ("W/K", 1.0, 1.0, "kilogram*meter^2/kelvin/second^3"),
+        ("W/K", 1.0, 1.0, "kg*m**2/K/s**3"),
     ],
 )
 def test_to_si(name, value, si, si_name):
