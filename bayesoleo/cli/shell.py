@@ -177,7 +177,8 @@ def campaign_name(campaign: Path) -> str:
 
 
 def _declared_name(campaign: Path) -> str:
-    from bayesoleo.data.declaration import FILE, read_declaration
+    from bayesoleo.data.checked_table import FILE
+    from bayesoleo.data.declaration import read_declaration
 
     toml = campaign if campaign.suffix == ".toml" else campaign / FILE
     return read_declaration(toml).name

@@ -11,14 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.data.declaration import (
-    FILE,
-    Channel,
-    Declaration,
-    RunDeclaration,
-    choose,
-    read_declaration,
-)
+from bayesoleo.data.checked_table import FILE, choose
+from bayesoleo.data.declaration import Channel, Declaration, read_declaration
+from bayesoleo.data.declared_run import RunDeclaration
 from bayesoleo.data.files import read_columns
 from bayesoleo.data.gaps import Stretches, masked
 from bayesoleo.data.registry import dataset_folder

@@ -1,47 +1,31 @@
-"""``campaign.toml``: every key checked, so that a typing slip does not pass as a default."""
+"""``campaign.toml`` as a whole: the campaign, its channels and its runs."""
 
 from __future__ import annotations
 
-import re
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesoleo.data.gaps import Stretches, read_stretches
+from bayesoleo.data.checked_table import (
+    FILE,
+    check_keys,
+    choose,
+    get_unit,
+    get_value,
+    load_table,
+)
+from bayesoleo.data.declared_run import RunDeclaration, read_runs
 from bayesoleo.data.rig import read_rig
-from bayesoleo.data.units import Unit, check_kind, parse_unit
+from bayesoleo.data.units import parse_unit
 from bayesoleo.errors import CampaignError
 
 FORMAT = 1
-FILE = "campaign.toml"
-KINDS = ("periodic", "transient")
-ROLES = ("fit", "hold-out")
 
 _TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
 _CHANNEL = ("column", "unit", "scale", "offset", "accuracy")
-_RUN = (
-    "label",
-    "file",
-    "kind",
-    "frequency",
-    "group",
-    "role",
-    "time",
-    "sample_rate",
-    "start",
-    "stop",
-    "mask",
-    "delimiter",
-    "header_delimiter",
-    "conditions",
-)
-_CONDITION = ("value", "unit", "sd")
 
 
 @dataclass(frozen=True)
@@ -81,28 +65,6 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class RunDeclaration:
-    """What ``campaign.toml`` says about a run; times in s, conditions SI."""
-
-    label: str
-    file: str
-    kind: str
-    frequency: float | None
-    group: str
-    role: str
-    time: str | None
-    sample_rate: float | None
-    start: float | None
-    stop: float | None
-    mask: Stretches
-    delimiter: str | None
-    header_delimiter: str | None
-    conditions: Mapping[str, float]
-    condition_units: Mapping[str, str]
-    condition_sd: Mapping[str, float]
-
-
-@dataclass(frozen=True)
 class Declaration:
     """What ``campaign.toml`` says."""
 
@@ -133,8 +95,8 @@ def read_declaration(path: Path) -> Declaration:
     CampaignError
         On anything missing, unknown or of the wrong kind.
     """
-    table = _load(path)
-    _check_keys(table, _TOP, None)
+    table = load_table(path)
+    check_keys(table, _TOP, None)
     if table.get("format") != FORMAT or isinstance(table.get("format"), bool):
         raise CampaignError(
             "unknown campaign format",
@@ -144,10 +106,10 @@ def read_declaration(path: Path) -> Declaration:
             hint=f"write format = {FORMAT}",
         )
     channels = _channels(
-        _get(table, "channels", dict, "a table [channels.<name>] for each channel")
+        get_value(table, "channels", dict, "a table [channels.<name>] for each channel")
     )
-    runs = _runs(_get(table, "runs", list, "a table [[runs]] for each run"))
-    controlled = _get(table, "controlled", str, "a channel's name", default=None)
+    runs = read_runs(get_value(table, "runs", list, "a table [[runs]] for each run"))
+    controlled = get_value(table, "controlled", str, "a channel's name", default=None)
     if controlled is not None and controlled not in channels:
         raise CampaignError(
             "controlled channel is not declared",
@@ -157,89 +119,14 @@ def read_declaration(path: Path) -> Declaration:
             hint=choose(controlled, channels),
         )
     return Declaration(
-        name=_get(table, "name", str, "a name in quotes"),
-        description=_get(table, "description", str, "text in quotes", default=""),
+        name=get_value(table, "name", str, "a name in quotes"),
+        description=get_value(table, "description", str, "text in quotes", default=""),
         controlled=controlled,
-        dataset=_get(table, "dataset", str, "a registered set's name", default=None),
+        dataset=get_value(table, "dataset", str, "a registered set's name", default=None),
         channels=channels,
         runs=runs,
         rig=read_rig(table.get("rig", {}), FILE),
     )
-
-
-def choose(wrong: str, allowed: Sequence[str] | Mapping[str, Any]) -> str:
-    """What to write instead of ``wrong``: the closest of ``allowed``, or all of them."""
-    names = [str(name) for name in allowed]
-    close = get_close_matches(wrong, names, n=1)
-    listed = ", ".join(names[:30]) + (", ..." if len(names) > 30 else "")
-    return (f"did you mean {close[0]!r}? " if close else "") + f"one of: {listed}"
-
-
-def _load(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise _no_campaign(path)
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CampaignError(
-            f"not valid TOML: {error}", file=path.name, hint=_slip(path, str(error))
-        ) from error
-
-
-def _slip(path: Path, problem: str) -> str | None:
-    """What to write in a line that holds text without quotes."""
-    place = re.search(r"at line (\d+)", problem)
-    lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    line = lines[int(place[1]) - 1] if place and int(place[1]) <= len(lines) else ""
-    key, _, value = (part.strip() for part in line.partition("="))
-    if re.match(r"[^\s\"'\[{#]*[A-Za-z]", value) and value not in ("true", "false"):
-        return f'text needs quotes: {key} = "{value}"'
-    number = re.match(r"([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*[A-Za-z/%°]+$", value)
-    if number:
-        return f"a number stands alone: {key} = {number[1]}"
-    return None
-
-
-def _no_campaign(path: Path) -> CampaignError:
-    """What is there instead of the file, or how far its path leads."""
-    hint, folder = f"a campaign is a folder with a {FILE}", path.parent
-    if folder.is_file():
-        return CampaignError("is a file; a folder is expected", file=folder, hint=hint)
-    if not folder.exists():
-        return CampaignError("no such folder", file=folder, hint=hint)
-    return CampaignError("no such file", file=path, hint=hint)
-
-
-def _get(
-    table: Mapping[str, Any],
-    key: str,
-    kind: type,
-    hint: str,
-    run: str | None = None,
-    **default: Any,
-) -> Any:
-    """A value of the expected kind; ``default=`` makes it optional."""
-    if key not in table:
-        if "default" in default:
-            return default["default"]
-        raise CampaignError("missing", file=FILE, run=run, key=key, hint=f"write {hint}")
-    value = table[key]
-    good = isinstance(value, Real) if kind is float else isinstance(value, kind)
-    if isinstance(value, bool) or not good or (kind is float and not np.isfinite(value)):
-        raise CampaignError(
-            "wrong kind of value", file=FILE, run=run, key=key, value=value, hint=f"write {hint}"
-        )
-    return float(value) if kind is float else value
-
-
-def _check_keys(
-    table: Mapping[str, Any], allowed: Sequence[str], run: str | None, inside: str = ""
-) -> None:
-    for key in table:
-        if key not in allowed:
-            raise CampaignError(
-                "unknown key", file=FILE, run=run, key=inside + key, hint=choose(key, allowed)
-            )
 
 
 def _channels(tables: Mapping[str, Any]) -> dict[str, Channel]:
@@ -256,161 +143,25 @@ def _channel(name: str, table: Any) -> Channel:
         raise CampaignError(
             "is no table", file=FILE, key=inside, value=table, hint=f"write [{inside}]"
         )
-    _check_keys(table, _CHANNEL, None, inside + ".")
+    check_keys(table, _CHANNEL, None, inside + ".")
     table = {f"{inside}.{key}": value for key, value in table.items()}
-    unit = _unit(name, _get(table, f"{inside}.unit", str, "a unit in quotes"), f"{inside}.unit")
+    unit = get_unit(
+        name, get_value(table, f"{inside}.unit", str, "a unit in quotes"), f"{inside}.unit"
+    )
     offset = table.get(f"{inside}.offset")
     if offset != "-mean":
-        offset = _get(table, f"{inside}.offset", float, "a number, or '-mean'", default=0.0)
-    scale = _get(table, f"{inside}.scale", float, "a number", default=1.0)
-    accuracy = _get(table, f"{inside}.accuracy", float, "a positive number", default=None)
+        offset = get_value(table, f"{inside}.offset", float, "a number, or '-mean'", default=0.0)
+    scale = get_value(table, f"{inside}.scale", float, "a number", default=1.0)
+    accuracy = get_value(table, f"{inside}.accuracy", float, "a positive number", default=None)
     for key, value in (("scale", scale != 0), ("accuracy", accuracy is None or accuracy > 0)):
         if not value:
             raise CampaignError("must not be zero or negative", file=FILE, key=f"{inside}.{key}")
     return Channel(
         name=name,
-        column=_get(table, f"{inside}.column", str, "a column of the run files"),
+        column=get_value(table, f"{inside}.column", str, "a column of the run files"),
         unit=unit.name,
         si_unit=unit.si_name,
         scale=scale,
         offset=offset,
         accuracy=None if accuracy is None else accuracy * unit.factor,
     )
-
-
-def _unit(name: str, text: str, key: str, run: str | None = None) -> Unit:
-    """Parse a unit and add where it stood to what is wrong with it."""
-    try:
-        unit = parse_unit(text)
-        check_kind(name, unit)
-    except CampaignError as error:
-        raise CampaignError(
-            error.problem, file=FILE, run=run, key=key, value=error.value, hint=error.hint
-        ) from error
-    return unit
-
-
-def _runs(tables: Sequence[Any]) -> tuple[RunDeclaration, ...]:
-    runs: list[RunDeclaration] = []
-    for number, table in enumerate(tables, 1):
-        if not isinstance(table, dict):
-            raise CampaignError(
-                "is no table", file=FILE, key="runs", value=table, hint="write [[runs]]"
-            )
-        run = _run(table, f"number {number}")
-        if run.label in {other.label for other in runs}:
-            raise CampaignError(
-                "two runs have this label", file=FILE, run=run.label, key="label", hint="rename one"
-            )
-        runs.append(run)
-    if not any(run.role == "fit" for run in runs):
-        raise CampaignError(
-            "no run to fit", file=FILE, key="role", hint="give one run or more role = 'fit'"
-        )
-    return tuple(runs)
-
-
-def _run(table: Mapping[str, Any], place: str) -> RunDeclaration:
-    label = _get(table, "label", str, "a name in quotes", run=place)
-    _check_keys(table, _RUN, label)
-
-    def text(key: str, **default: Any) -> Any:
-        return _get(table, key, str, "text in quotes", run=label, **default)
-
-    def number(key: str, positive: bool = False) -> float | None:
-        value = _get(table, key, float, "a number", run=label, default=None)
-        if positive and value is not None and value <= 0:
-            raise CampaignError(
-                "must be positive",
-                file=FILE,
-                run=label,
-                key=key,
-                value=value,
-                hint="write it in Hz",
-            )
-        return value
-
-    kind = _one_of(text("kind", default="periodic"), KINDS, "kind", label)
-    run = RunDeclaration(
-        label=label,
-        file=text("file"),
-        kind=kind,
-        frequency=number("frequency", positive=True),
-        group=text("group", default=""),
-        role=_one_of(text("role", default="fit"), ROLES, "role", label),
-        time=text("time", default=None),
-        sample_rate=number("sample_rate", positive=True),
-        start=number("start"),
-        stop=number("stop"),
-        mask=read_stretches(table.get("mask", []), label, FILE),
-        delimiter=text("delimiter", default=None),
-        header_delimiter=text("header_delimiter", default=None),
-        **_conditions(table, label),
-    )
-    _check_consistent(run)
-    return run
-
-
-def _one_of(value: str, allowed: Sequence[str], key: str, run: str) -> str:
-    if value not in allowed:
-        raise CampaignError(
-            f"unknown {key}", file=FILE, run=run, key=key, value=value, hint=choose(value, allowed)
-        )
-    return value
-
-
-def _check_consistent(run: RunDeclaration) -> None:
-    problem: tuple[str, str, object, str] | None = None
-    if run.kind == "periodic" and run.frequency is None:
-        problem = (
-            "periodic run without frequency",
-            "frequency",
-            None,
-            "write it in Hz, or kind = 'transient'",
-        )
-    elif run.kind == "transient" and run.frequency is not None:
-        problem = ("transient run with a frequency", "frequency", run.frequency, "leave it out")
-    elif run.time is not None and run.sample_rate is not None:
-        problem = (
-            "time and sample_rate are both given",
-            "sample_rate",
-            run.sample_rate,
-            "leave one out",
-        )
-    elif run.start is not None and run.stop is not None and run.stop <= run.start:
-        problem = ("stop is not after start", "stop", run.stop, "write both in seconds")
-    if problem is not None:
-        text, key, value, hint = problem
-        raise CampaignError(text, file=FILE, run=run.label, key=key, value=value, hint=hint)
-
-
-def _conditions(table: Mapping[str, Any], label: str) -> dict[str, dict[str, Any]]:
-    conditions = _get(table, "conditions", dict, "a table [runs.conditions]", run=label, default={})
-    values, units, sds = {}, {}, {}
-    for name, entry in conditions.items():
-        key = f"conditions.{name}"
-        if not isinstance(entry, dict):
-            raise CampaignError(
-                "malformed condition",
-                file=FILE,
-                run=label,
-                key=key,
-                value=entry,
-                hint="write { value = 4.9, unit = 'bar' }",
-            )
-        _check_keys(entry, _CONDITION, label, key + ".")
-        entry = {f"{key}.{part}": value for part, value in entry.items()}
-        unit = _unit(
-            name,
-            _get(entry, f"{key}.unit", str, "a unit in quotes", run=label),
-            f"{key}.unit",
-            label,
-        )
-        values[name] = float(unit.to_si(_get(entry, f"{key}.value", float, "a number", run=label)))
-        units[name] = unit.si_name
-        sd = _get(entry, f"{key}.sd", float, "a positive number", run=label, default=None)
-        if sd is not None and sd <= 0:
-            raise CampaignError("must be positive", file=FILE, run=label, key=f"{key}.sd", value=sd)
-        if sd is not None:
-            sds[name] = sd * unit.factor
-    return {"conditions": values, "condition_units": units, "condition_sd": sds}

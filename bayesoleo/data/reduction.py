@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.data.averaging import average_on
 from bayesoleo.data.campaign import Campaign, Run
-from bayesoleo.data.declaration import choose
+from bayesoleo.data.checked_table import choose
 from bayesoleo.data.gaps import bridged, masked
 from bayesoleo.data.harmonics import significant_harmonics
 from bayesoleo.data.period import Frequency, find_frequency

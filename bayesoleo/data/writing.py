@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.data.declaration import FILE, FORMAT
+from bayesoleo.data.checked_table import FILE
+from bayesoleo.data.declaration import FORMAT
 from bayesoleo.data.units import parse_unit
 from bayesoleo.errors import CampaignError
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bayesoleo import schema
-from bayesoleo.data import declaration
+from bayesoleo.data import declaration, declared_run
 from bayesoleo.effects import FAMILIES, catalogue
 from bayesoleo.model.expressions import FUNCTIONS
 
@@ -19,7 +19,7 @@ def page(name: str) -> str:
 
 
 def test_every_key_of_a_campaign_is_described() -> None:
-    keys = (*declaration._TOP, *declaration._CHANNEL, *declaration._RUN, *declaration._CONDITION)
+    keys = (*declaration._TOP, *declaration._CHANNEL, *declared_run._RUN, *declared_run._CONDITION)
     text = page("data-format.md")
     assert [key for key in keys if key not in text] == []
 
