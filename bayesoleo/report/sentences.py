@@ -11,7 +11,8 @@ from bayesoleo import schema
 from bayesoleo.plots.rankings import format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
-from bayesoleo.tracing.rounds import LEAST_SHARE, LEVEL
+from bayesoleo.tracing.confirmation import LEAST_SHARE
+from bayesoleo.tracing.rounds import LEVEL
 
 FLOOR = 1.15
 """A ratio of repeating error to noise below which a run is taken to be explained."""

@@ -29,8 +29,9 @@ Array = NDArray[np.float64]
 PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
-#: Two effects explain the data equally well if what they leave differs by less than this factor.
-AS_WELL = 1.25
+#: Two effects explain the data equally well if what they leave differs by less than this factor, or
+#: if the data are less than a hundred times as likely by the one as by the other.
+AS_WELL, AS_LIKELY = 1.25, 2.0 * float(np.log(100.0))
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Refit:
         Variance of the new amplitudes over what white noise gives, where noise is coloured.
     freedom : int
         Degrees of freedom that it was measured with; zero where it is the score's.
+    fall : float
+        Of the weighted sum of squares.
     """
 
     score: Score
@@ -65,15 +68,23 @@ class Refit:
     remaining: float
     inflation: float
     freedom: int
+    fall: float
 
     def resembles(self, other: Refit) -> bool:
-        """Whether the data cannot tell two estimated effects apart."""
+        """Whether the data cannot tell two estimated effects apart.
+
+        They hardly can where both do nearly the same. Where an effect is small against the noise,
+        effects that do different things may be as likely (Burnham and Anderson 2002, section 2.6).
+        """
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
         if not (np.isfinite(self.share) and np.isfinite(other.share)) or lengths == 0:
             return False
         cosine = float(self.contribution @ other.contribution) / float(lengths)
         low, high = sorted((self.remaining, other.remaining))
-        return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
+        nearly = cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
+        # Each unknown lowers the sum by one on average if it does nothing.
+        gap = (self.fall - self.size) - (other.fall - other.size)
+        return nearly or abs(gap) < AS_LIKELY * max(self.inflation, other.inflation)
 
     @property
     def size(self) -> int:
@@ -136,7 +147,8 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
     inflation, freedom = _inflation(fit, score)
-    return Refit(score, grown, fit, share, contribution, remaining, inflation, freedom)
+    fall = share * base.fall_back
+    return Refit(score, grown, fit, share, contribution, remaining, inflation, freedom, fall)
 
 
 def _inflation(fit: Fit, score: Score) -> tuple[float, int]:

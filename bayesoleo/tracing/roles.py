@@ -67,6 +67,22 @@ def assign(records: Sequence[Record]) -> Roles:
     return Roles(fitted, (), "none", f"{what}: nothing could be held out")
 
 
+def in_halves(roles: Roles) -> Roles | None:
+    """The fitted runs' first halves to be fitted, and their second ones held out.
+
+    Returns
+    -------
+    Roles or None
+        None where a run has no halves that repeat, or runs are held out so or in turn already.
+    """
+    whole = all(r.periodic and r.periods >= FEWEST_PERIODS_TO_SPLIT for r in roles.fitted)
+    if roles.strategy != "declared" or not whole:
+        return None
+    first, second = zip(*(halves(record) for record in roles.fitted), strict=True)
+    text = "fitted to the first half of each run's periods, held out the second"
+    return Roles(first, second, "split periods", text)
+
+
 def halves(record: Record) -> tuple[Record, Record]:
     """The first and the second half of a periodic record's periods, as records of their own."""
     half = record.periods // 2

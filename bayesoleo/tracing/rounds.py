@@ -4,37 +4,39 @@ not used."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
-from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.base import Base
+from bayesoleo.tracing.confirmation import confirmed
 from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.holdout import crossed
 from bayesoleo.tracing.refit import Refit, refit
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.scales import scales_of
 from bayesoleo.tracing.score import Score, score_all
 from bayesoleo.tracing.significance import classes, corrected_p, effective_tests
-from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.state import State
 from bayesoleo.tracing.unnamed import Search
 
 #: The search ends at the floor if no candidate explains this part of the excess.
 FLOOR_SHARE = 0.10
 #: Nominal probability of adding an effect to data that lack none.
 LEVEL = 0.01
-#: Least part of the present excess that is worth another effect.
-LEAST_SHARE = 0.05
 #: Candidates estimated before one is chosen, and how far behind the best a score may lie to be
 #: among them.
 MOST_REFITS, NEAR = 6, 0.25
+#: The same of what merely varies from run to run.
+MOST_VARYING = 3
 #: Effects after estimation within this share of the best are as good; the simplest of them is
 #: taken.
 AS_GOOD = 0.02
+
+#: Family of effects that let a parameter vary from run to run.
+RUN_TO_RUN = "run-to-run"
 
 Say = Callable[[str], None]
 
@@ -77,6 +79,11 @@ class Ranked:
     def target(self) -> str:
         """Where it sits."""
         return self.score.option.candidate.target
+
+    @property
+    def varies(self) -> bool:
+        """Whether it merely lets something vary from run to run."""
+        return self.score.option.candidate.family == RUN_TO_RUN
 
 
 @dataclass(frozen=True)
@@ -212,19 +219,43 @@ def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
 def _refit_best(
     base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say
 ) -> dict[int, Refit]:
-    """Estimate the best few: effects of physics first, what merely varies from run to run if
-    nothing else explains much."""
-    chosen: list[Score] = []
+    """Estimate the best few effects of physics, and what merely varies from run to run where that
+    may explain more than they do."""
     significant = [item for item in ranking if item.p_value < LEVEL and item.gain > 0]
-    named = [item for item in significant if item.score.option.candidate.family != "run-to-run"]
-    pool = named or significant
-    for item in pool:
-        if len(chosen) == MOST_REFITS or item.gain < NEAR * pool[0].gain:
-            break
-        chosen.append(item.score)
+    named = [item for item in significant if not item.varies]
+    found = _refit_few(base, named, MOST_REFITS, numerics, say)
+    explained = max((result.share for result in found.values()), default=0.0)
+    varying = [item for item in significant if item.varies and item.gain > explained]
+    return found | _refit_few(base, varying, MOST_VARYING, numerics, say)
+
+
+def _refit_few(
+    base: Base, pool: Sequence[Ranked], most: int, numerics: Numerics, say: Say
+) -> dict[int, Refit]:
+    """Estimate the best of a pool, best first, as far as they score near it."""
+    chosen = [item.score for item in pool[:most] if item.gain >= NEAR * pool[0].gain]
+    if not chosen:
+        return {}
     say(f"estimate the best {len(chosen)}: {', '.join(s.option.candidate.effect for s in chosen)}")
     results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
     return {id(score): result for score, result in zip(chosen, results, strict=True)}
+
+
+def _only_varies(item: Ranked, refits: dict[int, Refit], base: Base) -> bool:
+    """Whether an effect merely lets something vary from run to run, without need.
+
+    Much that physics does differs between runs, so a parameter of each run's own takes a part of it
+    up, whatever is missing. It is needed where it explains all that is left and no effect of
+    physics does, by more than its additional unknowns are worth (Schwarz 1978).
+    """
+    if not item.varies:
+        return False
+    own = refits[id(item.score)]
+    price = float(np.log(sum(run.residual.size for run in base.runs)))
+    physics = [r for r in refits.values() if r.score.option.candidate.family != RUN_TO_RUN]
+    worth = max((r.fall - price * r.size for r in physics), default=0.0)
+    reached = base.excess - own.fall < base.feigned
+    return not (reached and own.fall - price * own.size > worth)
 
 
 def _choose(
@@ -237,10 +268,14 @@ def _choose(
     say: Say,
 ) -> tuple[Ranked | None, State | None, str]:
     """The best effect that the runs not used confirm."""
-    tried = sorted((item for item in ranking if item.refitted), key=lambda item: -item.gain)
+    last = {id(r): _only_varies(r, refits, base) for r in ranking if r.refitted}
+    tried = sorted(
+        (item for item in ranking if item.refitted), key=lambda item: (last[id(item)], -item.gain)
+    )
     reasons = []
     while tried:
-        near = [item for item in tried if item.gain >= max(tried[0].gain, 0.0) - AS_GOOD]
+        level = max(tried[0].gain, 0.0) - AS_GOOD
+        near = [one for one in tried if one.gain >= level and last[id(one)] == last[id(tried[0])]]
         item = min(near, key=lambda one: refits[id(one.score)].size)
         tried.remove(item)
         after, reason = confirmed(state, item, refits[id(item.score)], roles, numerics, say)
@@ -248,80 +283,3 @@ def _choose(
             return item, after, reason
         reasons.append(reason)
     return None, None, "; ".join(reasons) or "no candidate could be estimated"
-
-
-def confirmed(
-    state: State, item: Ranked, result: Refit, roles: Roles, numerics: Numerics, say: Say
-) -> tuple[State | None, str]:
-    """The state with an estimated effect in, if runs that were not used confirm it, and why."""
-    if not np.isfinite(result.share):
-        return None, f"{item.effect} could not be estimated"
-    if result.share < LEAST_SHARE:
-        share = f"{100 * result.share:.0f} % of the excess"
-        return None, f"{item.effect} would explain only {share}"
-    if not result.excludes_null():
-        return None, f"the posterior of {item.effect} does not exclude its null"
-    say(f"confirm {item.effect} on runs that were not used")
-    after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
-    old, new = judged(state, after)
-    fall, error = fall_on_hold_out(old, new)
-    # Parameters estimated on the very samples that they are judged by fit their noise: each lowers
-    # the sum by one on average, and by more where noise is coloured, which scatters the sum more
-    # too.
-    more = sum(p.re_estimated for p in new.held_out) - sum(p.re_estimated for p in old.held_out)
-    error *= float(np.sqrt(item.score.inflation))
-    if after.hold_errors.entries and not fall - item.score.inflation * more > error:
-        return None, f"{item.effect} does not lower the error on hold-out runs"
-    return after, _accepted_reason(after, item, fall, error)
-
-
-def judged(before: State, after: State) -> tuple[State, State]:
-    """Both states as an effect is judged by them: where it brings parameters of single runs, with
-    each half of a run predicted by what the other half says, alike before and after."""
-    pairs = []
-    for old, new in zip(before.held_out, after.held_out, strict=True):
-        if new.re_estimated > old.re_estimated:
-            across = crossed(old) if old.re_estimated else old, crossed(new)
-            if across[0] is not None and across[1] is not None:
-                old, new = across[0], across[1]
-        pairs.append((old, new))
-    return (
-        replace(before, held_out=[old for old, _ in pairs]),
-        replace(after, held_out=[new for _, new in pairs]),
-    )
-
-
-def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
-    """Fall of the weighted sum of squares on held-out runs, and its standard error.
-
-    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``; noise with the
-    covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
-    ``4 d' w (1/w + B B') w d`` with ``d = b - a``. Runs that could not be solved in both states do
-    not count.
-    """
-    fall = variance = 0.0
-    for old, new in zip(before.held_out, after.held_out, strict=True):
-        if not (old.status.ok and new.status.ok):
-            continue
-        predictor = old.predictor
-        p = predictor.constants(old.vector[None], 0)[0]
-        moved = 0.0
-        from_input = input_columns(predictor.runs[0], p)
-        for b, output in enumerate(new.predictor.outputs):
-            weight = before.hold_errors.at(output, old.record.label).average.sigma ** -2
-            measured = old.record.samples[output]
-            fall += weight * float(np.sum((measured - old.y[b]) ** 2 - (measured - new.y[b]) ** 2))
-            change = new.y[b] - old.y[b]
-            variance += 4 * weight * float(change @ change)
-            moved = moved + weight * (from_input[b] @ change)
-        variance += 4 * float(np.sum(np.square(moved)))
-    return fall, float(np.sqrt(variance))
-
-
-def _accepted_reason(after: State, item: Ranked, fall: float, error: float) -> str:
-    text = f"{item.effect} explains {100 * item.gain:.0f} % of the excess"
-    if after.hold_errors.entries:
-        text += (
-            f" and lowers the weighted squared error on hold-out runs by {fall:.3g} ± {error:.1g}"
-        )
-    return text

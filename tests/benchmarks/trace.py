@@ -20,6 +20,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2] / "studies"))
 
 import identification as study
+import identification_rows as rows
 import numpy as np
 
 from bayesoleo.data import ReducedCampaign, dataset_folder, load_campaign, reduce_campaign
@@ -70,10 +71,10 @@ def main() -> None:
     result = times()
     if options.results is None:
         chosen = study.planned()
-        rows = [study.run(item) for item in chosen[: round(options.fraction * len(chosen))]]
+        found = [study.run(item) for item in chosen[: round(options.fraction * len(chosen))]]
     else:
-        rows = study.stored(options.results)
-    result |= study.summarise(rows)
+        found = rows.read(options.results)
+    result |= rows.summarise(found)
     if options.json:
         print(json.dumps(result))
     else:

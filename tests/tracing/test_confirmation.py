@@ -10,9 +10,9 @@ from fitted_states import NUMERICS
 from small_campaigns import damper, damper_campaign
 
 from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.confirmation import fall_on_hold_out, judged
 from bayesoleo.tracing.holdout import crossed
 from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.rounds import fall_on_hold_out, judged
 from bayesoleo.tracing.state import fit_state
 
 RUNS = (("a", 0.5, 0.010, "fit"), ("d", 0.8, 0.008, "hold-out"), ("e", 1.6, 0.006, "hold-out"))
