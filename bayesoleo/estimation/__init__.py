@@ -1,9 +1,9 @@
 """Which parameter values fit, and how sure is that, at a point."""
 
 from bayesoleo.estimation.estimators.estimate import estimate, polish
-from bayesoleo.estimation.estimators.iterate import Iteration
 from bayesoleo.estimation.estimators.methods import METHODS
 from bayesoleo.estimation.estimators.multistart import Modes, multistart
+from bayesoleo.estimation.estimators.outcome import Iteration
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.table import as_text, to_dataset

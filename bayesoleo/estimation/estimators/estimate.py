@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.estimators.iterate import Iteration, Outcome, iterate
+from bayesoleo.estimation.estimators.iterate import iterate
 from bayesoleo.estimation.estimators.methods import method as find_method
+from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.estimators.steps import Step

@@ -8,14 +8,15 @@ Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rar
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.estimators.newton import newton_equations
+from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.pace import Pace
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.objectives.bounded import is_cut
@@ -47,57 +48,6 @@ _IDLE_STEPS = 1e3
 # What then lies nearer to the level than _NEAR is on it.
 _FLAT = 0.9
 _LEVEL = 0.5 * _NEAR**2
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """Where one iteration ended.
-
-    Parameters
-    ----------
-    number : int
-        Zero at the start.
-    theta : ndarray, shape (l,)
-    variance : ndarray, shape (s,) or (s, s)
-        Staged at ``theta``; a matrix where the objective estimates one.
-    objective : float
-        The method's own objective at both.
-    halvings : int
-        Of the step that led here.
-    """
-
-    number: int
-    theta: Array
-    variance: Array
-    objective: float
-    halvings: int
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How the loop ended: the last point, its evaluation and the way there.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (l,)
-    evaluation : Evaluation
-    status : Status
-    history : tuple of Iteration
-        Empty if the start could not be evaluated.
-    evaluations : int
-    distance : float
-        To the method's fixed point by the last linearisation, in standard deviations.
-    failures : mapping of str to int
-        Evaluations that came to nothing, by the lower-case name of their status.
-    """
-
-    theta: Array
-    evaluation: Evaluation
-    status: Status
-    history: tuple[Iteration, ...]
-    evaluations: int
-    distance: float
-    failures: Mapping[str, int] = field(default_factory=dict)
 
 
 def iterate(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares, minimize
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.estimators.iterate import Iteration, Outcome
+from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts
 from bayesoleo.estimation.objectives.objective import Objective
 from bayesoleo.estimation.problems.problem import Array, Evaluation, Problem

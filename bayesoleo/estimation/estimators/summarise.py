@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.estimation.estimators.iterate import Outcome
+from bayesoleo.estimation.estimators.outcome import Outcome
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
 from bayesoleo.estimation.objectives.diagonal import output_counts, staged_variance, sums_of_squares
