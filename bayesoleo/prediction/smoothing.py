@@ -28,7 +28,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize_scalar
 
 from bayesoleo.errors import InputError
-from bayesoleo.solvers.schemes.sweep import eliminate
+from bayesoleo.solvers.schemes.elimination import eliminate
 
 Array = NDArray[np.float64]
 

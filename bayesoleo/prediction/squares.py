@@ -19,7 +19,7 @@ from bayesoleo.model.kernels import Kernels
 from bayesoleo.solvers.periodic.measures import total
 from bayesoleo.solvers.schemes.collocation import Collocation, SamplePlan
 from bayesoleo.solvers.schemes.collocation_kernels import sample_block
-from bayesoleo.solvers.schemes.sweep import jit
+from bayesoleo.solvers.schemes.elimination import jit
 
 Array = NDArray[np.float64]
 

@@ -128,6 +128,7 @@ class Work(NamedTuple):
     start: Any
     products: Any
     closure: Any
+    scale: Any
     inverse: Any
     measures: Any
     before: Any
@@ -183,6 +184,7 @@ def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
         start=(D, WIDTH),
         products=(WIDTH + 1, D, COLUMNS),
         closure=(D, D),
+        scale=(D,),
         inverse=(D, D),
         measures=(2 * d,),
         before=(2 * d,),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.solvers.schemes.sweep import jit
+from bayesoleo.solvers.schemes.elimination import jit
 
 
 @jit

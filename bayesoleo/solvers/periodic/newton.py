@@ -23,7 +23,7 @@ from bayesoleo.solvers.periodic.recursion import (
     take,
     update,
 )
-from bayesoleo.solvers.schemes.sweep import jit
+from bayesoleo.solvers.schemes.elimination import jit
 from bayesoleo.solvers.schemes.unrolled.emit import WIDTH
 from bayesoleo.solvers.status import Status
 

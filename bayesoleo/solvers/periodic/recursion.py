@@ -11,7 +11,9 @@ from numba import carray
 
 from bayesoleo.compiled import BLOCK, after, call_kernel, caller, pointer
 from bayesoleo.solvers.periodic.measures import total
-from bayesoleo.solvers.schemes.sweep import LARGEST_GROWTH, ROUND_OFF, eliminate, jit
+from bayesoleo.solvers.schemes.closure import LARGEST_GROWTH, close_balanced
+from bayesoleo.solvers.schemes.closure import close as solve_closure
+from bayesoleo.solvers.schemes.elimination import jit
 from bayesoleo.solvers.schemes.unrolled.emit import REACH, WIDTH
 from bayesoleo.solvers.schemes.unrolled.program import SIGNATURES
 from bayesoleo.solvers.status import Status
@@ -168,24 +170,25 @@ def _silence(sizes, lengths, b, count, z, out):
 @jit
 def close(pieces, sizes, work):
     """Invert the closure of the period, from the recursion's matrices alone."""
-    D, inverse, closure, products = sizes.state, work.inverse, work.closure, work.products
+    inverse, closure, products = work.inverse, work.closure, work.products
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
     _call_product(pieces.product, (history, pointer(products, 0), whole, rest, WIDTH))
-    growth = 0.0
-    for i in range(D):
-        largest, size = 0.0, 1.0
-        for k in range(D):
-            value = products[WIDTH, i, k]
-            inverse[i, k] = 1.0 if i == k else 0.0
-            closure[i, k] = inverse[i, k] - value
-            largest = max(largest, abs(closure[i, k]))
-            size += abs(value)
-        growth = max(growth, size)
-        if not largest > ROUND_OFF * size:
-            return SINGULAR
+    product = products[WIDTH]
+    _set_identity(inverse)
+    regular, growth = solve_closure(product, inverse, closure)
+    if not regular or growth > LARGEST_GROWTH:
+        _set_identity(inverse)
+        regular, growth = close_balanced(product, inverse, closure, work.scale)
     if growth > LARGEST_GROWTH:
         return NEEDS_EXCHANGE
-    return CONVERGED if eliminate(closure, inverse, ROUND_OFF) else SINGULAR
+    return CONVERGED if regular else SINGULAR
+
+
+@jit
+def _set_identity(matrix):
+    for i in range(matrix.shape[0]):
+        for k in range(matrix.shape[1]):
+            matrix[i, k] = 1.0 if i == k else 0.0
 
 
 @jit

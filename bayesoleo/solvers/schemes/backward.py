@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.solvers.schemes import sparse
-from bayesoleo.solvers.schemes.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
+from bayesoleo.solvers.schemes.closure import close_and_sweep
+from bayesoleo.solvers.schemes.elimination import eliminate_each, eliminate_together, jit
 from bayesoleo.solvers.schemes.unrolled import program as unrolled
 
 Array = NDArray[np.float64]

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesoleo.compiled import BLOCK as POINTS
-from bayesoleo.solvers.schemes.sweep import close_and_sweep, eliminate_each, eliminate_together, jit
+from bayesoleo.solvers.schemes.closure import close_and_sweep
+from bayesoleo.solvers.schemes.elimination import eliminate_each, eliminate_together, jit
 
 
 @jit

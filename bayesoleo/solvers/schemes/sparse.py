@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from bayesoleo.solvers.schemes.sweep import LARGEST_GROWTH
+from bayesoleo.solvers.schemes.closure import LARGEST_GROWTH, balance
 from bayesoleo.solvers.schemes.tableau import Tableau
 
 Array = NDArray[np.float64]
@@ -29,7 +29,11 @@ SMALLEST_PIVOT = 1e-13
 def needs_factorisation(ok: bool, monodromy: Array) -> bool:
     """Whether what a sweep made of a lane cannot be used: it failed, or too many digits were lost
     in its ``monodromy (D, D)``."""
-    return not (ok and np.abs(monodromy).sum(axis=1).max() < LARGEST_GROWTH)
+    if not ok or np.abs(monodromy).sum(axis=1).max() < LARGEST_GROWTH:
+        return not ok
+    balanced = monodromy.copy()
+    balance(balanced, balanced.shape[0], np.empty(balanced.shape[0]))
+    return not np.abs(balanced).sum(axis=1).max() < LARGEST_GROWTH
 
 
 def solve(matrix: csc_array, right: Array) -> Array | None:

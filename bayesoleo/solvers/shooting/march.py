@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.schemes.sweep import jit
+from bayesoleo.solvers.schemes.elimination import jit
 from bayesoleo.solvers.shooting.inner import inner
 from bayesoleo.solvers.shooting.march_start import first_sizes, is_inside, starts
 from bayesoleo.solvers.shooting.march_step import (

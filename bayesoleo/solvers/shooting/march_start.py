@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.solvers.schemes.sweep import eliminate
+from bayesoleo.solvers.schemes.elimination import eliminate
 from bayesoleo.solvers.shooting.inner import evaluate, inner
 from bayesoleo.solvers.shooting.signals import rows_at
 

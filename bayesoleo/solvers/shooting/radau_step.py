@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from bayesoleo.compiled import BLOCK
-from bayesoleo.solvers.schemes.sweep import eliminate
+from bayesoleo.solvers.schemes.elimination import eliminate
 from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.shooting.inner import evaluate, inner
 

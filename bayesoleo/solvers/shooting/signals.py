@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.schemes.sweep import jit
+from bayesoleo.solvers.schemes.elimination import jit
 
 Array = NDArray[np.float64]
 

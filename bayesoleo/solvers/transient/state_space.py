@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.solvers.schemes.sweep import eliminate, jit
+from bayesoleo.solvers.schemes.elimination import eliminate, jit
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

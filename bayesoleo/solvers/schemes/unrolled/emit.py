@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bayesoleo.compiled import BLOCK
-from bayesoleo.solvers.schemes.sweep import SMALL_PIVOT
+from bayesoleo.solvers.schemes.elimination import SMALL_PIVOT
 
 #: Chunks of a period that are swept side by side.
 WIDTH = 8

@@ -1,9 +1,6 @@
-"""Compiled linear algebra of one Newton step: small blocks, one forward sweep, a periodic closure.
+"""Compiled elimination of small systems: one with exchange of rows, many at once without.
 
-Each step of the mesh maps the state at its left end to that at its right end. Eliminating a step's
-own unknowns leaves ``delta_{m+1} = M_m delta_m + r_m``; the product of all ``M_m`` closes the
-period with one small system (Verbeek 1993, section 4.3.1, with one state in place of three past
-blocks). Compiled once for every model: the sizes are run-time numbers.
+Compiled once for every model: the sizes are run-time numbers.
 """
 
 from __future__ import annotations
@@ -12,13 +9,6 @@ import numba
 import numpy as np
 
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
-
-
-#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of
-#: what cancels.
-ROUND_OFF = 1e-12
-#: Growth of the recursion over a period beyond which half of the digits are lost.
-LARGEST_GROWTH = 1e8
 
 
 @jit
@@ -131,56 +121,4 @@ def eliminate_each(work, count, m):
         for i in range(m):
             for j in range(m, width):
                 work[i, j, t] = right[i, j - m]
-    return True
-
-
-@jit
-def close_and_sweep(transfer, monodromy, states, initial):
-    """Close the period and run through it once more.
-
-    Parameters: ``transfer (D, D + k, n)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is
-    the product of all ``M_m`` and ``states (D, k, n)`` the solution at the nodes. With ``initial``
-    true the first state is held (an initial value problem) instead of being closed. Returns False
-    if the closure is singular.
-    """
-    D, width, n = transfer.shape
-    k = width - D
-    product, following = np.zeros((D, width)), np.empty((D, width))
-    for i in range(D):
-        product[i, i] = 1.0
-    for m in range(n):
-        for i in range(D):
-            for j in range(width):
-                total = transfer[i, j, m] if j >= D else 0.0
-                for other in range(D):
-                    total += transfer[i, other, m] * product[other, j]
-                following[i, j] = total
-        product, following = following, product
-    closure, state = np.empty((D, D)), np.zeros((D, k))
-    for i in range(D):
-        for j in range(D):
-            monodromy[i, j] = product[i, j]
-            closure[i, j] = (1.0 if i == j else 0.0) - product[i, j]
-    if not initial:
-        for i in range(D):
-            largest, size = 0.0, 1.0
-            for j in range(D):
-                largest = max(largest, abs(closure[i, j]))
-                size += abs(monodromy[i, j])
-            if not (largest > ROUND_OFF * size):
-                return False
-            for j in range(k):
-                state[i, j] = product[i, D + j]
-        if not eliminate(closure, state, ROUND_OFF):
-            return False
-    for i in range(D):
-        for j in range(k):
-            states[i, j, 0] = state[i, j]
-    for m in range(n - 1):
-        for i in range(D):
-            for j in range(k):
-                total = transfer[i, D + j, m]
-                for other in range(D):
-                    total += transfer[i, other, m] * states[other, j, m]
-                states[i, j, m + 1] = total
     return True
