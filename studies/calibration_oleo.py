@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesoleo import LogNormal, Model, Normal, driven_by, system
 from bayesoleo.effects import Scales, find_effect
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.model.correlated import sample_of
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
 from bayesoleo.systems.verbeek import SHAKER_RUNS
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 #: volume drawn from its prior might not suffice.
 RUNS = ("g", "h", "i", "l")
 PERIODS, PER_PERIOD, STEPS = 2, 100, 96
+#: Parameters that are estimated.
+PARAMETERS = 7
 #: Noise of a sample, SI.
 NOISE = {"force": 20.0, "pressure": 4000.0}
 #: Standard deviations of the priors over their values.
@@ -111,6 +114,21 @@ def extended(effect: str) -> Simulator:
     """The model with an effect that is not declared."""
     model, found = oleo(), find_effect(effect)
     return Simulator.of(found.extend(model, found.places(model)[0], _SCALES).model)
+
+
+def generator(seed: int, number: int) -> np.random.Generator:
+    """All that is random in a replication."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+
+
+def drawn(rng: np.random.Generator) -> tuple[Array, tuple[Array, ...]]:
+    """Parameters from their prior that have an answer, and the outputs."""
+    simulator = declared()
+    while True:
+        theta = sample_of(simulator.problem.priors, rng, 1)[0]
+        outputs = simulator.outputs(theta)
+        if outputs is not None:
+            return theta, outputs
 
 
 def noisy(outputs: tuple[Array, ...], sd: Mapping[str, float], rng: np.random.Generator):
