@@ -1,4 +1,4 @@
-"""Branches of a model's periodic answers, and the limit cycles of a model without input.
+"""Branches of a model's periodic answers.
 
 What a single solve does not show: that there are other answers to the same motion, where two of
 them meet and vanish, and which of them a rig can be on.
@@ -6,26 +6,23 @@ them meet and vanish, and which of them a rig can be on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels, kernels
 from bayesoleo.prediction.records import Harmonics
 from bayesoleo.prediction.simulate import RunPlan
-from bayesoleo.solvers.branches.autonomous import LimitCycle, solve_limit_cycle
 from bayesoleo.solvers.branches.follow import Branch, BranchPoint, follow
 from bayesoleo.solvers.periodic.continuation import solve_from_guess
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME, scheme
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.transient.state_space import StateSpace
 
 Array = NDArray[np.float64]
 
@@ -34,8 +31,6 @@ FREQUENCY, AMPLITUDE = "frequency", "amplitude"
 UNITS = {FREQUENCY: "Hz", AMPLITUDE: ""}
 #: Steps of the longest kind after which a branch that does not leave its span is given up.
 MOST = 40
-#: Of the motion towards a limit cycle, which only has to start Newton's method.
-RELATIVE_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +194,7 @@ class _Answers:
         )
         return cls(
             compiled,
-            _collocation(scheme_name, derived.orders),
+            collocation_scheme(scheme_name, derived.orders),
             plan,
             along,
             np.array([known[name] for name in derived.constants]),
@@ -246,111 +241,14 @@ class _Answers:
         return y[0, derived.outputs.index(name)]
 
 
-def limit_cycle(
-    model: Model,
-    start: Mapping[str, float],
-    settle: float,
-    values: Mapping[str, float] | None = None,
-    *,
-    period: float | None = None,
-    steps: int = 512,
-    scheme_name: str = DEFAULT_SCHEME,
-    backend: str = "numpy",
-) -> LimitCycle:
-    """The limit cycle to which a motion settles, or near which it starts, with inputs at zero.
-
-    Parameters
-    ----------
-    model : Model
-    start : mapping of str to float
-        Where dofs start; those not given at zero. ``dot(x)`` is the velocity of a second-order dof.
-    settle : float
-        Time after which the motion is near the cycle, s; at least a few periods.
-    values : mapping of str to float, optional
-        Parameters that are not at their nominal value.
-    period : float, optional
-        Of an unstable cycle, about, s: nothing settles to it. The motion over that time from where
-        it is after ``settle`` then begins the iteration.
-    steps : int
-        Of the mesh.
-    scheme_name : str
-        A collocation scheme.
-    backend : {"numpy", "numba"}
-
-    Returns
-    -------
-    LimitCycle
-        With its period, multipliers, and the period's derivatives by the estimated parameters.
+def collocation_scheme(name: str, orders: tuple[int, ...]) -> Collocation:
+    """A scheme by its name, if it is one of one step.
 
     Raises
     ------
     InputError
-        If a dof is unknown, or the motion does not come back after the settling time.
+        If it is not.
     """
-    compiled = kernels(model, model.estimated(), backend)
-    derived = compiled.derived
-    known = {str(item): value for item, value in model.nominal().items()} | dict(values or {})
-    p = np.array([known[name] for name in derived.constants])
-    method, nu = _collocation(scheme_name, derived.orders), len(derived.inputs)
-    space = StateSpace(
-        compiled, derived.orders, lambda t: np.zeros((nu, t.size)), len(derived.active)
-    )
-    names = [
-        dof if k == 0 else f"dot({dof})"
-        for dof, order in zip(derived.dofs, derived.orders, strict=True)
-        for k in range(order)
-    ]
-    for name in start:
-        if name not in names:
-            raise InputError("no such dof", key=name, hint=f"there are {', '.join(names)}")
-    state = np.array([start.get(name, 0.0) for name in names])
-    problem = Boundary(
-        compiled, method, 1.0, np.zeros((nu, method.phases(steps).size)), 0, len(derived.active)
-    )
-    way = _motion(space, p, state, settle, period, model.name)
-    begin, length = (settle, period) if period else _last_turn(way, settle, model.name)
-
-    def rows(phase: Array) -> Array:
-        times = begin + length * phase
-        return space.complete(times, way(times)[None], p[None])[0]
-
-    nodes, points = np.arange(steps) / steps, method.phases(steps)
-    x = method.from_motion(rows(nodes), rows(points))[0]
-    return solve_limit_cycle(problem, p, x, length)
-
-
-def _motion(
-    space: StateSpace, p: Array, s: Array, settle: float, period: float | None, name: str
-) -> Callable[[Array], Array]:
-    """States ``(D, N)`` at times up to a period after settling, or twice as long."""
-    end = settle + period if period else 2 * settle
-    options = {"rtol": RELATIVE_TOLERANCE, "atol": RELATIVE_TOLERANCE * (1.0 + np.abs(s).max())}
-    way = solve_ivp(
-        space.right_side(p), (0.0, end), s, method="LSODA", dense_output=True, **options
-    )
-    if not way.success:
-        raise InputError(f"model {name!r}: the motion cannot be computed", value=way.message)
-    motion: Callable[[Array], Array] = way.sol
-    return motion
-
-
-def _last_turn(way: Callable[[Array], Array], settle: float, name: str) -> tuple[float, float]:
-    """Beginning and length of the last turn of a motion."""
-    fine = np.linspace(settle, 2 * settle, 4000)
-    first = way(fine)[0]
-    above = first - 0.5 * (first.max() + first.min())
-    rising = np.flatnonzero((above[:-1] < 0) & (above[1:] >= 0))
-    if np.ptp(first) <= 1e-6 * (1.0 + np.abs(first).max()) or rising.size < 2:
-        raise InputError(
-            f"model {name!r}: the motion does not come back",
-            key="settle",
-            value=settle,
-            hint="give a longer time, or another start",
-        )
-    return float(fine[rising[-2]]), float(fine[rising[-1]] - fine[rising[-2]])
-
-
-def _collocation(name: str, orders: tuple[int, ...]) -> Collocation:
     method = scheme(name, orders)
     if not isinstance(method, Collocation):
         raise InputError(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bayesoleo.errors import InputError
-from bayesoleo.prediction.branch import follow_branch, limit_cycle
+from bayesoleo.prediction.branch import follow_branch
+from bayesoleo.prediction.limit_cycle import limit_cycle
 from bayesoleo.prediction.simulate import RunPlan, motion
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system

@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.model import driven_by
 from bayesoleo.model.expressions import derivative_symbol, symbol
-from bayesoleo.prediction.branch import follow_branch, limit_cycle
+from bayesoleo.prediction.branch import follow_branch
+from bayesoleo.prediction.limit_cycle import limit_cycle
 from bayesoleo.prediction.orbit import periodic_answer
 from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
 from bayesoleo.systems import system, systems
