@@ -17,6 +17,7 @@ from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.base import Base, replicate
 from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.masked import weights
 from bayesoleo.tracing.projection import squared_distance
 from bayesoleo.tracing.robust import clustered_variance
 from bayesoleo.tracing.score import Score
@@ -29,9 +30,9 @@ Array = NDArray[np.float64]
 PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
-#: Two effects explain the data equally well if what they leave differs by less than this factor, or
-#: if the data are less than a hundred times as likely by the one as by the other.
-AS_WELL, AS_LIKELY = 1.25, 2.0 * float(np.log(100.0))
+#: Two effects explain the data equally well if the data are less than a hundred times as likely by
+#: the one as by the other; where more than noise is left, if that differs by less than this factor.
+AS_LIKELY, AS_WELL = 2.0 * float(np.log(100.0)), 1.25
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class Refit:
         Degrees of freedom that it was measured with; zero where it is the score's.
     fall : float
         Of the weighted sum of squares.
+    reached : bool
+        Whether noise alone could leave what it leaves.
     """
 
     score: Score
@@ -69,22 +72,28 @@ class Refit:
     inflation: float
     freedom: int
     fall: float
+    reached: bool
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot tell two estimated effects apart.
 
-        They hardly can where both do nearly the same. Where an effect is small against the noise,
-        effects that do different things may be as likely (Burnham and Anderson 2002, section 2.6).
+        Where both come down to the noise, the noise says how sure a difference is: effects may do
+        different things and be as likely, if they are small (Burnham and Anderson 2002, section
+        2.6), and nearly the same and not, if they are large. Where more is left a likelihood
+        promises too much, and effects that do nearly the same are not told apart.
         """
+        if not (np.isfinite(self.share) and np.isfinite(other.share)):
+            return False
+        # Each unknown lowers the sum by one on average if it does nothing.
+        gap = (self.fall - self.size) - (other.fall - other.size)
+        if abs(gap) < AS_LIKELY * max(self.inflation, other.inflation):
+            return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
-        if not (np.isfinite(self.share) and np.isfinite(other.share)) or lengths == 0:
+        if (self.reached and other.reached) or lengths == 0:
             return False
         cosine = float(self.contribution @ other.contribution) / float(lengths)
         low, high = sorted((self.remaining, other.remaining))
-        nearly = cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
-        # Each unknown lowers the sum by one on average if it does nothing.
-        gap = (self.fall - self.size) - (other.fall - other.size)
-        return nearly or abs(gap) < AS_LIKELY * max(self.inflation, other.inflation)
+        return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
 
     @property
     def size(self) -> int:
@@ -148,7 +157,10 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     grown = assembly.with_values(fit.shared)
     inflation, freedom = _inflation(fit, score)
     fall = share * base.fall_back
-    return Refit(score, grown, fit, share, contribution, remaining, inflation, freedom, fall)
+    reached = base.excess - fall < base.feigned
+    return Refit(
+        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached
+    )
 
 
 def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
@@ -193,7 +205,7 @@ def _stretches(
 ) -> tuple[Array, Array, Array]:
     """By new unknown and stretch: pull ``a @ r``, ``a @ a`` and ``a @ J``, in noise units."""
     unit = np.sqrt(fit.point.variance)[:, None]
-    columns = predicted.sensitivity[:, free] / unit[:, None]
+    columns = predicted.sensitivity[:, free] / unit[:, None] * weights(run.record)
     influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
     residual = (run.measured - predicted.y) / unit
     edges = np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1])

@@ -254,8 +254,7 @@ def _only_varies(item: Ranked, refits: dict[int, Refit], base: Base) -> bool:
     price = float(np.log(sum(run.residual.size for run in base.runs)))
     physics = [r for r in refits.values() if r.score.option.candidate.family != RUN_TO_RUN]
     worth = max((r.fall - price * r.size for r in physics), default=0.0)
-    reached = base.excess - own.fall < base.feigned
-    return not (reached and own.fall - price * own.size > worth)
+    return not (own.reached and own.fall - price * own.size > worth)
 
 
 def _choose(
