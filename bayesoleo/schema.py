@@ -32,6 +32,7 @@ POSTERIOR_PREDICTIVE: Final = "posterior_predictive"
 RESIDUAL: Final = "residual"
 PREDICTION: Final = "prediction"
 DISCOVERY: Final = "discovery"
+UNNAMED: Final = "unnamed"
 SAMPLING_DISTRIBUTION: Final = "sampling_distribution"
 INDIFFERENCE: Final = "indifference"
 PROFILE: Final = "profile"
@@ -55,6 +56,7 @@ GROUPS: Final = (
     RESIDUAL,
     PREDICTION,
     DISCOVERY,
+    UNNAMED,
     SAMPLING_DISTRIBUTION,
     INDIFFERENCE,
     PROFILE,

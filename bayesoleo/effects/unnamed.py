@@ -100,6 +100,13 @@ def tensor(bases: Sequence[Array]) -> Array:
     return found
 
 
+@dataclass(frozen=True)
+class UnnamedEffect(Effect):
+    """An effect that remembers of which function it is made."""
+
+    spline: Spline | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Spline:
     """A smooth function of one or two quantities, in a balance.
@@ -137,11 +144,11 @@ class Spline:
         found: Array = self.weights.T @ tensor(parts)
         return found
 
-    def effect(self) -> Effect:
+    def effect(self) -> UnnamedEffect:
         """The effect, to be estimated like any other."""
         size = self.weights.shape[1]
         unit = "force"
-        return Effect(
+        return UnnamedEffect(
             id=self.id,
             family=FAMILY,
             title=f"Unnamed: a smooth function of {self.quantities}",
@@ -154,6 +161,7 @@ class Spline:
             change=self._add,
             source="de Boor (1978), A Practical Guide to Splines",
             applies_to="the model that it was found for",
+            spline=self,
         )
 
     def _add(self, model: Model, target: str, names: Names) -> Model:

@@ -29,6 +29,7 @@ from bayesoleo.plots.sensitivities import sensitivity
 from bayesoleo.plots.traces import trace
 from bayesoleo.plots.trajectories import trajectory
 from bayesoleo.plots.units import Scale, engineering, format_unit, format_value
+from bayesoleo.plots.unnamed_shapes import unnamed_shape
 
 __all__ = [
     "Scale",
@@ -59,5 +60,6 @@ __all__ = [
     "sensitivity",
     "trace",
     "trajectory",
+    "unnamed_shape",
     "whereabouts",
 ]

@@ -102,7 +102,10 @@ def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, An
             "reason": sentences.reason(entry),
             "table": tables.candidates(entry) if entry["candidates"] else None,
             "failed": tables.failed(entry),
-            "figures": sections.ranking_figure(tree, number),
+            "figures": [
+                *sections.ranking_figure(tree, number),
+                *sections.unnamed_figure(tree, entry),
+            ],
         }
 
 

@@ -131,6 +131,19 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
     return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 
 
+def unnamed_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
+    """The shape of an effect without a name, in the round that added it."""
+    if schema.UNNAMED not in tree.children:
+        return []
+    if entry["accepted"] != tree[schema.UNNAMED].attrs["effect"]:
+        return []
+    caption = (
+        "The effect that has no name: what it adds to the balance, beside all that the model's own "
+        "terms do, with its 95 % band. Beyond the range shown nothing is known of it."
+    )
+    return _drawn([(lambda: plots.unnamed_shape(tree), caption)])
+
+
 def error_figure(tree: xr.DataTree) -> list[Shown]:
     """The error of each run."""
     caption = (

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.plots.rankings import format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
@@ -25,7 +26,7 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 
 def headline(summary: Mapping[str, Any]) -> str:
     """The verdict as a sentence."""
-    names = summary["effects"]
+    names = [_called(effect) for effect in summary["effects"]]
     found = " and ".join([part for part in (", ".join(names[:-1]), *names[-1:]) if part])
     lacked = "an effect" if len(summary["effects"]) == 1 else "effects"
     if summary["verdict"] == schema.NOTHING_MISSING:
@@ -36,6 +37,11 @@ def headline(summary: Mapping[str, Any]) -> str:
     if found:
         return f"The model lacked {lacked}: {found} added, but an error remains{rest}."
     return f"Something is missing{rest}."
+
+
+def _called(effect: str) -> str:
+    """An effect's id; of one without a name it must not pass for a name."""
+    return f"one without a name ({effect})" if effect.startswith(f"{FAMILY}_") else effect
 
 
 def _unexplained(last: Mapping[str, Any]) -> str:

@@ -82,4 +82,8 @@ def _accepted(number: int, entry: Mapping[str, Any]) -> Text:
     others = added["indistinguishable_from"]
     if others:
         text.append(f"; these data cannot tell it from {', '.join(others)}", style="dim")
+    near = added.get("closest", [])
+    if near:
+        first = f"{near[0]['effect']} (cosine {near[0]['cosine']:.2f})"
+        text.append(f"; it has no name, and is most like {first}", style="dim")
     return text

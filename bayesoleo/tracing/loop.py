@@ -17,7 +17,7 @@ from bayesoleo.tracing.projection import information_beside, squared_distance
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.rounds import Round, examine
 from bayesoleo.tracing.state import State, fit_state
-from bayesoleo.tracing.unnamed_round import with_unnamed
+from bayesoleo.tracing.unnamed_round import unnamed_notes, with_unnamed
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
@@ -131,6 +131,7 @@ def close_loop(
             break
         state = _pruned(outcome.after, roles, numerics, notes, say)
     notes += _warnings(state.fit)
+    notes += unnamed_notes(rounds)
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     if not state.at_floor:
         notes.append(

@@ -20,6 +20,7 @@ from bayesoleo.tracing.holdout import Prediction, predict_fitted
 from bayesoleo.tracing.loop import ClosedLoop
 from bayesoleo.tracing.predictive import PHASES, predictive_group
 from bayesoleo.tracing.rounds import Ranked, Round
+from bayesoleo.tracing.shapes import shape_group
 from bayesoleo.tracing.state import State
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ def predictive_groups(
 def loop_groups(
     loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
 ) -> dict[str, xr.Dataset]:
-    """The groups prediction, residual, discovery and posterior_predictive."""
+    """The groups prediction, residual, discovery, unnamed and posterior_predictive."""
     groups = {
         schema.PREDICTION: _predictions(
             [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
@@ -124,6 +125,9 @@ def loop_groups(
         schema.RESIDUAL: _residuals(loop),
         schema.DISCOVERY: _discovery(loop.rounds),
     }
+    shape = shape_group(loop)
+    if shape is not None:
+        groups[schema.UNNAMED] = shape
     if drawn is not None:
         final, (samples, density) = loop.final, drawn
         groups[schema.POSTERIOR_PREDICTIVE] = predictive_group(

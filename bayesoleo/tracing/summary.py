@@ -77,6 +77,7 @@ def _round(item: Round) -> dict[str, Any]:
 def _candidate(ranked: Ranked) -> dict[str, Any]:
     score, candidate = ranked.score, ranked.score.option.candidate
     expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    near = [{"effect": effect, "cosine": cosine} for effect, cosine in ranked.closest]
     return {
         "effect": candidate.effect,
         "target": candidate.target,
@@ -86,7 +87,7 @@ def _candidate(ranked: Ranked) -> dict[str, Any]:
         "expected": expected | {name: float(value) for name, value in score.shapes.items()},
         "estimated": ranked.refitted,
         "indistinguishable_from": list(ranked.same),
-    }
+    } | ({"closest": near} if near else {})
 
 
 def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, Any]]:

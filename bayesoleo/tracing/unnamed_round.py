@@ -5,22 +5,24 @@ Named effects go first, one after the other. If something is left then, two answ
 what was found so far: the function beside the named effects, and the function *instead* of them. A
 named effect may have been no more than the nearest to what is in the data. The weighted sum of
 squares decides, less the logarithm of the number of averaged values for each unknown (Schwarz
-1978, Annals of Statistics 6(2)); then the runs that were not used, as for every effect.
+1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the runs that
+were not used decide, as for every effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.base import Base
+from bayesoleo.tracing.confirmation import confirmed
 from bayesoleo.tracing.fit import Numerics
 from bayesoleo.tracing.refit import Refit, compare, refit
 from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.rounds import LEVEL, Ranked, Round, confirmed
+from bayesoleo.tracing.rounds import LEVEL, Ranked, Round
 from bayesoleo.tracing.scales import scales_of
 from bayesoleo.tracing.score import Score
 from bayesoleo.tracing.significance import SAME
@@ -31,6 +33,9 @@ from bayesoleo.tracing.unnamed import Search, closest, search
 MOST_UNNAMED = 1
 #: Where no further effect may be added, a function may stand instead of so many or more.
 FEWEST_REPLACED = 2
+#: Named effects stay beside a function only if that is better by this much, which is called very
+#: strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90(430)).
+DECISIVE = 10.0
 #: Functions estimated before one is chosen.
 MOST_TRIED = 3
 
@@ -146,7 +151,8 @@ def _merit(answer: _Answer, reference: Base) -> float:
         return -np.inf
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
     unknowns = len(answer.refit.fit.problem.names)
-    return share * reference.fall_back - unknowns * float(np.log(values))
+    merit = share * reference.fall_back - unknowns * float(np.log(values))
+    return merit + DECISIVE if answer.instead else merit
 
 
 def _accepting(
@@ -163,6 +169,20 @@ def _accepting(
         return outcome, reason
     if answer.instead:
         before = [step.effect.id for step in outcome.before.assembly.steps]
-        reason += f", and stands instead of {' and '.join(before)}, which leave more"
+        reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
     ranking = (item, *outcome.ranking)
     return replace(outcome, ranking=ranking, accepted=item, after=after, reason=reason), reason
+
+
+def unnamed_notes(rounds: Sequence[Round]) -> list[str]:
+    """What is to be said of effects that were added without a name."""
+    found = []
+    for entry in rounds:
+        item = entry.accepted
+        if item is None or item.score.option.candidate.family != FAMILY:
+            continue
+        title = item.score.option.assembly.steps[-1].effect.title
+        near = ", ".join(f"{effect} (cosine {cosine:.2f})" for effect, cosine in item.closest)
+        text = f"{item.effect} is no named effect. {title}, in the balance of {item.target}"
+        found.append(text + (f"; the named ones most like it: {near}" if near else ""))
+    return found
