@@ -99,9 +99,9 @@ figure_pairs = plots.pairs(tree)
 
 # %%
 # The table of every result, ``compare``: the posterior's mean against the estimate, its width
-# against the linearised covariance and against the region's extent, and its skewness. One by one the
-# parameters are as good as normal. Together they are not: the last line compares variances over all
-# directions, and across the narrow ridge, along the best known axis, draws lie wider than its
+# against the linearised covariance and against the region's extent, and its skewness. One by one
+# the parameters are as good as normal. Together they are not: the last line compares variances over
+# all directions, and across the narrow ridge, along the best known axis, draws lie wider than its
 # ellipse, because the ridge is bent.
 
 found = compare(tree)
