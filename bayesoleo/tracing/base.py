@@ -16,6 +16,7 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.errors_table import RunError
 from bayesoleo.tracing.fit import Fit
+from bayesoleo.tracing.masked import counted, weights
 from bayesoleo.tracing.sensitivities import present_constants, sensitivities_of
 
 Array = NDArray[np.float64]
@@ -166,8 +167,8 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
         for entry, value in zip(entries, sigma, strict=True):
-            noise += record.time.size * (entry.noise / value) ** 2
-            excess += record.time.size * (entry.repeating**2 - entry.noise**2) / value**2
+            noise += counted(record) * (entry.noise / value) ** 2
+            excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(run)
     return Base(fit, runs, gram, gradient, noise, excess)
 
@@ -198,7 +199,7 @@ def _run_base(
     unit = np.array([prior.sd for prior in fit.problem.priors])
     own = fit.predictions[r].sensitivity[:, free] * unit[:, None]
     return RunBase.of(
-        np.repeat(1.0 / np.array(sigma), record.time.size),
+        np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
         (run.measured - fit.predictions[r].y).ravel(),
         flat(np.concatenate([own, tolerances], axis=1)),
         flat(input_columns(run, present_constants(fit, r))),

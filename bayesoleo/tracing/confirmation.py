@@ -11,6 +11,7 @@ import numpy as np
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.fit import Numerics
 from bayesoleo.tracing.holdout import crossed
+from bayesoleo.tracing.masked import weights
 from bayesoleo.tracing.refit import Refit
 from bayesoleo.tracing.roles import Roles, in_halves
 from bayesoleo.tracing.state import State, fit_state
@@ -114,9 +115,10 @@ def fall_on_hold_out(before: State, after: State) -> tuple[float, float]:
         from_input = input_columns(predictor.runs[0], p)
         for b, output in enumerate(new.predictor.outputs):
             weight = before.hold_errors.at(output, old.record.label).average.sigma ** -2
-            measured = old.record.samples[output]
-            fall += weight * float(np.sum((measured - old.y[b]) ** 2 - (measured - new.y[b]) ** 2))
-            change = new.y[b] - old.y[b]
+            measured, counts = old.record.samples[output], weights(old.record)
+            squares = (measured - old.y[b]) ** 2 - (measured - new.y[b]) ** 2
+            fall += weight * float(counts @ squares)
+            change = (new.y[b] - old.y[b]) * counts
             variance += 4 * weight * float(change @ change)
             moved = moved + weight * (from_input[b] @ change)
         variance += 4 * float(np.sum(np.square(moved)))

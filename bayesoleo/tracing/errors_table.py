@@ -16,6 +16,7 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.holdout import Prediction
+from bayesoleo.tracing.masked import counted, of_those_counted, weights, without_masked
 
 Array = NDArray[np.float64]
 
@@ -158,9 +159,10 @@ def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
     spread = np.sqrt(np.mean(np.sum(columns**2, axis=1), axis=1))
     entries = []
     for b, output in enumerate(predictor.outputs):
-        residual = record.samples[output] - prediction.y[b]
+        measured = record.samples[output] - prediction.y[b]
+        residual = without_masked(record, measured)
         average = _average(record, residual)
-        rms = float(np.sqrt(np.mean(residual**2)))
+        rms = float(np.sqrt(np.mean(measured[weights(record) > 0] ** 2)))
         entries.append(
             RunError(
                 record.label,
@@ -180,11 +182,13 @@ def _spectrum(
 ) -> NoiseSpectrum | None:
     if not record.periodic or not np.isfinite(residual).all():
         return None
-    return noise_spectrum(residual - average.values, record.periods)
+    # What was bridged does not scatter: as much as is missing has to be made up for.
+    part = counted(record) / record.time.size
+    return noise_spectrum((residual - average.values) / part, record.periods)
 
 
 def _average(record: Record, residual: Array) -> PeriodicAverage | LocalAverage:
     if not record.periodic:
         return local_average(residual)
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    return periodic_average(residual, step, record.frequency)
+    return of_those_counted(record, periodic_average(residual, step, record.frequency))

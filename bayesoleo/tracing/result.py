@@ -18,6 +18,7 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fit import Fit
 from bayesoleo.tracing.holdout import Prediction, predict_fitted
 from bayesoleo.tracing.loop import ClosedLoop
+from bayesoleo.tracing.masked import weights
 from bayesoleo.tracing.predictive import PHASES, predictive_group
 from bayesoleo.tracing.rounds import Ranked, Round
 from bayesoleo.tracing.shapes import shape_group
@@ -182,7 +183,7 @@ def _residuals(loop: ClosedLoop) -> xr.Dataset:
             unit = state.fit.model.outputs[output].unit
             errors = [state.errors.at(output, p.record.label) for p in found]
             data[f"{output}_{stage}"] = _padded(
-                [p.record.samples[output] - p.y[b] for p in found],
+                [_counted(p.record, p.record.samples[output] - p.y[b]) for p in found],
                 rows,
                 unit,
                 f"residual of {output}",
@@ -206,6 +207,11 @@ def _residuals(loop: ClosedLoop) -> xr.Dataset:
         schema.PHASE: np.arange(PHASES) / PHASES,
     }
     return xr.Dataset(data, coords=coords)
+
+
+def _counted(record: Record, residual: Array) -> Array:
+    """A residual without the samples that do not count."""
+    return np.where(weights(record) > 0, residual, np.nan)
 
 
 def _place(loop: ClosedLoop) -> Coordinate | None:

@@ -109,5 +109,6 @@ def _part(record: Record, samples: slice, periods: int, name: str, role: str) ->
         periods=periods,
         time=time,
         samples={channel: values[samples] for channel, values in record.samples.items()},
+        kept=None if record.kept is None else record.kept[samples],
         harmonics=harmonics,
     )

@@ -7,6 +7,7 @@ import numpy as np
 from bayesoleo.effects import Scales
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fit import Fit
+from bayesoleo.tracing.masked import weights
 
 POINTS = 512
 
@@ -38,7 +39,9 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
                     if dof not in run.known_motions():
                         add(dof, values, rates)
     outputs = {
-        name: max(float(np.ptp(run.measured[k])) for run in fit.predictor.runs)
+        name: max(
+            float(np.ptp(run.measured[k][weights(run.record) > 0])) for run in fit.predictor.runs
+        )
         for k, name in enumerate(fit.predictor.outputs)
     }
     periods = [time for record in fit.records for time in _times(record)]

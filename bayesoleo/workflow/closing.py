@@ -7,7 +7,6 @@ from pathlib import Path
 
 import xarray as xr
 
-from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
 from bayesoleo.tracing.experiments.questions import Question, questions_of
 from bayesoleo.tracing.loop import ClosedLoop, close_loop
@@ -82,23 +81,8 @@ def close(
 
 
 def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
-    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
-
-    Raises
-    ------
-    CampaignError
-        If stretches of a run are left out.
-    """
+    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled."""
     settings = task.settings
-    for record in task.reduced.records:
-        if record.kept is not None:
-            raise CampaignError(
-                "the loop compares whole periods, and cannot leave stretches out of one",
-                file=task.campaign.path / "campaign.toml",
-                run=record.label,
-                key="mask",
-                hint="cut the run with start and stop, or estimate and sample only",
-            )
     return close_loop(
         task.assembly,
         task.roles,
