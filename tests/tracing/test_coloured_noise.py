@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from fitted_states import fitted, scored
 from small_campaigns import damper, damper_campaign
 from synthetic_scores import base_of_noise
 
+from bayesoleo.data.noise_spectrum import noise_spectrum
 from bayesoleo.tracing.colour import inflation_of
 from bayesoleo.tracing.significance import corrected_p
 
@@ -56,3 +60,19 @@ def test_noise_of_their_own_is_hardly_inflated():
         found.append(inflation_of(base, [direction])[0])
     # Never below one, and scatter between 60 periods is 18 %, believed once in twenty.
     assert 1.0 <= np.mean(found) < 1.1
+
+
+def test_a_drift_is_not_its_own_noise():
+    """A ramp lies between the harmonics, where noise is measured; what it explains is no noise."""
+    rng, periods, per_period = np.random.default_rng(1), 8, 50
+    base, wave = base_of_noise(rng, shared=False, periods=periods)
+    size = periods * per_period
+    ramp = np.concatenate([np.linspace(-3, 3, size), np.zeros(size)])
+    run = replace(base.runs[0], residual=base.runs[0].residual + ramp)
+    parts = run.residual.reshape(2, periods, per_period)
+    rest = (parts - parts.mean(axis=1, keepdims=True)).reshape(2, size)
+    run = replace(run, spectra=tuple(noise_spectrum(part, periods) for part in rest))
+    record = SimpleNamespace(time=np.arange(size) / per_period, frequency=1.0, periods=periods)
+    drifting = replace(base, runs=[run], fit=SimpleNamespace(records=[record]))
+    assert inflation_of(drifting, [ramp])[0] < 1.6
+    assert inflation_of(drifting, [wave])[0] > 3.0, "to others the drift is noise"

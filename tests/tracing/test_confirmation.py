@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fitted_states import NUMERICS
-from small_campaigns import damper, damper_campaign
+from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
+from bayesoleo.effects import find_effect
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.confirmation import fall_on_hold_out, judged
 from bayesoleo.tracing.holdout import crossed
+from bayesoleo.tracing.loop import close_loop
 from bayesoleo.tracing.roles import assign
 from bayesoleo.tracing.state import fit_state
 
@@ -69,3 +71,29 @@ def test_a_run_that_has_no_halves_is_left_as_it_is(tmp_path):
     _, after = states(tmp_path, 0)
     short = replace(after.held_out[0].record, periods=1)
     assert crossed(replace(after.held_out[0], record=short)) is None
+
+
+#: The strokes of fitted runs end at 10 mm and more, those of runs held out at 8 mm at most.
+STOP_AT = 0.0085
+
+
+def with_stop(stiffness):
+    """A spring and a damper, with a stop that only fitted runs reach."""
+    return lambda x, v, _: plain(x, v, _) + stiffness * np.maximum(x - STOP_AT, 0.0)
+
+
+@pytest.mark.parametrize(("stiffness", "found"), [(200.0, ("end_stop_upper",)), (0.0, ())])
+def test_a_stop_that_runs_held_out_do_not_reach(tmp_path, stiffness, found):
+    """Nobody held out has seen it: the other half of the periods decides, and says so."""
+    runs = [run for run in DAMPER_RUNS if run[3] == "fit"] + list(RUNS[1:])
+    reduced = damper_campaign(tmp_path, with_stop(stiffness), runs=runs, per_period=60.3)
+    loop = close_loop(
+        Assembly(damper(cubic=False)),
+        assign(reduced.records),
+        NUMERICS,
+        effects=[find_effect("end_stop_upper")],
+        unnamed=False,
+    )
+    assert loop.effects == found
+    if found:
+        assert "the second half of fitted ones" in loop.rounds[0].reason

@@ -1,0 +1,85 @@
+"""When two estimated effects are one class, and when what varies by run is taken."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from small_campaigns import damper
+
+from bayesoleo.model.drive import driven_by
+from bayesoleo.model.kernels import kernels
+from bayesoleo.systems import system
+from bayesoleo.tracing.refit import AS_LIKELY, Refit
+from bayesoleo.tracing.rounds import Ranked, _only_varies
+
+ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+NEARLY = np.array([1.0, 0.1])
+
+
+def estimated(fall, *, contribution=ALONG, reached=True, size=1, family="friction"):
+    """An effect after estimation that lowers the sum of squares by so much."""
+    candidate = SimpleNamespace(family=family)
+    score = SimpleNamespace(
+        names=("a",) * size, shapes={}, option=SimpleNamespace(candidate=candidate)
+    )
+    remaining = 100.0 if reached else 1.0e5
+    return Refit(score, None, None, 0.5, contribution, remaining, 1.0, 0, fall, reached)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_at_the_noise_the_likelihood_decides(factor):
+    """Whatever the effects do: a hundred to one is the edge."""
+    best, other = estimated(200.0), estimated(200.0 - factor * AS_LIKELY, contribution=ACROSS)
+    assert best.resembles(other) == other.resembles(best) == (factor < 1)
+    nearly = estimated(200.0 - factor * AS_LIKELY, contribution=NEARLY)
+    assert best.resembles(nearly) == (factor < 1)
+
+
+def test_an_unknown_that_does_nothing_is_no_difference():
+    assert estimated(200.0).resembles(estimated(200.0 + AS_LIKELY + 1.0, size=4))
+
+
+@pytest.mark.parametrize(("contribution", "alike"), [(NEARLY, True), (ACROSS, False)])
+def test_away_from_the_noise_likeness_decides(contribution, alike):
+    """There the likelihood of a wrong model is as sure as it is wrong."""
+    best = estimated(1.0e5, reached=False)
+    other = estimated(9.0e4, reached=False, contribution=contribution)
+    assert best.resembles(other) == alike
+
+
+@pytest.mark.parametrize(
+    ("physics", "reached", "last"),
+    [(50.0, True, False), (190.0, True, True), (50.0, False, True)],
+    ids=["needed", "physics does as well", "not enough"],
+)
+def test_what_varies_by_run_is_taken_where_it_is_needed(physics, reached, last):
+    """Four unknowns, eight thousand samples: it has to be better by 27."""
+    base = SimpleNamespace(runs=[SimpleNamespace(residual=np.zeros(8000))])
+    varies = estimated(200.0, reached=reached, size=4, family="run-to-run")
+    other = estimated(physics)
+    refits = {id(r.score): r for r in (varies, other)}
+    item = Ranked(varies.score, 0.0, 0.5, True, ())
+    assert _only_varies(item, refits, base) == last
+    assert not _only_varies(Ranked(other.score, 0.0, 0.5, True, ()), refits, base)
+
+
+def test_models_of_the_same_equations_share_their_code():
+    """Values of parameters, and whether they are estimated, change no expression."""
+    model = damper()
+    other = model.with_values({"damping": 123.0})
+    assert other.structure == model.structure
+    assert kernels(other, backend="numpy") is kernels(model, backend="numpy")
+    moved = model.with_term("output", "force", "more", "damping*dot(displacement)**3")
+    assert moved.structure != model.structure
+    assert kernels(moved, backend="numpy") is not kernels(model, backend="numpy")
+
+
+def test_a_driven_model_keeps_the_values_of_its_own():
+    """The exchange of channels is remembered by the equations, not with its first values."""
+    native = system("f16n2d2")
+    driven_by(native, "displacement")
+    other = driven_by(native.with_values({"solubility": -2e-8}), "displacement")
+    assert other.parameters["solubility"].value == -2e-8
+    assert driven_by(native, "displacement").parameters == native.parameters
