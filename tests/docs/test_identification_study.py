@@ -1,0 +1,78 @@
+"""The identification study: what counts as right, its table, and a hundredth of its campaigns."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+STUDIES = Path(__file__).resolve().parents[2] / "studies"
+NAMES = ("identification", "identification_rows", "identification_figures")
+ROW: dict[str, Any] = {
+    "effect": "play", "target": "stroke", "factor": 3.0, "replication": 0,
+    "verdict": "effect added",
+    "added": ["play at stroke"], "same": [], "place": 1, "p_value": 1e-9, "ratio": 1.02,
+    "seconds": 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Imports a module of the study."""
+    monkeypatch.syspath_prepend(str(STUDIES))
+    yield import_module
+    for name in NAMES:
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    ("added", "same", "right"),
+    [
+        (["play at stroke"], [], True),
+        (["dahl_friction at stroke"], ["play", "lugre_friction"], True),
+        (["dahl_friction at stroke"], ["play", "lugre_friction", "stribeck_friction"], False),
+        (["play at other"], [], False),
+        (["play at other"], ["play @ stroke"], True),
+        (["dahl_friction at stroke", "play at stroke"], [], False),
+        ([], [], False),
+    ],
+)
+def test_right_is_the_effect_or_a_small_class_with_it(load, added, same, right):
+    rows: ModuleType = load("identification_rows")
+    assert rows.right({**ROW, "added": added, "same": same}) == right
+
+
+def test_the_table_keeps_what_the_figures_need(load, tmp_path, monkeypatch):
+    rows = load("identification_rows")
+    monkeypatch.setattr(rows, "TABLE", tmp_path / "table.json")
+    assert rows.stored() is None
+    plain = {**ROW, "effect": "none", "target": "", "factor": 0.0, "added": [], "p_value": None}
+    strange = {**ROW, "effect": "ripple", "added": ["play at stroke"]}
+    found = [ROW, {**ROW, "replication": 1, "added": []}, plain, strange, {"failed": "no"}]
+    rows.store(found, 10, "command", 0)
+    table = rows.stored()
+    assert (table["planned"], table["failed"], table["seed"]) == (10, 1, 0)
+    kept = [*rows.plain(table["rows"]), *rows.named(table["rows"]), *rows.strange(table["rows"])]
+    assert kept == [plain, ROW, found[1], strange]
+    said = rows.summarise(table["rows"])
+    assert (said["right_at_3x"], said["false_additions"]) == (0.5, 0.0)
+    assert said["outside_named_as_certain"] == 1.0
+    assert said["right_at_10x"] is None
+
+
+@pytest.mark.statistical
+def test_a_hundredth_of_the_campaigns(load):
+    """An even sample: nothing is added where nothing lacks, and what is large is named."""
+    study, rows = load("identification"), load("identification_rows")
+    campaigns = study.planned()
+    found = [study.run(one) for one in campaigns[: round(0.01 * len(campaigns))]]
+    said = rows.summarise(found)
+    assert said["failed"] == 0
+    assert said["false_additions"] == 0
+    assert said["right_at_10x"] == 1
+    assert not said["outside_named_as_certain"]
