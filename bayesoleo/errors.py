@@ -73,9 +73,5 @@ class ResultsError(InputError):
     """A stored result is missing, broken or of another kind than expected."""
 
 
-class NumericalWarning(UserWarning):
-    """A numerical result is usable but deserves a look."""
-
-
 class DataWarning(UserWarning):
     """A record is usable but deserves a look."""

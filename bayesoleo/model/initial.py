@@ -161,8 +161,3 @@ def _typical_size(model: Model, name: str) -> float:
     parsed = parse(guess, {item: symbol(item) for item in known}, model.inputs, where)
     number = parsed.subs(model.nominal())
     return abs(float(number)) if number.is_number and abs(float(number)) > 0 else 1.0
-
-
-def is_start(parameter: str) -> bool:
-    """Whether a parameter is the estimated start of a dof."""
-    return parameter.startswith(START)

@@ -367,15 +367,6 @@ class Model:
         """Add a definition, or redefine the one of that name in place."""
         return replace(self, definitions={**self.definitions, name: expression})
 
-    def with_definition_before(self, before: str, name: str, expression: Text) -> Model:
-        """Insert a definition in front of another that is to use it."""
-        ordered: dict[str, Text] = {}
-        for existing, body in self.definitions.items():
-            if existing == before:
-                ordered[name] = expression
-            ordered[existing] = body
-        return replace(self, definitions=ordered)
-
     def with_dof(self, name: str, dof: Dof, equation: Mapping[str, Text]) -> Model:
         """Add a degree of freedom with its equation."""
         return replace(

@@ -189,13 +189,6 @@ def exact_signal(values: Array, step: float) -> Smoothed:
     return Smoothed(step, np.stack([spline(time, nu=k) for k in range(3)], axis=1))
 
 
-def constant_signal(value: float, duration: float) -> Smoothed:
-    """A signal that stays what it is over a duration in s."""
-    states = np.zeros((2, 3))
-    states[:, 0] = value
-    return Smoothed(duration, states)
-
-
 def _quintic(left: Array, right: Array) -> Array:
     """Coefficients ``(M, 6)`` by rising power on the unit interval, from states at its ends."""
     value, rate, bend = left.T

@@ -3,7 +3,6 @@ runs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -163,9 +162,3 @@ def mode_group(density: LogDensity, mode: Mode, word: str) -> xr.Dataset:
 
 def _about(text: str) -> dict[str, str]:
     return {schema.LONG_NAME: text, schema.UNITS: "unit of each quantity"}
-
-
-def names_of(words: str | Sequence[str]) -> tuple[str, ...]:
-    """Names from a list, or from text with commas between them."""
-    parts = words.split(",") if isinstance(words, str) else list(words)
-    return tuple(part.strip() for part in parts if part.strip())
