@@ -314,13 +314,19 @@ def forecast_text(data: xr.Dataset) -> str:
         Of :func:`predict`.
     """
     level = f"{100 * float(data.attrs['level']):.3g} %"
-    head = ["output", "run", "rms", "expected", "bias", "log score", f"within {level}", "PIT off"]
+    head = ["output", "run", "rms", "expected", "bias", "unit", "log score"]
+    head += [f"within {level}", "PIT off"]
     rows = []
     for output in data[schema.OUTPUT].values:
         for run in data[schema.RUN].values:
             one = {key: float(data[key].sel(output=output, run=run)) for key in _NUMBERS}
-            cells = [f"{one[key]:.3g}" for key in ("rms", "expected_rms", "bias", "log_score")]
-            cells += [f"{100 * one['coverage']:.1f} %", f"{one['pit_distance']:.3f}"]
+            cells = [f"{one[key]:.3g}" for key in ("rms", "expected_rms", "bias")]
+            cells += [str(data[schema.UNIT].sel(output=output).values) or "1"]
+            cells += [
+                f"{one['log_score']:.3g}",
+                f"{100 * one['coverage']:.1f} %",
+                f"{one['pit_distance']:.3f}",
+            ]
             rows.append([str(output), str(run), *cells])
     lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
     for run in data[schema.RUN].values:

@@ -277,7 +277,7 @@ def correlograms(series: Series) -> tuple[Array, Array]:
 
 def assessment_text(data: xr.Dataset) -> str:
     """One line a series; a star marks what chance alone hardly gives."""
-    head = ["output", "run", "rms", "runs z", "skew", "kurt.", "memory", "same phase"]
+    head = ["output", "run", "rms", "unit", "runs z", "skew", "kurt.", "memory", "same phase"]
     head += ["over noise", "outliers", "depends on"]
     rows = []
     for output in data[schema.OUTPUT].values:
@@ -313,6 +313,7 @@ def _cells(one: xr.Dataset, series: int) -> list[str]:
     ratio = number["ratio_to_noise"]
     return [
         f"{number['rms']:.3g}",
+        str(one[schema.UNIT].values) or "1",
         marked(f"{number['runs_z']:.1f}", number["runs_p"]),
         f"{number['skewness']:.2f}",
         marked(f"{number['kurtosis']:.2f}", number["normality_p"]),

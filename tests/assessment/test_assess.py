@@ -43,6 +43,8 @@ def test_right_model_leaves_noise(right):
     np.testing.assert_allclose(found["ratio_to_noise"], 1.0, atol=0.25)
     assert abs(found["same_phase"]).max() < 0.1
     assert "*" not in "".join(str(found).splitlines()[1:-1])
+    head, first = (line.split() for line in str(found).splitlines()[:2])
+    assert first[head.index("unit")] == "N"
 
 
 def test_missing_friction_shows_in_every_test(wrong):

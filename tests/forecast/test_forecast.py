@@ -105,6 +105,8 @@ def test_constants_held_to_a_tolerance_and_runs_of_their_own_widen_it(estimated)
 def test_text_and_figure_have_the_numbers(estimated):
     found = predict(*estimated, runs=["d", "e"], jobs=1)
     assert "within 95 %" in str(found)
+    head, first = (line.split() for line in str(found).splitlines()[:2])
+    assert first[head.index("unit")] == "N"
     assert "200 draws of damper" in str(found)
     assert json.loads(str(found["failed"].values[0])) == {}
     figure = plots.forecast(found.data)
