@@ -30,9 +30,9 @@ Array = NDArray[np.float64]
 PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
-#: Two effects explain the data equally well if the data are less than a hundred times as likely by
-#: the one as by the other; where more than noise is left, if that differs by less than this factor.
-AS_LIKELY, AS_WELL = 2.0 * float(np.log(100.0)), 1.25
+#: Two effects explain the data equally well if the data are less than twenty times as likely by the
+#: one as by the other; where more than noise is left, if that differs by less than this factor.
+AS_LIKELY, AS_WELL = 2.0 * float(np.log(20.0)), 1.25
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,9 @@ class Refit:
         Of the weighted sum of squares.
     reached : bool
         Whether noise alone could leave what it leaves.
+    price : float
+        By which an unknown has to lower the sum to be worth it: the logarithm of the number of
+        samples (Schwarz 1978).
     """
 
     score: Score
@@ -73,6 +76,7 @@ class Refit:
     freedom: int
     fall: float
     reached: bool
+    price: float
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot tell two estimated effects apart.
@@ -84,8 +88,7 @@ class Refit:
         """
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
             return False
-        # Each unknown lowers the sum by one on average if it does nothing.
-        gap = (self.fall - self.size) - (other.fall - other.size)
+        gap = self.worth - other.worth
         if abs(gap) < AS_LIKELY * max(self.inflation, other.inflation):
             return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
@@ -95,10 +98,20 @@ class Refit:
         low, high = sorted((self.remaining, other.remaining))
         return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
 
+    def outdoes(self, other: Score) -> bool:
+        """Whether noise alone is left, and an effect that was only scored explains less of it."""
+        mine, its = (one.fall - self.price * one.size for one in (self.score, other))
+        return self.reached and mine - its > AS_LIKELY * max(self.inflation, other.inflation)
+
     @property
     def size(self) -> int:
         """Number of unknowns that the effect adds."""
-        return len(self.score.names) + len(self.score.shapes)
+        return self.score.size
+
+    @property
+    def worth(self) -> float:
+        """Fall of the sum beyond the price of the unknowns."""
+        return self.fall - self.price * self.size
 
     def excludes_null(self, level: float = 0.975) -> bool:
         """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
@@ -158,8 +171,9 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     inflation, freedom = _inflation(fit, score)
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
+    price = float(np.log(sum(run.residual.size for run in base.runs)))
     return Refit(
-        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached
+        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price
     )
 
 

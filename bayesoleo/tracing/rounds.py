@@ -195,7 +195,7 @@ def _same(
         if own is not None and estimated is not None:
             alike = own.resembles(estimated)
         else:
-            alike = j in group
+            alike = j in group and not (own is not None and own.outdoes(other))
         if alike:
             effect, target = other.option.key
             same_id = effect == scores[k].option.candidate.effect
@@ -241,7 +241,7 @@ def _refit_few(
     return {id(score): result for score, result in zip(chosen, results, strict=True)}
 
 
-def _only_varies(item: Ranked, refits: dict[int, Refit], base: Base) -> bool:
+def _only_varies(item: Ranked, refits: dict[int, Refit]) -> bool:
     """Whether an effect merely lets something vary from run to run, without need.
 
     Much that physics does differs between runs, so a parameter of each run's own takes a part of it
@@ -251,10 +251,19 @@ def _only_varies(item: Ranked, refits: dict[int, Refit], base: Base) -> bool:
     if not item.varies:
         return False
     own = refits[id(item.score)]
-    price = float(np.log(sum(run.residual.size for run in base.runs)))
     physics = [r for r in refits.values() if r.score.option.candidate.family != RUN_TO_RUN]
-    worth = max((r.fall - price * r.size for r in physics), default=0.0)
-    return not (own.reached and own.fall - price * own.size > worth)
+    return not (own.reached and own.worth > max((r.worth for r in physics), default=0.0))
+
+
+def _next(tried: Sequence[Ranked], refits: dict[int, Refit]) -> Ranked:
+    """Of effects by falling gain the best for its unknowns, or the simplest near the best.
+
+    What an unknown is worth is known where only noise is left.
+    """
+    if refits[id(tried[0].score)].reached:
+        return max(tried, key=lambda one: refits[id(one.score)].worth)
+    near = [one for one in tried if one.gain >= max(tried[0].gain, 0.0) - AS_GOOD]
+    return min(near, key=lambda one: refits[id(one.score)].size)
 
 
 def _choose(
@@ -267,15 +276,13 @@ def _choose(
     say: Say,
 ) -> tuple[Ranked | None, State | None, str]:
     """The best effect that the runs not used confirm."""
-    last = {id(r): _only_varies(r, refits, base) for r in ranking if r.refitted}
+    last = {id(r): _only_varies(r, refits) for r in ranking if r.refitted}
     tried = sorted(
         (item for item in ranking if item.refitted), key=lambda item: (last[id(item)], -item.gain)
     )
     reasons = []
     while tried:
-        level = max(tried[0].gain, 0.0) - AS_GOOD
-        near = [one for one in tried if one.gain >= level and last[id(one)] == last[id(tried[0])]]
-        item = min(near, key=lambda one: refits[id(one.score)].size)
+        item = _next([one for one in tried if last[id(one)] == last[id(tried[0])]], refits)
         tried.remove(item)
         after, reason = confirmed(state, item, refits[id(item.score)], roles, numerics, say)
         if after is not None:

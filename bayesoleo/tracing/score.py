@@ -81,6 +81,11 @@ class Score:
     freedom: int = 0
 
     @property
+    def size(self) -> int:
+        """Number of unknowns that the effect adds, shapes included."""
+        return len(self.names) + len(self.shapes)
+
+    @property
     def statistic(self) -> float:
         """Chi-square statistic with ``rank`` degrees of freedom, corrected for coloured noise."""
         return self.fall / self.inflation

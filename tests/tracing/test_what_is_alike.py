@@ -16,29 +16,40 @@ from bayesoleo.tracing.rounds import Ranked, _only_varies
 
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 NEARLY = np.array([1.0, 0.1])
+#: Of an unknown, with eight thousand samples.
+PRICE = float(np.log(8000))
 
 
 def estimated(fall, *, contribution=ALONG, reached=True, size=1, family="friction"):
     """An effect after estimation that lowers the sum of squares by so much."""
     candidate = SimpleNamespace(family=family)
     score = SimpleNamespace(
-        names=("a",) * size, shapes={}, option=SimpleNamespace(candidate=candidate)
+        fall=fall, size=size, inflation=1.0, option=SimpleNamespace(candidate=candidate)
     )
     remaining = 100.0 if reached else 1.0e5
-    return Refit(score, None, None, 0.5, contribution, remaining, 1.0, 0, fall, reached)
+    return Refit(score, None, None, 0.5, contribution, remaining, 1.0, 0, fall, reached, PRICE)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_at_the_noise_the_likelihood_decides(factor):
-    """Whatever the effects do: a hundred to one is the edge."""
+    """Whatever the effects do: twenty to one is the edge."""
     best, other = estimated(200.0), estimated(200.0 - factor * AS_LIKELY, contribution=ACROSS)
     assert best.resembles(other) == other.resembles(best) == (factor < 1)
     nearly = estimated(200.0 - factor * AS_LIKELY, contribution=NEARLY)
     assert best.resembles(nearly) == (factor < 1)
 
 
-def test_an_unknown_that_does_nothing_is_no_difference():
-    assert estimated(200.0).resembles(estimated(200.0 + AS_LIKELY + 1.0, size=4))
+def test_a_superset_that_gains_nothing_is_no_rival():
+    """An offset of each run explains what a constant force does; nobody needs it for that."""
+    assert not estimated(200.0).resembles(estimated(200.0, size=4))
+    assert estimated(200.0).resembles(estimated(200.0 + 3 * PRICE, size=4))
+
+
+@pytest.mark.parametrize(
+    ("fall", "reached", "out"), [(150, True, True), (199, True, False), (150, False, False)]
+)
+def test_what_was_only_scored_is_outdone_where_noise_is_left(fall, reached, out):
+    assert estimated(200.0, reached=reached).outdoes(estimated(float(fall)).score) == out
 
 
 @pytest.mark.parametrize(("contribution", "alike"), [(NEARLY, True), (ACROSS, False)])
@@ -56,13 +67,12 @@ def test_away_from_the_noise_likeness_decides(contribution, alike):
 )
 def test_what_varies_by_run_is_taken_where_it_is_needed(physics, reached, last):
     """Four unknowns, eight thousand samples: it has to be better by 27."""
-    base = SimpleNamespace(runs=[SimpleNamespace(residual=np.zeros(8000))])
     varies = estimated(200.0, reached=reached, size=4, family="run-to-run")
     other = estimated(physics)
     refits = {id(r.score): r for r in (varies, other)}
     item = Ranked(varies.score, 0.0, 0.5, True, ())
-    assert _only_varies(item, refits, base) == last
-    assert not _only_varies(Ranked(other.score, 0.0, 0.5, True, ()), refits, base)
+    assert _only_varies(item, refits) == last
+    assert not _only_varies(Ranked(other.score, 0.0, 0.5, True, ()), refits)
 
 
 def test_models_of_the_same_equations_share_their_code():
