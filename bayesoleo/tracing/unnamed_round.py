@@ -19,7 +19,7 @@ import numpy as np
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.base import Base
 from bayesoleo.tracing.confirmation import confirmed
-from bayesoleo.tracing.fit import Numerics
+from bayesoleo.tracing.fit import Fit, Numerics
 from bayesoleo.tracing.refit import Refit, compare, refit
 from bayesoleo.tracing.roles import Roles
 from bayesoleo.tracing.rounds import LEVEL, Ranked, Round
@@ -99,10 +99,13 @@ def with_unnamed(
         reference = origin.base()
         again = search(reference, origin.assembly, numerics.jobs)
         chances.append(_Chance(origin, reference, again, first, True))
-    reasons = [outcome.reason]
+    reasons, common = [outcome.reason], chances[-1].base
+    # What was found so far competes too: a function that explains less does not replace it.
+    present = _worth(state.fit, common)
     for k in range(MOST_TRIED):
         answers = [item for chance in chances for item in chance.answers(k, numerics)]
-        for answer in sorted(answers, key=lambda item: -_merit(item, chances[-1].base)):
+        answers = [item for item in answers if _merit(item, common) > present]
+        for answer in sorted(answers, key=lambda item: -_merit(item, common)):
             accepted, reason = _accepting(outcome, answer, roles, numerics, say)
             if accepted.accepted is not None:
                 return accepted
@@ -145,14 +148,18 @@ class _Chance:
 
 
 def _merit(answer: _Answer, reference: Base) -> float:
+    """What a function is worth; one that stands instead of names needs none of them."""
+    merit = _worth(answer.refit.fit, reference)
+    return merit + DECISIVE if answer.instead else merit
+
+
+def _worth(fit: Fit, reference: Base) -> float:
     """Fall of the weighted sum of squares from a common model, less the price of the unknowns."""
-    share, _ = compare(reference, answer.refit.fit)
+    share, _ = compare(reference, fit)
     if not np.isfinite(share):
         return -np.inf
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
-    unknowns = len(answer.refit.fit.problem.names)
-    merit = share * reference.fall_back - unknowns * float(np.log(values))
-    return merit + DECISIVE if answer.instead else merit
+    return share * reference.fall_back - len(fit.problem.names) * float(np.log(values))
 
 
 def _accepting(
