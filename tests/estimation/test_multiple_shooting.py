@@ -190,7 +190,7 @@ def test_bad_input_is_named():
     model, record = system("lorenz"), chaos.record(0)
     with pytest.raises(InputError, match=r"no such estimator.*use mbe, be, gauss-newton"):
         multiple_shooting(model, [record], "mve", backend="numpy")
-    with pytest.raises(InputError, match=r"one number per unknown.*sigma, rho, beta"):
+    with pytest.raises(InputError, match=r"one finite number per unknown.*sigma, rho, beta"):
         multiple_shooting(model, [record], start=[1.0], backend="numpy")
     other = transient_record("r", chaos.time, {"w": chaos.clean[0]})
     with pytest.raises(InputError, match=r"no output of model 'rossler' was measured.*x, y, z"):

@@ -98,7 +98,7 @@ def estimate(
     """
     _check_samples(problem)
     scale = PriorScale.of(problem.priors, problem.names)
-    begin = checked_start(problem, scale, problem.start if start is None else start)
+    begin = checked_start(problem.names, scale, problem.start if start is None else start)
     wanted = objective_of(problem, objective, error_covariance)
     limits = _Limits(tolerance, max_iterations, resolution, bias_corrected, progress)
     found: list[PointEstimate] = []
@@ -207,7 +207,7 @@ def _check_samples(problem: Problem) -> None:
             raise InputError("there is no sample to estimate from", column=name)
 
 
-def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Array:
+def checked_start(names: Sequence[str], scale: PriorScale, start: ArrayLike) -> Array:
     """The start as an array, or an :class:`InputError` that names what does not fit."""
     theta = np.array(start, dtype=float)
     if theta.shape != scale.mean.shape or not np.isfinite(theta).all():
@@ -215,10 +215,10 @@ def checked_start(problem: Problem, scale: PriorScale, start: ArrayLike) -> Arra
             "start must be one finite number per unknown",
             key="start",
             value=theta.tolist(),
-            hint=f"the unknowns are {', '.join(problem.names)}",
+            hint=f"the unknowns are {', '.join(names)}",
         )
     inside = scale.inside(theta)
-    columns = (problem.names, theta, scale.low, scale.high, inside)
+    columns = (names, theta, scale.low, scale.high, inside)
     for name, value, low, high, fits in zip(*columns, strict=True):
         if not fits:
             raise InputError(

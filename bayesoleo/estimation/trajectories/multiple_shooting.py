@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesoleo.errors import InputError
+from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
 from bayesoleo.estimation.objectives.linearise import inverse_gram
@@ -189,7 +190,8 @@ def multiple_shooting(
     meshes = [record.time.size - 1 if steps is None else steps for record in records]
     problem = ShootingProblem.of(model, records, meshes, interval, scheme, backend)
     scale = PriorScale.of(problem.priors, problem.names)
-    begin = _checked(scale, problem, problem.layout.start(model) if start is None else start)
+    given = problem.layout.start(model) if start is None else start
+    begin = checked_start(problem.names, scale, given)
     x = [run.start(problem.constants(begin, r)) for r, run in enumerate(problem.runs)]
     options: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations}
     outcome = iterate(problem, method, begin, x, None, **options)
@@ -203,18 +205,6 @@ def multiple_shooting(
         if not outcome.status.ok or shift <= LARGEST_SHIFT:
             break
     return _summary(problem, method, begin, outcome, shift)
-
-
-def _checked(scale: PriorScale, problem: ShootingProblem, start: ArrayLike) -> Array:
-    theta = np.array(start, dtype=float)
-    if theta.shape != scale.mean.shape or not scale.inside(theta).all():
-        raise InputError(
-            "start must be one number per unknown, inside its prior's support",
-            key="start",
-            value=theta.tolist(),
-            hint=f"the unknowns are {', '.join(problem.names)}",
-        )
-    return theta
 
 
 def _again(

@@ -178,5 +178,5 @@ def _checked_starts(
 ) -> Array:
     begin = np.asarray(problem.start if start is None else start, dtype=float)
     if begin.ndim == 2 and len(begin) == count:
-        return np.stack([checked_start(problem, scale, row) for row in begin])
-    return np.repeat(checked_start(problem, scale, begin)[None], count, axis=0)
+        return np.stack([checked_start(problem.names, scale, row) for row in begin])
+    return np.repeat(checked_start(problem.names, scale, begin)[None], count, axis=0)
