@@ -24,7 +24,14 @@ from bayesoleo.estimation import (
     principal_axes,
     profile,
 )
-from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
+from bayesoleo.posterior import (
+    LogDensity,
+    compare,
+    comparison_text,
+    laplace_mixture,
+    sample,
+    to_datasets,
+)
 
 NAMES = ["pressure", "exponent", "area", "volume"]
 TRUTH = np.array([4.9, 1.1, 3.5, 9.2])  # bar, 1, 1e-3 m², 1e-4 m³
@@ -104,12 +111,4 @@ figure_pairs = plots.pairs(tree)
 # all directions, and across the narrow ridge, along the best known axis, draws lie wider than its
 # ellipse, because the ridge is bent.
 
-found = compare(tree)
-print(f"{'':10}{'shift [sd]':>11}{'sd / linear':>13}{'sd / region':>13}{'skewness':>10}")
-for name in NAMES:
-    one = found.sel(parameter=name)
-    linear, half = (float(one["sd_ratio"].sel(reference=r)) for r in ("linearised", "indifference"))
-    shift, skewness = float(one["shift"]), float(one["skewness"])
-    print(f"{name:10}{shift:11.2f}{linear:13.2f}{half:13.2f}{skewness:10.2f}")
-least, greatest = found["variance_ratio"].sel(reference="linearised").values
-print(f"variance over the linearised one: {least:.2f} to {greatest:.2f}")
+print(comparison_text(compare(tree)))

@@ -1,6 +1,6 @@
 """Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
 
-from bayesoleo.posterior.comparison import compare
+from bayesoleo.posterior.comparison import compare, comparison_text
 from bayesoleo.posterior.density import LogDensity
 from bayesoleo.posterior.diagnostics import Comparison, compare_with_point
 from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
@@ -25,6 +25,7 @@ __all__ = [
     "choose_draws",
     "compare",
     "compare_with_point",
+    "comparison_text",
     "error_model",
     "find_mode",
     "hierarchical",

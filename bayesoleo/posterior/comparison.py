@@ -11,6 +11,7 @@ from scipy import linalg, stats
 
 from bayesoleo import schema
 from bayesoleo.errors import ResultsError
+from bayesoleo.estimation.shown import columns
 
 Array = NDArray[np.float64]
 
@@ -88,6 +89,37 @@ def compare(groups: Mapping[str, xr.Dataset] | xr.DataTree) -> xr.Dataset:
             "extreme": ["least", "greatest"],
         },
     )
+
+
+def comparison_text(found: xr.Dataset) -> str:
+    """A comparison as a table: one line for each parameter, and one over all directions.
+
+    Parameters
+    ----------
+    found : Dataset
+        Of :func:`compare`, or the group ``comparison`` of a result.
+
+    Returns
+    -------
+    str
+        Columns of references that there are not are left out.
+    """
+    there = found["sd_ratio"].notnull().any(schema.PARAMETER)
+    references = [str(name) for name in found["reference"].values[there.values]]
+    head = ["parameter", "shift in sd", *(f"sd / {name}" for name in references), "skewness"]
+    rows = []
+    for name in found[schema.PARAMETER].values:
+        one = found.sel({schema.PARAMETER: name})
+        ratios = [float(one["sd_ratio"].sel(reference=r)) for r in references]
+        numbers = [float(one["shift"]), *ratios, float(one["skewness"])]
+        rows.append([str(name), *("–" if np.isnan(x) else f"{x:.2f}" for x in numbers)])
+    lines = [columns(head, rows)]
+    for reference in references:
+        least, greatest = found["variance_ratio"].sel(reference=reference).values
+        if np.isfinite(least):
+            between = f"{least:.2f} to {greatest:.2f}"
+            lines.append(f"variance over the {reference} one, over all directions: {between}")
+    return "\n".join(lines)
 
 
 def _about(text: str) -> dict[str, str]:

@@ -8,7 +8,14 @@ from bayesoleo import Normal, plots
 from bayesoleo.errors import ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate, indifference, sampling_distribution
 from bayesoleo.plots.pairs import inside
-from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
+from bayesoleo.posterior import (
+    LogDensity,
+    compare,
+    comparison_text,
+    laplace_mixture,
+    sample,
+    to_datasets,
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +46,30 @@ def test_a_linear_normal_problem_has_ratios_of_one(tree):
     assert np.isnan(found["variance_ratio"].sel(reference="indifference")).all()
     np.testing.assert_allclose(found["shift"], 0.0, atol=4 / np.sqrt(4000))
     np.testing.assert_allclose(found["skewness"], 0.0, atol=0.2)
+
+
+def test_the_table_shows_what_there_is_to_compare_with(tree):
+    found = compare(tree)
+    head, level, slope, *rest = comparison_text(found).splitlines()
+    assert head.split("  ")[0] == "parameter"
+    assert "sd / indifference" in head
+    assert level.split()[1:] == [
+        f"{float(found[name].sel(parameter='level', **which)):.2f}"
+        for name, which in (
+            ("shift", {}),
+            ("sd_ratio", {"reference": "linearised"}),
+            ("sd_ratio", {"reference": "monte carlo"}),
+            ("sd_ratio", {"reference": "indifference"}),
+            ("skewness", {}),
+        )
+    ]
+    assert slope.startswith("slope")
+    assert [line.split(" one")[0] for line in rest] == [
+        "variance over the linearised",
+        "variance over the monte carlo",
+    ]
+    few = xr.DataTree.from_dict({name: tree[name].to_dataset() for name in ("point", "posterior")})
+    assert "monte carlo" not in comparison_text(compare(few))
 
 
 def test_what_is_not_there_is_not_compared_with(tree):
