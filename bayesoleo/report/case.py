@@ -108,6 +108,9 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
         added = chosen(entry)
         if added is None:
             continue
+        if added["effect"] not in summary["effects"]:
+            yield f"{name(added)} was added first, and removed again."
+            continue
         others = [c for c in entry["candidates"] if c is not added]
         alike = added["indistinguishable_from"]
         apart = [c for c in others if c["effect"] not in alike and name(c) not in alike]

@@ -33,6 +33,14 @@ def test_what_it_is_how_large_and_whether_it_holds(answers):
     assert "best remaining candidate" in found["What is left?"]
 
 
+def test_what_was_removed_again_is_not_said_to_be_it(answers, oleo):
+    removed = json.loads(json.dumps(answers[1]))
+    removed["effects"] = []
+    found = dict(case(removed, {}, oleo))
+    assert found["What is it?"].endswith("was added first, and removed again.")
+    assert "explains" not in found["What is it?"]
+
+
 def test_candidates_without_a_score_are_counted_by_reason(answers):
     found, summary = answers
     expected = "3 candidates have no score: 2 (singular), 1 (spanned)."
