@@ -14,6 +14,8 @@ from bayesoleo.data.findings import frequency_findings as frequency_findings
 from bayesoleo.data.findings import motions_per_period as motions_per_period
 from bayesoleo.data.findings import periods_per_motion as periods_per_motion
 from bayesoleo.data.harmonics import significant_harmonics as significant_harmonics
+from bayesoleo.data.lines import Line as Line
+from bayesoleo.data.lines import foreign_line as foreign_line
 from bayesoleo.data.mapping import on_grid as on_grid
 from bayesoleo.data.period import Frequency as Frequency
 from bayesoleo.data.period import autocovariance as autocovariance
@@ -25,6 +27,8 @@ from bayesoleo.data.reduction import ReducedCampaign as ReducedCampaign
 from bayesoleo.data.reduction import reduce_campaign as reduce_campaign
 from bayesoleo.data.reduction import reduce_run as reduce_run
 from bayesoleo.data.registry import dataset_folder as dataset_folder
+from bayesoleo.data.resolution import repeating_rounding as repeating_rounding
+from bayesoleo.data.resolution import step_of as step_of
 from bayesoleo.data.transforms import HarmonicBasis as HarmonicBasis
 from bayesoleo.data.writing import SimulatedRun as SimulatedRun
 from bayesoleo.data.writing import write_campaign as write_campaign

@@ -9,6 +9,8 @@ import numpy as np
 
 from bayesoleo.data.averaging import average_on
 from bayesoleo.data.drift import Drift, drifting
+from bayesoleo.data.lines import foreign_lines
+from bayesoleo.data.resolution import clipped, coarse_steps, repeating_rounding
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.prediction.records import Record
 
@@ -94,7 +96,33 @@ def findings(records: Sequence[Record]) -> list[str]:
         Each names the run, what was found and what to write.
     """
     found = frequency_findings(records)
-    return found + [_sentence(record, item) for record in records for item in drifting(record)]
+    found += [_sentence(record, item) for record in records for item in drifting(record)]
+    return found + [sentence for record in records for sentence in _about_channels(record)]
+
+
+def _about_channels(record: Record) -> list[str]:
+    """What channels show beside what is measured: foreign lines, cut-off ends, coarse steps."""
+    where = f"run {record.label}: "
+    found = [
+        f"{where}{line.channel} has a line at {line.frequency:.4g} Hz with the amplitude "
+        f"{line.amplitude:.3g} (SI), which is no harmonic of {record.frequency:.4g} Hz: something "
+        "periodic besides the drive; it counts as noise"
+        for line in foreign_lines(record)
+    ]
+    found += [
+        f"{where}{item.channel} is cut off at its {item.end} value, {item.value:.4g} (SI), for "
+        f"{100 * item.share:.2g} % of the samples; mask these stretches"
+        for item in clipped(record)
+    ]
+    for channel, step in coarse_steps(record).items():
+        stays = repeating_rounding(step, record.signal_noise[channel])
+        found.append(
+            f"{where}{channel} goes in steps of {step:.3g} (SI), "
+            f"{step / max(record.signal_noise[channel], 1e-300):.2g} times the noise of a sample; "
+            f"where samples fall on the same phases in every period an error of {stays:.2g} of "
+            "rounding repeats itself"
+        )
+    return found
 
 
 def frequency_findings(records: Sequence[Record]) -> list[str]:

@@ -64,4 +64,22 @@ PLAY = force_effect(
     title="Play: no stiffness in a gap about mid-stroke",
 )
 
-EFFECTS = (END_STOP_LOWER, END_STOP_UPPER, HERTZIAN_LOWER, HERTZIAN_UPPER, PLAY)
+PRELOAD = force_effect(
+    "preload",
+    "contact",
+    "preload*2/pi*atan((position - (lowest_position + highest_position)/2)/width)",
+    {"preload": Amplitude("preload", "force", "F_p", "force that a preloaded spring holds", 1)},
+    shapes=(
+        Shape(
+            "width",
+            "position",
+            "w",
+            "displacement at which the preload is half taken up",
+            range_grid(1 / 256, 1 / 8),
+        ),
+    ),
+    formula=r"F_p \, \frac{2}{\pi} \arctan((q - q_\mathrm{mid}) / w)",
+    title="Preload: a spring that is held between stops about mid-stroke",
+)
+
+EFFECTS = (END_STOP_LOWER, END_STOP_UPPER, HERTZIAN_LOWER, HERTZIAN_UPPER, PLAY, PRELOAD)

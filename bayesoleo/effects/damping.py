@@ -13,7 +13,7 @@ import sympy as sp
 
 from bayesoleo.effects.effect import Amplitude, Effect, Names, Shape
 from bayesoleo.effects.force_effect import force_effect
-from bayesoleo.effects.grids import values
+from bayesoleo.effects.grids import values, velocity_grid
 from bayesoleo.effects.places import damping_terms, force_places, is_quantity, moving_places
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import symbol
@@ -183,6 +183,34 @@ CUBIC_EXTENSION = force_effect(
     title="Flow that chokes in extension",
 )
 
+CAVITATING = force_effect(
+    "cavitating_rebound",
+    "damping",
+    "cavitating_rebound*positive(-velocity - onset)**2",
+    {
+        "cavitating_rebound": Amplitude(
+            "cavitating_rebound",
+            "force/(position/s)**2",
+            r"c_\mathrm{cav}",
+            "quadratic damping lost in extension beyond the onset",
+            sign=1,
+        )
+    },
+    shapes=(
+        Shape(
+            "onset",
+            "position/s",
+            r"v_\mathrm{cav}",
+            "velocity of extension at which the oil cavitates",
+            velocity_grid(1 / 16, 3 / 4),
+        ),
+    ),
+    formula=r"c_\mathrm{cav} \max(-\dot q - v_\mathrm{cav}, 0)^2",
+    title="Rebound damping that cavitation limits",
+    source="the pressure behind the orifice cannot fall below that of vapour; Currey (1988),"
+    " Aircraft Landing Gear Design, chapter 5",
+)
+
 EFFECTS = (
     VISCOUS,
     QUADRATIC,
@@ -193,4 +221,5 @@ EFFECTS = (
     TEMPERATURE_DEPENDENT,
     EXTENSION_ONLY,
     CUBIC_EXTENSION,
+    CAVITATING,
 )

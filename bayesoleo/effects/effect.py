@@ -54,6 +54,8 @@ class Scales:
         Peak-to-peak value by output, in the output's unit.
     shortest_period, longest_period : float
         Of all runs, in seconds.
+    output_range : mapping of str to (float, float)
+        Lowest and highest value measured, by output, in the output's unit.
     """
 
     position: Mapping[str, tuple[float, float]]
@@ -61,6 +63,7 @@ class Scales:
     output: Mapping[str, float]
     shortest_period: float
     longest_period: float
+    output_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from bayesoleo.effects.effect import Amplitude
+from collections.abc import Sequence
+
+from bayesoleo.effects.effect import Amplitude, Effect, Names
 from bayesoleo.effects.force_effect import force_effect
+from bayesoleo.effects.places import is_quantity, substitute
+from bayesoleo.model import Model
+from bayesoleo.model.expressions import symbol
+
+#: Name under which a model may declare the acceleration of gravity.
+GRAVITY = "gravity"
 
 CONSTANT = force_effect(
     "constant_force",
@@ -36,4 +44,27 @@ MASS = force_effect(
     title="Mass error (inertia)",
 )
 
-EFFECTS = (CONSTANT, OFFSET_BY_RUN, MASS)
+
+def _declares_gravity(model: Model) -> Sequence[str]:
+    """Models that name it and use it."""
+    return (GRAVITY,) if is_quantity(model, GRAVITY) else ()
+
+
+def _heavier(model: Model, target: str, names: Names) -> Model:
+    return substitute(model, {symbol(target): symbol(target) + names["gravity_error"]})
+
+
+GRAVITY_ERROR = Effect(
+    id="gravity_error",
+    family="force",
+    title="Gravity error (a rig that is not upright)",
+    formula=r"g + \Delta g",
+    amplitudes=(
+        Amplitude("gravity_error", "parameter", r"\Delta g", "acceleration beyond that stated"),
+    ),
+    places=_declares_gravity,
+    change=_heavier,
+    applies_to=f"models that declare {GRAVITY}",
+)
+
+EFFECTS = (CONSTANT, OFFSET_BY_RUN, MASS, GRAVITY_ERROR)

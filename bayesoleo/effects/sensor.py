@@ -1,4 +1,4 @@
-r"""Sensors: offset, gain, lag and drift of a channel.
+r"""Sensors: offset, gain, lag, drift and saturation of a channel.
 
 A channel shows :math:`m` where the model says :math:`y`. Of an output the expression changes;
 of an input, which *is* what was measured, the model's own quantity is got back from it.
@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names
+from bayesoleo.effects.effect import Amplitude, Constant, Effect, Names, Scales, Shape
+from bayesoleo.effects.grids import geometric
 from bayesoleo.effects.places import substitute
 from bayesoleo.model import Model, possible_drives
 from bayesoleo.model.expressions import (
@@ -122,7 +123,69 @@ LAG = _sensor(
     _lag,
 )
 DRIFT = _sensor(
-    "sensor_drift", "Drift of a sensor", "m = y + d t", "channel/s", "d", _driftable, _drift
+    "sensor_drift",
+    "Drift of a sensor, or of a force",
+    "m = y + d t",
+    "channel/s",
+    "d",
+    _driftable,
+    _drift,
 )
 
-EFFECTS = (OFFSET, GAIN, LAG, DRIFT)
+
+# -- saturation ------------------------------------------------------------------------------------
+
+
+def _extreme(end: int) -> Callable[[Model, str, Scales], float]:
+    return lambda model, target, scales: _range(target, scales)[end]
+
+
+def _range(channel: str, scales: Scales) -> tuple[float, float]:
+    return scales.output_range.get(channel, (-1.0, 1.0))
+
+
+def _depth_grid(model: Model, channel: str, scales: Scales) -> tuple[float, ...]:
+    """From a level just inside the highest value measured to one a quarter of the range inside."""
+    low, high = _range(channel, scales)
+    return geometric((high - low) / 256, (high - low) / 4)
+
+
+def _saturation(side: str) -> Effect:
+    """Beyond a level only a part of what is to be measured is shown; of a clipped channel none.
+
+    The level is stated as its depth inside the extreme value measured, so that it is positive.
+    """
+    upper = side == "upper"
+    id_ = f"sensor_saturation_{side}"
+
+    def saturate(model: Model, channel: str, names: Names) -> Model:
+        whole = sp.Add(*model.output_terms(channel).values())
+        inside = names["extreme"] - names["depth"] if upper else names["extreme"] + names["depth"]
+        beyond = sp.Max(whole - inside, 0) if upper else sp.Min(whole - inside, 0)
+        return model.with_term("output", channel, id_, -names[id_] * beyond)
+
+    level = r"m_\mathrm{max} - h" if upper else r"m_\mathrm{min} + h"
+    limit = r"\max" if upper else r"\min"
+    word = "highest" if upper else "lowest"
+    return Effect(
+        id=id_,
+        family="sensor",
+        title=f"Sensor that saturates at its {side} end",
+        formula=rf"m = y - s \, {limit}(y - ({level}), 0)",
+        amplitudes=(
+            Amplitude(id_, "", "s", "part that is not shown; one where the channel is clipped", 1),
+        ),
+        places=lambda model: tuple(model.outputs),
+        change=saturate,
+        shapes=(
+            Shape("depth", "channel", "h", f"distance from the {word} value measured", _depth_grid),
+        ),
+        constants=(
+            Constant("extreme", "channel", f"{word} value measured", _extreme(1 if upper else 0)),
+        ),
+        applies_to="outputs",
+        own_name_per_target=True,
+    )
+
+
+EFFECTS = (OFFSET, GAIN, LAG, DRIFT, _saturation("upper"), _saturation("lower"))

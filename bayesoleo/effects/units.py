@@ -145,6 +145,8 @@ def target_units(model: Model, target: str) -> TargetUnits:
         words |= {"force": balance_unit(model, name), "position": model.dofs[name].unit}
     if name in model.parameters:
         words |= {"parameter": model.parameters[name].unit}
+    if name in model.conditions:
+        words |= {"parameter": model.conditions[name].unit}
     if name in model.inputs:
         words |= {"channel": model.inputs[name]}
     if name in model.outputs:

@@ -45,7 +45,14 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
         for k, name in enumerate(fit.predictor.outputs)
     }
     periods = [time for record in fit.records for time in _times(record)]
-    return Scales(position, velocity, outputs, min(periods), max(periods))
+    ranges = {
+        name: (
+            min(float(run.measured[k].min()) for run in fit.predictor.runs),
+            max(float(run.measured[k].max()) for run in fit.predictor.runs),
+        )
+        for k, name in enumerate(fit.predictor.outputs)
+    }
+    return Scales(position, velocity, outputs, min(periods), max(periods), ranges)
 
 
 def _places(record: Record) -> np.ndarray:

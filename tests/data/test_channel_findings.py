@@ -1,0 +1,81 @@
+"""Foreign lines, coarse steps and ends that are cut off are found, and only where they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_campaigns import damper_campaign, spring_damper_force
+
+from bayesoleo.data import findings, foreign_line, repeating_rounding, step_of
+
+FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
+
+
+def signal(rng, noise=0.1):
+    t = STEP * np.arange(SAMPLES)
+    return t, np.sin(2 * np.pi * FREQUENCY * t) + noise * rng.standard_normal(SAMPLES)
+
+
+def test_a_foreign_line_is_found_with_its_frequency_and_amplitude():
+    t, x = signal(np.random.default_rng(1))
+    line = foreign_line(x + 0.05 * np.sin(2 * np.pi * 50.3 * t), STEP, FREQUENCY)
+    assert line is not None
+    assert line.frequency == pytest.approx(50.3, abs=1 / (SAMPLES * STEP))
+    # Between two lines of the spectrum 2 / pi of an amplitude is left.
+    assert 0.6 * 0.05 < line.amplitude < 1.1 * 0.05
+    assert line.p_value < 1e-6
+
+
+@pytest.mark.statistical
+def test_noise_has_a_line_no_oftener_than_said():
+    rng = np.random.default_rng(2)
+    lines = [foreign_line(signal(rng)[1], STEP, FREQUENCY) for _ in range(200)]
+    few = sum(line is not None and line.p_value < 0.05 for line in lines)
+    # Ten are expected; more than twenty come once in 1000 times.
+    assert few <= 20
+
+
+def test_a_line_at_a_harmonic_is_not_foreign():
+    t, x = signal(np.random.default_rng(3))
+    line = foreign_line(x + 0.05 * np.sin(2 * np.pi * 50.0 * t), STEP, FREQUENCY)
+    assert line is None or line.p_value > 1e-3
+
+
+@pytest.mark.parametrize("step", [0.02, 1 / 3])
+def test_the_step_of_a_grid(step):
+    x = signal(np.random.default_rng(4), 0.01)[1] * 4
+    assert step_of(np.round(x / step) * step) == pytest.approx(step, rel=1e-6)
+    assert step_of(x) == 0.0
+
+
+def test_rounding_that_repeats_is_what_is_measured():
+    """Against a simulation: the mean of many roundings of the same values with new noise."""
+    rng, step = np.random.default_rng(5), 1.0
+    values = rng.uniform(0, 50, 4000)
+    for noise in (0.0, 0.2, 0.35):
+        mean = np.zeros_like(values)
+        for _ in range(800):
+            mean += np.round(values + noise * rng.standard_normal(values.size)) / 800
+        left = float(np.std(mean - values))
+        # What noise leaves of an average over 800, and the scatter of a standard deviation.
+        floor = np.sqrt(noise**2 + step**2 / 12) / np.sqrt(800)
+        expected = np.hypot(repeating_rounding(step, noise), floor if noise else 0.0)
+        assert left == pytest.approx(expected, rel=0.06)
+
+
+def test_findings_name_what_is_wrong_with_a_channel(tmp_path):
+    records = damper_campaign(tmp_path, spring_damper_force, periods=16).records
+    assert findings(records) == []
+    record = records[0]
+    force, t = record.samples["force"], record.time
+    cut = replace(record, samples={**record.samples, "force": np.minimum(force, 10.0)})
+    (text,) = findings([cut])
+    assert "force is cut off at its highest value, 10 (SI)" in text
+    coarse = replace(record, samples={**record.samples, "force": np.round(force / 2.0) * 2.0})
+    (text,) = findings([coarse])
+    assert "force goes in steps of 2 (SI)" in text
+    hum = replace(record, samples={**record.samples, "force": force + np.sin(2 * np.pi * 17.3 * t)})
+    (text,) = findings([hum])
+    assert "force has a line at 17.3" in text
