@@ -26,7 +26,6 @@ from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, record_of
 from bayesoleo.solvers.adaptive.switched import crossings_of
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
 from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.schemes.mesh import Mesh
@@ -239,8 +238,11 @@ class _Way:
 
     def discretised(self, p: Array) -> list[Found]:
         run = self.run
-        starts = np.concatenate([run.guess(row) for row in p])
-        solution = solve_from_guess(run.boundary, p, starts)
+        each = [run.solve_from_guess(row) for row in p]
+        solution = Solution(*(
+            np.concatenate([getattr(one, name) for one in each])
+            for name in ("x", "status", "iterations")
+        ))  # fmt: skip
         solution, x_theta, monodromy = sensitivities(run.boundary, p, solution)
         size, found = run.scheme.state_size, []
         for lane in range(len(p)):

@@ -15,6 +15,7 @@ from bayesoleo.model import Model
 from bayesoleo.model.expressions import WITHIN
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.anchor import PATH_PIECES, Anchor
+from bayesoleo.prediction.from_shot import solve_from_shot
 from bayesoleo.prediction.guess import Motion, guess_rows
 from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
@@ -202,7 +203,7 @@ class RunPredictor:
             return Status.CONVERGED
         solution = self._from_anchor(p[None]) if self.anchor is not None else None
         if solution is None or solution.status[0] != Status.CONVERGED.value:
-            solution = solve_from_guess(self.boundary, p[None], self.guess(p))
+            solution = self.solve_from_guess(p)
         if solution.status[0] == Status.CONVERGED.value:
             solution, x_p, monodromy = sensitivities(self.boundary, p[None], solution)
             if solution.status[0] == Status.CONVERGED.value:
@@ -211,6 +212,15 @@ class RunPredictor:
                 self.anchor = anchor.after(self.anchor, self.boundary, self.active)
                 self.jumps += self.anchor.jumped
         return Status(int(solution.status[0]))
+
+    def solve_from_guess(self, p: Array) -> Solution:
+        """Periodic solution at constants ``p (np,)`` without an anchor."""
+        guess = self.guess(p)
+        solution = solve_from_guess(self.boundary, p[None], guess)
+        if solution.status[0] != Status.NO_CONVERGENCE.value:
+            return solution
+        found = solve_from_shot(self.model, self.kernels, self.record, self.boundary, p, guess)
+        return solution if found is None else found
 
     def _from_anchor(self, p: Array) -> Solution:
         anchor = self.anchor
