@@ -54,6 +54,7 @@ def summarise(
         "notes": [
             *loop.notes,
             *([] if stability is None else stability.notes()),
+            *final.fit.point.doubts,
             *_input_noise_notes(final),
             *_sampler_notes(samples),
         ],

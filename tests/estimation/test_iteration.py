@@ -103,7 +103,7 @@ def test_an_unknown_without_effect_keeps_its_prior():
     np.testing.assert_array_equal(
         np.isnan(point.covariance_likelihood), [[False, True], [True] * 2]
     )
-    assert point.notes == ["the data say nothing of theta2: what is known of it is the prior's"]
+    assert point.notes == ["the data say nothing of theta2: what is known beyond is the prior's"]
 
 
 def test_a_product_is_not_taken_apart():

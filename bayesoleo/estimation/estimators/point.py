@@ -25,7 +25,7 @@ EXACT = (
 )
 SILENT = "the data say nothing of {}"
 UNDETERMINED = "the data do not determine {}, at most combinations of these (see principal_axes)"
-FROM_PRIOR = ": what is known of it is the prior's"
+FROM_PRIOR = ": what is known beyond is the prior's"
 NO_SD = ": there is no standard deviation"
 _MOST_NAMES = 8
 
@@ -124,16 +124,20 @@ class PointEstimate:
         return tuple(name for name, is_open in zip(self.names, open_ones, strict=True) if is_open)
 
     @property
-    def notes(self) -> list[str]:
-        """What to know of an estimate, such as that the solution behind it is unstable."""
-        notes = [] if self.stability is None else self.stability.notes()
-        if self.exact:
-            notes.append(EXACT.format(", ".join(self.exact)))
+    def doubts(self) -> list[str]:
+        """Where standard deviations are not what they seem."""
+        found = [EXACT.format(", ".join(self.exact))] if self.exact else []
         if self.undetermined:
             text = SILENT if len(self.undetermined) == 1 else UNDETERMINED
             text += FROM_PRIOR if np.isfinite(self.sd).all() else NO_SD
-            notes.append(text.format(_listed(self.undetermined)))
-        return notes
+            found.append(text.format(_listed(self.undetermined)))
+        return found
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know of an estimate: of its solutions, such as that one is unstable, and of its
+        standard deviations."""
+        return [*([] if self.stability is None else self.stability.notes()), *self.doubts]
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])
