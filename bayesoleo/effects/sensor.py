@@ -164,14 +164,17 @@ def _saturation(side: str) -> Effect:
         beyond = sp.Max(whole - inside, 0) if upper else sp.Min(whole - inside, 0)
         return model.with_term("output", channel, id_, -names[id_] * beyond)
 
-    level = r"m_\mathrm{max} - h" if upper else r"m_\mathrm{min} + h"
-    limit = r"\max" if upper else r"\min"
+    beyond_level = (
+        r"- s \, \max(y - m_\mathrm{max} + h, 0)"
+        if upper
+        else r"+ s \, \max(m_\mathrm{min} + h - y, 0)"
+    )
     word = "highest" if upper else "lowest"
     return Effect(
         id=id_,
         family="sensor",
         title=f"Sensor that saturates at its {side} end",
-        formula=rf"m = y - s \, {limit}(y - ({level}), 0)",
+        formula=f"m = y {beyond_level}",
         amplitudes=(
             Amplitude(id_, "", "s", "part that is not shown; one where the channel is clipped", 1),
         ),
