@@ -138,3 +138,14 @@ def test_the_weight_of_tails_follows_the_draws(two):
     one = Mixture(np.zeros((1, 2)), np.eye(2)[None], np.zeros(1)).defended()
     assert one.refitted(normal, rounds=50).weights[1] < 0.05
     assert one.refitted(heavy, rounds=50).weights[1] > 0.3
+
+
+def test_a_mode_a_hundred_standard_deviations_away_is_reached():
+    log_density = LogDensity(gas_spring(relative_sd=0.1, seed=0))
+    found = find_mode(log_density, np.array([1.05, -4.4]))
+    near = find_mode(log_density, np.array([1.22, -4.4]))
+    assert found.status is Status.CONVERGED
+    assert (near.centre[0] - 1.05) / np.sqrt(near.covariance[0, 0]) > 100
+    # Newton's method stops at steps of a thousandth of a standard deviation.
+    off = (found.centre - near.centre) / np.sqrt(np.diag(near.covariance))
+    np.testing.assert_allclose(off, 0.0, atol=2e-3)
