@@ -25,7 +25,7 @@ from pathlib import Path
 import calibration_coverage as coverage
 import calibration_oleo as campaign
 import numpy as np
-from matplotlib.figure import Figure
+from calibration_figures import MODELS, STORED
 from numpy.typing import NDArray
 
 from bayesoleo.estimation import FunctionProblem
@@ -44,7 +44,6 @@ from bayesoleo.storage.slots import Slots
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray]
-STORED = Path(__file__).resolve().parent / "tables"
 POSITION = np.linspace(0.0, 0.9, 100)
 SPRING_PRIOR, SPRING_LOG_V = Normal(1.0, 0.1), Normal(2 * np.log(0.0792), 0.5)
 #: Spread of the logarithm of a variance about that of the nominal noise.
@@ -108,7 +107,7 @@ REPLICATIONS: dict[str, Callable[[int, int], Arrays]] = {
     "spring": spring,
     "oleo": oleo,
     "oleo-weighted": oleo_weighted,
-    **{f"coverage-{word}": partial(coverage.replication, word) for word in coverage.MODELS},
+    **{f"coverage-{word}": partial(coverage.replication, word) for word in MODELS},
 }
 
 
@@ -141,8 +140,7 @@ def replicate(study: str, count: int, seed: int, out: Path, scheduler: str | Non
 def coverage_of(count: int, seed: int, out: Path, scheduler: str | None) -> dict[str, object]:
     """Coverage by error model, each with a folder of its own."""
     found = {
-        word: replicate(f"coverage-{word}", count, seed, out / word, scheduler)
-        for word in coverage.MODELS
+        word: replicate(f"coverage-{word}", count, seed, out / word, scheduler) for word in MODELS
     }
     return coverage.table_of(found)
 
@@ -165,34 +163,6 @@ def ranks_of(
         "reached": int(sum(bool(item["reached"]) for item in found)),
         "ranks": ranks.T.tolist(),
     }
-
-
-def stored(study: str) -> dict | None:
-    """The table of the last run; None if there is none."""
-    path = STORED / f"calibration-{study}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-
-
-def ranks_figure(study: str) -> Figure | None:
-    """Distribution functions of the ranks, less the uniform one, with their band."""
-    table = stored(study)
-    if table is None:
-        return None
-    columns = min(len(table["names"]), 3)
-    rows = -(-len(table["names"]) // columns)
-    figure = Figure(figsize=(9, 0.4 + 1.9 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
-    for axes, name, ranks in zip(panels, table["names"], table["ranks"], strict=False):
-        test = uniformity(ranks)
-        axes.fill_between(test.places, test.low, test.high, color="0.88", lw=0)
-        axes.plot(test.places, test.difference, color="#0072b2", lw=1.4)
-        axes.set_title(f"{name}, p = {test.p_value:.2g}", fontsize=9)
-        axes.axhline(0, color="0.6", lw=0.6)
-    for axes in panels[len(table["names"]) :]:
-        axes.set_axis_off()
-    figure.supxlabel("rank of the truth", fontsize=9)
-    figure.supylabel("part of the ranks − uniform", fontsize=9)
-    return figure
 
 
 def main() -> None:

@@ -31,8 +31,6 @@ from bayesoleo.posterior import sample as draw
 from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
 
 Arrays = dict[str, NDArray]
-MODELS = ("independent", "correlated", "discrepancy")
-COLOURS = ("#d55e00", "#e69f00", "#0072b2")
 #: Ninety-per-cent intervals.
 TAILS = (0.05, 0.95)
 #: Effective draws from which their ends are taken: of 200, 5 % lie beyond an end give or take 1.5.
@@ -78,12 +76,13 @@ def _ends(density: LogDensity, theta, seed: int):
     Weighted draws from the mixture do where they are worth so many; elsewhere walkers go.
     """
     mixture = laplace_mixture(density, theta[None])
-    weighted = importance_sample(
-        density, mixture, seed=seed, effective_size=ENDS, draws=500, rounds=8
-    )
-    if weighted.reached:
-        low, high = weighted.quantiles(TAILS)[:, : theta.size]
-        return low, high, True, True
+    for draws, rounds in ((500, 8), (3000, 4)):
+        weighted = importance_sample(
+            density, mixture, seed=seed, effective_size=ENDS, draws=draws, rounds=rounds
+        )
+        if weighted.reached:
+            low, high = weighted.quantiles(TAILS)[:, : theta.size]
+            return low, high, True, True
     samples = draw(
         density, mixture, effective_size=ENDS, seed=seed, quick=True, progress=False,
         max_evaluations=40_000,
@@ -92,15 +91,19 @@ def _ends(density: LogDensity, theta, seed: int):
     return low, high, False, samples.reached
 
 
-def own_directions() -> NDArray:
-    """Unit vectors of what each parameter alone changes, (l, n), at the priors' means."""
+def sensitivities() -> NDArray:
+    """What parameters change over the noise, by prior sd, (n, l), at the priors' means."""
     problem = campaign.declared().problem
     sd = np.array([prior.sd for prior in problem.priors])
     problem.freeze(problem.start)
     found = problem.evaluate(problem.start)
     scaled = zip(found.sensitivity, campaign.NOISE.values(), strict=True)
-    columns = np.concatenate([part / noise for part, noise in scaled]) * sd
-    directions = []
+    return np.concatenate([part / noise for part, noise in scaled]) * sd
+
+
+def own_directions() -> NDArray:
+    """Unit vectors of what each parameter alone changes, (l, n)."""
+    columns, directions = sensitivities(), []
     for a, column in enumerate(columns.T):
         others = np.delete(columns, a, axis=1)
         # Their priors, one standard deviation each, are data of their own.
@@ -109,6 +112,13 @@ def own_directions() -> NDArray:
         rest = column - others @ np.linalg.lstsq(held, target, rcond=None)[0]
         directions.append(rest / np.linalg.norm(rest))
     return np.array(directions)
+
+
+def taken_over(misfits: NDArray) -> NDArray:
+    """Parts of unit vectors (k, n) that all parameters together take over, (k,): their priors, of
+    one standard deviation each, hold them back no more than a large misfit does."""
+    inside, _ = np.linalg.qr(sensitivities())
+    return np.sum((misfits @ inside) ** 2, axis=1)
 
 
 def changed_by(effect: str, rng: np.random.Generator) -> NDArray:
@@ -122,7 +132,10 @@ def changed_by(effect: str, rng: np.random.Generator) -> NDArray:
 
 @cache
 def imitation() -> tuple[NDArray, NDArray]:
-    """Parts of effects along each parameter's own direction, (effects, l), and chance's, (l,)."""
+    """Parts of effects along each parameter's own direction, and along all, (effects, l + 1).
+
+    And those that 95 % of chance misfits do not exceed, (l + 1,).
+    """
     own, rng = own_directions(), np.random.default_rng(0)
     tables = [basis(run.phase) for run in campaign.declared().problem.samples]
     root = np.sqrt(spectrum(np.array([LENGTH]))[0])
@@ -132,9 +145,14 @@ def imitation() -> tuple[NDArray, NDArray]:
             parts.append((rng.standard_normal((CHANCE, root.size)) * root) @ table.T)
     misfits = np.concatenate(parts, axis=1)
     misfits /= np.linalg.norm(misfits, axis=1)[:, None]
-    chance = np.quantile((misfits @ own.T) ** 2, LEVEL, axis=0)
-    shapes = [[changed_by(name, rng) for _ in range(SHAPES)] for name in campaign.EFFECTS]
-    return np.mean((np.array(shapes) @ own.T) ** 2, axis=1), chance
+    found = [_parts(misfits, own)]
+    for name in campaign.EFFECTS:
+        found.append(_parts(np.array([changed_by(name, rng) for _ in range(SHAPES)]), own))
+    return np.array([part.mean(axis=0) for part in found[1:]]), np.quantile(found[0], LEVEL, axis=0)
+
+
+def _parts(misfits: NDArray, own: NDArray) -> NDArray:
+    return np.column_stack([(misfits @ own.T) ** 2, taken_over(misfits)])
 
 
 @cache
@@ -143,7 +161,7 @@ def keeps_meaning() -> NDArray:
     parts, chance = imitation()
     names = campaign.declared().problem.names
     redefined = [[name in given for name in names] for given in campaign.EFFECTS.values()]
-    return (parts <= chance) & ~np.array(redefined)
+    return (parts <= chance)[:, :-1] & ~np.array(redefined)
 
 
 def table_of(found: dict[str, list[Arrays]]) -> dict[str, object]:
@@ -153,8 +171,10 @@ def table_of(found: dict[str, list[Arrays]]) -> dict[str, object]:
     table: dict[str, object] = {
         "names": list(problem.names),
         "effects": list(campaign.EFFECTS),
-        "imitation": np.round(parts, 4).tolist(),
-        "imitation_by_chance": np.round(chance, 4).tolist(),
+        "imitation": np.round(parts[:, :-1], 4).tolist(),
+        "imitation_by_chance": np.round(chance[:-1], 4).tolist(),
+        "taken_over": np.round(parts[:, -1], 4).tolist(),
+        "taken_over_by_chance": round(float(chance[-1]), 4),
         "keeps_meaning": keeps_meaning().tolist(),
     }
     sd = np.array([prior.sd for prior in problem.priors])

@@ -12,11 +12,11 @@ intervals promise too much: the second half of this page counts how much.
 # %%
 # Replications take long; the tables are those of the commands that they name.
 
-import calibration
+import calibration_figures as figures
 
-for name in calibration.STUDIES:
-    stored = calibration.stored(name)
-    print(f"{name:9}", stored["command"] if stored else "not run yet", sep="  ")
+for name in ("spring", "oleo", "oleo-weighted", "coverage"):
+    stored = figures.stored(name)
+    print(f"{name:14}", stored["command"] if stored else "not run yet", sep="  ")
 
 # %%
 # Ranks
@@ -26,12 +26,22 @@ for name in calibration.STUDIES:
 # its band is what chance makes of a right posterior; one that leans has a bias, one that is bent
 # twice has the wrong width. First the gas spring: its exponent and the logarithm of its variance.
 
-figure = calibration.ranks_figure("spring")
+figure = figures.ranks_figure("spring")
 
 # %%
 # The same of seven parameters and two variances of an oleo, four runs of a shaker campaign.
 
-figure = calibration.ranks_figure("oleo")
+figure = figures.ranks_figure("oleo")
+
+# %%
+# Each band holds 95 % of uniform ranks, so of nine quantities one or none may leave theirs by
+# chance. Where two do, more replications tell: of the same seed, the same first experiments among
+# them, by weighted draws, which cost a tenth
+# (:func:`~bayesoleo.posterior.importance_sample`) and test the density where walkers test the
+# sampler too.
+
+figures.print_ranks()
+figure = figures.ranks_figure("oleo-weighted")
 
 # %%
 # An effect that nobody declared
@@ -40,15 +50,26 @@ figure = calibration.ranks_figure("oleo")
 # Parameters, the effect and its size are drawn anew in each replication: direction-dependent
 # damping, a linear stiffness, Stribeck friction or a wall that stores heat, one as likely as
 # another, of a size of half to four times the noise (rms of what it changes, in the output that
-# shows it most; uniform in the logarithm). Parameters that mean something else beside the effect
-# are left out: the heat conduction of a wall that stores heat, base and slope of a friction with a
-# Stribeck peak. The posterior knows nothing of the effect.
+# shows it most; uniform in the logarithm). The posterior knows nothing of the effect.
+#
+# What can one ask of it? A parameter whose signature the effect bears stands for the sum of both:
+# no assumption on errors tells them apart, and such a parameter does not keep its meaning. Which
+# these are the model says, without data: the part of what an effect changes that lies along what
+# only this parameter changes, cos² of the angle between them, is compared with that of smooth
+# misfits by chance. Left out besides are parameters that an effect redefines: the heat conduction
+# of a wall that stores heat, base and slope of a friction with a Stribeck peak.
 
-calibration.print_coverage()
+figures.print_imitation()
 
 # %%
-# Errors assumed independent count each sample as news. The others know that a residual which stays
-# off is one error and not a hundred; what the parameters have taken over is not in the residual,
-# and no error model sees it. So it pays to look for the effect first.
+# How often the intervals hold the truth, and what that costs in width:
 
-figure = calibration.coverage_figure()
+figures.print_coverage()
+
+# %%
+# Filled: parameters that keep their meaning. Open: the others. Errors assumed independent count
+# each sample as news. The others know that a residual which stays off is one error and not a
+# hundred; what the parameters have taken over is not in the residual, and no error model sees it.
+# So it pays to look for the effect first.
+
+figure = figures.coverage_figure()
