@@ -78,7 +78,8 @@ def test_the_truth_lies_in_the_posteriors_interval(closed):
 
 
 #: What a closed loop fills; the others come of a study of the estimate, and that of the errors
-#: where an error model remembers, or of effects that the data cannot tell apart.
+#: where an error model remembers, of effects that the data cannot tell apart, or of one without a
+#: name.
 CLOSED = set(schema.GROUPS) - {
     schema.SAMPLING_DISTRIBUTION,
     schema.INDIFFERENCE,
@@ -87,6 +88,7 @@ CLOSED = set(schema.GROUPS) - {
     schema.SENSITIVITY,
     schema.ERROR_MODEL,
     schema.PROPOSAL,
+    schema.UNNAMED,
 }
 
 
