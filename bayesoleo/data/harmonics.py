@@ -16,10 +16,10 @@ from bayesoleo.prediction.records import Harmonics
 
 Array = NDArray[np.float64]
 
-#: Expected share of false harmonics among those kept. With hundreds of orders tested in each of
-#: dozens of channels, one in a thousand keeps a whole campaign free of false ones; what it costs is
-#: harmonics below about four standard deviations.
-FALSE_DISCOVERY_RATE = 1e-3
+#: Expected share of false harmonics among those kept. A false one of high order is no small error:
+#: an inertia sees it times the order squared. One in ten thousand keeps a hundred campaigns of
+#: dozens of channels free of them; what it costs is harmonics below some five standard deviations.
+FALSE_DISCOVERY_RATE = 1e-4
 
 #: Spectral bins between harmonics that are averaged for the noise at one harmonic, where the record
 #: has as many.
