@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from posterior_cases import gas_spring_case, oleo_case
+from tqdm import tqdm
 
 from bayesoleo.estimation import sampling_distribution
 from bayesoleo.estimation.uncertainty.redraw import data_source
@@ -47,7 +48,8 @@ def on(workers: int, work: Clocked) -> tuple[list[np.ndarray], float, float, flo
     with connected(f"local:{workers}") as client:
         dict(each_done(work, range(2 * workers), client=client))  # compiled code is loaded
         begin = time.perf_counter()
-        found = dict(each_done(work, range(TASKS), client=client))
+        tasks = each_done(work, range(TASKS), client=client)
+        found = dict(tqdm(tasks, total=TASKS, desc=f"replications, workers: {workers}"))
         wall = time.perf_counter() - begin
     parts = [found[index] for index in range(TASKS)]
     return (

@@ -6,11 +6,13 @@ import multiprocessing
 import os
 import signal
 import tempfile
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 from posterior_cases import gas_spring_case
+from tqdm import tqdm
 
 from bayesoleo.posterior import LogDensity, Samples, sample
 
@@ -46,7 +48,8 @@ def child(folder: str, ready: str) -> None:
     """In a process of its own."""
     case = gas_spring_case(0.01)  # the modes are found before the clock starts
     assert case.mixture.dimension == 2
-    Path(ready).touch()  # a killed process would leave a semaphore behind
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
+    Path(ready).touch()
     run(Path(folder), Slow)
 
 
@@ -82,7 +85,7 @@ def safety_figures() -> dict[str, float]:
     moments = np.random.default_rng(6).uniform(0, length, KILLS)
     identical = amid = 0
     with tempfile.TemporaryDirectory() as place:
-        for number, moment in enumerate(moments):
+        for number, moment in enumerate(tqdm(moments, desc="kills")):
             folder = Path(place) / f"{number:02d}"
             killed(folder, float(moment), context)
             amid += bool(list(folder.glob("segment-*.npz")))
