@@ -115,10 +115,16 @@ def own_directions() -> NDArray:
 
 
 def taken_over(misfits: NDArray) -> NDArray:
-    """Parts of unit vectors (k, n) that all parameters together take over, (k,): their priors, of
-    one standard deviation each, hold them back no more than a large misfit does."""
-    inside, _ = np.linalg.qr(sensitivities())
-    return np.sum((misfits @ inside) ** 2, axis=1)
+    """Parts of unit vectors (k, n) that all parameters together take over, (k,).
+
+    For misfits of the sizes' geometric mean: priors hold parameters back from small ones.
+    """
+    columns = sensitivities()
+    samples = len(columns) / len(campaign.NOISE)
+    scaled = misfits * np.sqrt(np.prod(campaign.SIZES) * samples)
+    inner = columns.T @ columns + np.eye(columns.shape[1])
+    rest = scaled - (columns @ np.linalg.solve(inner, columns.T @ scaled.T)).T
+    return 1 - np.sum(rest**2, axis=1) / np.sum(scaled**2, axis=1)
 
 
 def changed_by(effect: str, rng: np.random.Generator) -> NDArray:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from bayesoleo.posterior.calibration import uniformity
 
 STORED = Path(__file__).resolve().parent / "tables"
-MODELS = ("independent", "correlated", "discrepancy")
-COLOURS = ("#d55e00", "#e69f00", "#0072b2")
+MODELS = ("independent", "correlated", "discrepancy", "shared-discrepancy")
+COLOURS = ("#d55e00", "#e69f00", "#0072b2", "#009e73")
 
 
 def stored(study: str) -> dict | None:
@@ -118,7 +118,7 @@ def coverage_figure() -> Figure | None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     coverage, width, effects = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 1.0))
     for k, (word, colour) in enumerate(zip(MODELS, COLOURS, strict=True)):
-        found, shift = table[word], 0.24 * (k - 1)
+        found, shift = table[word], 0.19 * (k - 1.5)
         place = np.arange(len(table["names"])) + shift
         kept, others = (_numbers(found[key]) for key in ("each", "each_left_out"))
         coverage.plot(kept, place, "o", color=colour, ms=5, label=word)
@@ -140,7 +140,7 @@ def coverage_figure() -> Figure | None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="0.93")
         axes.set_axisbelow(True)
-    figure.legend(*coverage.get_legend_handles_labels(), loc="outside upper center", ncols=3,
+    figure.legend(*coverage.get_legend_handles_labels(), loc="outside upper center", ncols=len(MODELS),
                   frameon=False, fontsize=9)  # fmt: skip
     return figure
 
