@@ -95,9 +95,13 @@ def findings(records: Sequence[Record]) -> list[str]:
     list of str
         Each names the run, what was found and what to write.
     """
-    found = frequency_findings(records)
+    periods = [_about_period(record) for record in records]
+    found = [sentence for sentences in periods for sentence in sentences]
     found += [_sentence(record, item) for record in records for item in drifting(record)]
-    return found + [sentence for record in records for sentence in _about_channels(record)]
+    for record, doubts in zip(records, periods, strict=True):
+        # Lines between the harmonics of a wrong frequency are harmonics of the true one.
+        found += [] if doubts else _about_channels(record)
+    return found
 
 
 def _about_channels(record: Record) -> list[str]:
