@@ -140,8 +140,8 @@ def coverage_figure() -> Figure | None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="0.93")
         axes.set_axisbelow(True)
-    figure.legend(*coverage.get_legend_handles_labels(), loc="outside upper center", ncols=len(MODELS),
-                  frameon=False, fontsize=9)  # fmt: skip
+    handles = coverage.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
