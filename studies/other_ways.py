@@ -1,0 +1,370 @@
+"""Other ways to find what a model lacks, on the same data: what remains on runs not used.
+
+Every way gets the same fitted model, and the residual of the fitted runs with what a rig knows of
+each sample: position, velocity and the measured pressure. It learns the residual as a function of
+these, and predicts that of the runs held out. What is to be chosen - degree, threshold, whether
+the velocity is squeezed about its zero - is chosen on the fitted runs alone: each predicted from
+the others, or by marginal likelihood.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.polynomial import chebyshev
+
+import bayesoleo
+from bayesoleo import workflow
+from bayesoleo.plots import style
+from bayesoleo.plots.units import format_number
+from bayesoleo.tracing.state import State, fit_state
+
+OUTPUT = "force"
+#: Degrees of the surface, thresholds of SINDy for columns of unit norm in noise units, points
+#: of the Gaussian process.
+DEGREES, THRESHOLDS, POINTS = range(1, 10), (1.0, 3.0, 10.0, 30.0, 100.0, 300.0), 900
+#: Widths, in parts of the largest velocity, of the smooth signs that SINDy may choose from.
+WIDTHS = (0.01, 0.03, 0.1, 0.3)
+
+
+@dataclass(frozen=True)
+class RunResidual:
+    """Residual of one run, in units of the noise of a sample; coordinates over their largest."""
+
+    label: str
+    residual: np.ndarray
+    coordinates: np.ndarray  # (N, 3): position, velocity, pressure
+    period: np.ndarray
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a way leaves on runs not used, over the noise, and what it says."""
+
+    way: str
+    rms: float
+    repeating: float
+    seconds: float
+    says: str
+
+
+Learner = Callable[[Sequence[RunResidual]], Callable[[np.ndarray], np.ndarray]]
+
+
+def residuals(state: State) -> tuple[list[RunResidual], list[RunResidual]]:
+    """Of the fitted runs and of those held out."""
+    predictions = [*state.fitted, *state.held_out]
+    motions = [_motion(p.record) for p in predictions]
+    scale = np.max([np.abs(m).max(axis=0) for m in motions], axis=0)
+    found = []
+    for prediction, coordinates in zip(predictions, motions, strict=True):
+        record, place = prediction.record, prediction.predictor.outputs.index(OUTPUT)
+        noise = state.errors.at(OUTPUT, record.label).average.sigma
+        residual = (record.samples[OUTPUT] - prediction.y[place]) / noise
+        period = np.floor(record.phase + 1e-9).astype(int)
+        found.append(RunResidual(record.label, residual, coordinates / scale, period))
+    return found[: len(state.fitted)], found[len(state.fitted) :]
+
+
+def _motion(record) -> np.ndarray:
+    """Position and velocity by the harmonics, without noise; pressure likewise."""
+    x = record.harmonics["displacement"]
+    p = record.harmonics["pressure"].evaluate(record.phase, record.frequency)
+    return np.stack([*(x.evaluate(record.phase, record.frequency, n) for n in (0, 1)), p], axis=1)
+
+
+def judge(
+    way: str, left: Sequence[tuple[RunResidual, np.ndarray]], seconds: float, says: str
+) -> Found:
+    """Pool over runs what a way leaves: raw, and averaged over periods, each over its noise."""
+    from bayesoleo.data import periodic_average
+
+    squares, ratios = [], []
+    for run, rest in left:
+        cycles = run.period.max() + 1
+        average = periodic_average(rest, 1.0 / (rest.size / cycles), 1.0)
+        squares.append(np.mean(rest**2))
+        ratios.append(average.ratio**2)
+    return Found(
+        way, float(np.sqrt(np.mean(squares))), float(np.sqrt(np.mean(ratios))), seconds, says
+    )
+
+
+def across(runs: Sequence[RunResidual], learn: Learner) -> float:
+    """Mean square of each run's residual when learned from the others."""
+    errors = []
+    for out in runs:
+        predict = learn([run for run in runs if run is not out])
+        errors.append(np.mean((out.residual - predict(out.coordinates)) ** 2))
+    return float(np.mean(errors))
+
+
+def learned(
+    way: str, fitted, held_out, learn: Learner, says: Callable[[], str], start: float
+) -> Found:
+    """Learn from all fitted runs, judge on those held out."""
+    predict = learn(fitted)
+    left = [(run, run.residual - predict(run.coordinates)) for run in held_out]
+    return judge(way, left, time.process_time() - start, says())
+
+
+# -- restoring-force surface -----------------------------------------------------------------------
+
+
+def places(coordinates: np.ndarray, squeezed: bool) -> np.ndarray:
+    """Position and velocity; the latter, if squeezed, with most of its range near zero."""
+    x, v = coordinates[:, 0], coordinates[:, 1]
+    if squeezed:
+        v = np.arcsinh(v / WIDTHS[0]) / np.arcsinh(1 / WIDTHS[0])
+    return np.stack([x, v], axis=1)
+
+
+def surface(degree: int, squeezed: bool) -> Learner:
+    """Chebyshev polynomials in position and velocity (Masri and Caughey 1979), least squares."""
+
+    def columns(coordinates: np.ndarray) -> np.ndarray:
+        at = places(coordinates, squeezed)
+        x, v = (chebyshev.chebvander(at[:, k], degree) for k in (0, 1))
+        pairs = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+        return np.stack([x[:, i] * v[:, j] for i, j in pairs], axis=1)
+
+    def learn(runs: Sequence[RunResidual]):
+        A = np.concatenate([columns(run.coordinates) for run in runs])
+        b = np.concatenate([run.residual for run in runs])
+        weights = np.linalg.lstsq(A, b, rcond=1e-10)[0]
+        return lambda coordinates: columns(coordinates) @ weights
+
+    return learn
+
+
+def with_surface(fitted, held_out) -> Found:
+    """The degree is that which predicts fitted runs best from each other."""
+    start = time.process_time()
+    scores = {
+        (degree, squeezed): across(fitted, surface(degree, squeezed))
+        for degree in DEGREES
+        for squeezed in (False, True)
+    }
+    degree, squeezed = min(scores, key=scores.get)
+    count, over = (degree + 1) * (degree + 2) // 2, "squeezed velocity" if squeezed else "velocity"
+    says = f"{count} coefficients of degree {degree} in position and {over}"
+    learn = surface(degree, squeezed)
+    return learned("restoring-force surface", fitted, held_out, learn, lambda: says, start)
+
+
+# -- SINDy -----------------------------------------------------------------------------------------
+
+
+def sindy(threshold: float, keep: dict) -> Learner:
+    """Sequentially thresholded least squares on polynomials and on smooth signs of the velocity."""
+    import pysindy
+
+    def library():
+        # pysindy counts a function's arguments, so that a width has to be closed over.
+        pairs = [_sign(width) for width in WIDTHS] + [_sign(width, "p") for width in WIDTHS]
+        pairs.append((lambda x, v, p: v * np.abs(v), lambda x, v, p: f"{v}|{v}|"))
+        functions, names = (list(part) for part in zip(*pairs, strict=True))
+        own = pysindy.CustomLibrary(library_functions=functions, function_names=names)
+        return pysindy.GeneralizedLibrary([pysindy.PolynomialLibrary(degree=3), own])
+
+    def learn(runs: Sequence[RunResidual]):
+        model = pysindy.SINDy(
+            optimizer=pysindy.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True),
+            feature_library=library(),
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model.fit(
+                [run.coordinates for run in runs],
+                t=1.0,
+                x_dot=[np.column_stack([run.residual] * 3) for run in runs],
+                feature_names=["x", "v", "p"],
+            )
+        keep["model"] = model
+        return lambda coordinates: np.asarray(model.predict(coordinates))[:, 0]
+
+    return learn
+
+
+def _sign(width: float, factor: str = ""):
+    """A smooth sign of the velocity, times the pressure if asked for, and its name."""
+    if factor:
+        return (
+            lambda x, v, p: p * np.tanh(v / width),
+            lambda x, v, p: f"{p} tanh({v}/{width:g})",
+        )
+    return lambda x, v, p: np.tanh(v / width), lambda x, v, p: f"tanh({v}/{width:g})"
+
+
+def with_sindy(fitted, held_out) -> Found:
+    """The threshold is that which predicts fitted runs best from each other."""
+    start, keep = time.process_time(), {}
+    scores = {value: across(fitted, sindy(value, keep)) for value in THRESHOLDS}
+    best = min(scores, key=scores.get)
+
+    def says() -> str:
+        model = keep["model"]
+        weights = np.asarray(model.coefficients())[0]
+        names = np.array(model.get_feature_names())
+        order = np.argsort(-np.abs(weights))
+        active = int(np.count_nonzero(weights))
+        return (
+            f"{active} of {weights.size} terms: " + ", ".join(names[order][: min(active, 4)]) + " …"
+        )
+
+    return learned("SINDy", fitted, held_out, sindy(best, keep), says, start)
+
+
+# -- Gaussian process ------------------------------------------------------------------------------
+
+
+def process(squeezed: bool, keep: dict, seed: int = 0) -> Learner:
+    """A Gaussian-process discrepancy over position and velocity, at most some points of all runs.
+
+    Its lengths are the same everywhere, so that the velocity may also be squeezed about its zero.
+    """
+    from sklearn.gaussian_process import GaussianProcessRegressor, kernels
+
+    def learn(runs: Sequence[RunResidual]):
+        rng = np.random.default_rng(seed)
+        X = np.concatenate([places(run.coordinates, squeezed) for run in runs])
+        y = np.concatenate([run.residual for run in runs])
+        chosen = rng.permutation(y.size)[:POINTS]
+        kernel = kernels.ConstantKernel(1.0, (1e-3, 1e4)) * kernels.RBF(
+            [0.3, 0.3], (1e-3, 1e3)
+        ) + kernels.WhiteKernel(1.0, (0.1, 1e3))
+        model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model.fit(X[chosen], y[chosen])
+        keep["model"] = model
+        return lambda coordinates: model.predict(places(coordinates, squeezed))
+
+    return learn
+
+
+def with_process(fitted, held_out) -> Found:
+    """The velocity is squeezed if the marginal likelihood is higher so."""
+    start, likelihood = time.process_time(), {}
+    for squeezed in (False, True):
+        keep: dict = {}
+        process(squeezed, keep)(fitted)
+        likelihood[squeezed] = keep["model"].log_marginal_likelihood_value_
+    best, keep = max(likelihood, key=likelihood.get), {}
+
+    def says() -> str:
+        lengths = keep["model"].kernel_.k1.k2.length_scale
+        over = "squeezed velocity" if best else "velocity"
+        scales = f"{lengths[0]:.2g} of the position and {lengths[1]:.2g} of the {over}"
+        return f"a surface that varies over {scales}"
+
+    return learned("Gaussian process", fitted, held_out, process(best, keep), says, start)
+
+
+# -- all of them -----------------------------------------------------------------------------------
+
+
+def with_close(task, state: State) -> Found:
+    """The closed loop, without sampling."""
+    from bayesoleo.workflow.closing import run_loop
+
+    start = time.process_time()
+    loop = run_loop(task, 4, lambda _: None)
+    left = [(run, run.residual) for run in residuals(loop.final)[1]]
+    fit, texts = loop.final.fit, []
+    for step in loop.final.assembly.steps:
+        entry = next(r for r in loop.rounds if r.accepted and r.accepted.effect == step.effect.id)
+        own = (*entry.accepted.score.names, *entry.accepted.score.shapes)
+        values = [_value(fit, name) for name in own if name in fit.values]
+        same = f" (or {', '.join(entry.accepted.same)})" if entry.accepted.same else ""
+        texts.append(f"{step.effect.id}{same}: {', '.join(values[:3])}")
+    says = "; ".join(texts) or loop.rounds[-1].reason
+    return judge("close", left, time.process_time() - start, says)
+
+
+def _value(fit, name: str) -> str:
+    """A parameter with its standard deviation and unit."""
+    sd = float(fit.point.sd[fit.problem.names.index(name)])
+    unit = fit.model.parameters[name].unit if name in fit.model.parameters else ""
+    return f"{name} = {format_number(fit.values[name], sd)} ± {sd:.2g} {unit}".strip()
+
+
+def measure(campaign: Path, model: str) -> list[Found]:
+    """All ways on one campaign."""
+    settings = bayesoleo.Settings(jobs=1)
+    task = workflow.prepare(campaign, bayesoleo.system(model), settings)
+    state = fit_state(task.assembly, task.roles, settings.numerics)
+    fitted, held_out = residuals(state)
+    left = [(run, run.residual) for run in held_out]
+    found = [judge("the model as declared", left, 0.0, "")]
+    for way in (with_surface, with_sindy, with_process):
+        with contextlib.suppress(ImportError):
+            found.append(way(fitted, held_out))
+    return [*found, with_close(task, state)]
+
+
+def print_table(name: str, found: Sequence[Found]) -> None:
+    """One line each, what it says below."""
+    print(f"{name}: {OUTPUT} on runs not used, over the noise")
+    print(f"{'':26}{'rms':>8}{'repeating':>11}{'CPU s':>8}")
+    for one in found:
+        print(f"{one.way:26}{one.rms:8.3f}{one.repeating:11.2f}{one.seconds:8.1f}")
+    print()
+    for one in found:
+        if one.says:
+            print(f"{one.way} says: {one.says}")
+    print()
+
+
+def draw(results: dict[str, Sequence[Found]]) -> Figure:
+    """What each way leaves that repeats, over the noise, one panel for each campaign."""
+    figure = style.blank(style.WIDTH, 2.6)
+    for k, (name, found) in enumerate(results.items()):
+        axes = figure.add_axes((0.2 + 0.41 * k, 0.22, 0.36, 0.62))
+        style.dress(axes)
+        colours = [style.BEFORE, *[style.NEUTRAL] * (len(found) - 2), style.AFTER]
+        axes.barh(range(len(found)), [one.repeating for one in found], 0.7, color=colours)
+        axes.axvline(1.0, color=style.INK, lw=1)
+        axes.set_yticks(range(len(found)), [one.way for one in found] if k == 0 else [])
+        axes.invert_yaxis()
+        axes.set_title(name, loc="left", fontsize=style.TEXT, fontweight="bold")
+        axes.set_xlabel("what repeats on runs not used, over its noise", fontsize=style.TEXT)
+    return figure
+
+
+def main() -> None:
+    """Measure, and print a table or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("campaigns", nargs="*", default=["shaker-breakaway", "shaker-wall"])
+    options = parser.parse_args()
+    root, flat = Path(os.environ["BAYESOLEO_DATA"]) / "campaigns", {}
+    for name in options.campaigns:
+        with contextlib.redirect_stdout(io.StringIO()):
+            found = measure(root / name, "f16n2d2")
+        for one in found:
+            key = f"{name}_{one.way}".replace(" ", "_").replace("-", "_").lower()
+            flat |= {
+                f"{key}_rms": one.rms,
+                f"{key}_repeating": one.repeating,
+                f"{key}_cpu_s": one.seconds,
+            }
+        if not options.json:
+            print_table(name, found)
+    if options.json:
+        print(json.dumps(flat, indent=1))
+
+
+if __name__ == "__main__":
+    main()

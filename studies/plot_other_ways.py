@@ -1,0 +1,61 @@
+r"""
+Other ways to find what is missing
+==================================
+
+A residual can be learned without asking what it is: by a polynomial surface over position and
+velocity, by sparse regression on a library of terms (SINDy), by a Gaussian process. Here each gets
+the same residual as the closed loop, and is judged on the same runs that were not used.
+"""
+
+# %%
+# The data are two simulated campaigns of an oleo, each with one effect that the model ``f16n2d2``
+# lacks: a **breakaway** friction (Stribeck), which is a function of velocity, and the heat
+# capacity of the **wall**, which is a function of what happened before. Fourteen runs each, three
+# held out.
+#
+# Each way gets its fair best. The *surface* (Masri and Caughey, 1979) may take any degree up to
+# nine and squeeze the velocity about its zero. *SINDy* (Brunton, Proctor and Kutz, 2016, by
+# ``pysindy``) gets polynomials of third order in position, velocity and pressure, smooth signs of
+# the velocity of four widths, also times the pressure, and any threshold. The *Gaussian process*
+# (Kennedy and O'Hagan, 2001, by ``scikit-learn``) gets its lengths and noise by marginal
+# likelihood, and may squeeze the velocity too. What is to be chosen is chosen on the fitted runs
+# alone.
+#
+# ``rms`` is that of the force residual over the noise of a sample, ``repeating`` that of its
+# average over the periods over the noise of that average: both are one where nothing is left.
+
+from other_ways import draw, measure, print_table
+from stored import Study
+
+import bayesoleo
+
+print(bayesoleo.system("f16n2d2").name, "and what it lacks")
+
+breakaway = Study("other_ways_breakaway", data="campaigns/shaker-breakaway", slow=True)
+friction = breakaway.run(lambda: measure(breakaway.folder, "f16n2d2"))
+breakaway.text("table", lambda: print_table("breakaway", friction))
+
+# %%
+# A friction is a function of the velocity, so that every way that is given the velocity on the
+# right scale can learn it, and predicts as well as the loop does. What it says of the cause is
+# another matter: coefficients, terms that stand in for the law, or a length over which the surface
+# varies. The loop names the law, with its size and its speed in physical units and their
+# uncertainty. The data were made with 140 N at 6 mm/s.
+
+wall = Study("other_ways_wall", data="campaigns/shaker-wall", slow=True)
+heat = wall.run(lambda: measure(wall.folder, "f16n2d2"))
+wall.text("table", lambda: print_table("wall", heat))
+
+# %%
+# The heat that a wall stores depends on the past. No function of the present position, velocity
+# and pressure equals it: what these ways learn goes along with it in the fitted runs, and helps
+# little in the others, or makes their error larger. An effect may bring a state of its own, and
+# the loop finds the right one. The data were made with 1.50 W/K, that is 0.667 K/W, and 12.0 J/K,
+# which is 8.0 s.
+
+figure = wall.figure("bars", lambda: draw({"breakaway": friction, "wall": heat}))
+
+# %%
+# With ``BAYESOLEO_STORE_FIGURES=1`` this page runs anew, and ``python studies/other_ways.py
+# --json`` prints the numbers alone. ``pysindy`` and ``scikit-learn`` come with the dependency
+# group ``bench``; a way that is not installed is left out.
