@@ -9,8 +9,11 @@ import sympy as sp
 from sympy.printing.latex import LatexPrinter
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.expressions import split_derivative
+from bayesoleo.model.expressions import bspline, split_derivative
 from bayesoleo.model.text import as_text
+
+#: Splines that a formula shows one by one.
+MOST_SPLINES = 4
 
 
 def as_latex(expression: sp.Expr, model: Model) -> str:
@@ -48,10 +51,20 @@ def equations_latex(model: Model) -> list[str]:
     def upright(name: str) -> str:
         return "\\mathrm{" + name.replace("_", "\\_") + "}"
 
-    lines = [f"{upright(k)} = {as_latex(body, model)}" for k, body in model.definitions.items()]
+    lines = [f"{upright(k)} = {_body(body, model)}" for k, body in model.definitions.items()]
     lines += [f"{total(terms)} = 0" for terms in model.equations.values()]
     lines += [f"{upright(k)} = {total(model.output_terms(k))}" for k in model.outputs]
     return lines
+
+
+def _body(body: sp.Expr, model: Model) -> str:
+    """A definition; of a curve made of many splines only what it follows."""
+    splines = body.atoms(bspline)
+    if len(splines) <= MOST_SPLINES:
+        return as_latex(body, model)
+    followed = {item for spline in splines for item in spline.free_symbols}
+    names = sorted(_latex_symbol(item, model) for item in followed)
+    return rf"\sum_k a_k \, B_k({', '.join(names)})"
 
 
 def _sum_text(terms: Mapping[str, sp.Expr]) -> str:

@@ -11,8 +11,9 @@ from small_campaigns import damper, damper_campaign, oscillator_campaign, spring
 from bayesoleo import schema
 from bayesoleo.effects import find_effect
 from bayesoleo.effects.unnamed import Axis, Spline, bspline_values
+from bayesoleo.model.document import from_document, to_document
 from bayesoleo.model.expressions import symbol
-from bayesoleo.systems import system
+from bayesoleo.systems import equations_latex, system
 from bayesoleo.tracing.assembly import Assembly
 from bayesoleo.tracing.loop import close_loop
 from bayesoleo.tracing.result import loop_groups
@@ -83,6 +84,16 @@ def test_the_curve_is_kept_and_told(strange):
     first = first["candidates"][0]
     assert first["family"] == "unnamed"
     assert first["closest"][0]["effect"]
+
+
+def test_the_formula_of_a_curve_can_be_read_and_the_model_kept(strange):
+    model = strange.final.fit.model
+    assert max(map(len, equations_latex(model))) < 300
+    assert any("B_k" in text for text in equations_latex(model))
+    again = from_document(to_document(model))
+    at = {**model.nominal(), symbol("displacement"): 0.004, symbol("dot(displacement)"): 0.01}
+    values = [float(item.output("force").xreplace(at).evalf(20)) for item in (model, again)]
+    assert values[0] == pytest.approx(values[1], rel=1e-12)
 
 
 def test_plain_data_get_no_curve(tmp_path):
