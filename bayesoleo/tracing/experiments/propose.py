@@ -146,25 +146,8 @@ def propose_runs(
     drive = drive_of(rivals, records)
     outputs = rivals[0].fit.predictor.outputs
     chosen = Limits.of(records, drive, outputs) if limits is None else limits
-    noise = expected_noise(errors)
-    known = [Knowledge.of(rival.fit) for rival in rivals]
-    spread = _input_variance(records, drive)
-
-    def judge(run: Planned | Record) -> Trial | str:
-        record = _blank(run, records, drive, outputs, spread)
-        found = [foresee(r, k, record, noise) for r, k in zip(rivals, known, strict=True)]
-        failed = [item for item in found if isinstance(item, Status)]
-        if failed:
-            return failed[0].message
-        solved = [item for item in found if not isinstance(item, Status)]
-        if isinstance(run, Planned) and not _inside(chosen, outputs, [y for _, y in solved]):
-            return BEYOND_LIMITS
-        separation = separate([item for item, _ in solved])
-        if isinstance(run, Planned):
-            return Trial(run.frequency, run.mean, run.amplitude, separation)
-        move = Motion.of(run, drive)
-        return Trial(run.frequency, move.mean, move.amplitude, separation, run.label)
-
+    known = tuple(Knowledge.of(rival.fit) for rival in rivals)
+    judge = _Judge(tuple(rivals), known, tuple(records), drive, chosen, expected_noise(errors))
     with single_blas_thread():
         planned = thread_map(judge, planned_runs(chosen, records, drive), jobs)
         repeated = thread_map(judge, list(records), jobs)
@@ -176,6 +159,45 @@ def propose_runs(
         tuple(item for item in repeated if isinstance(item, Trial)),
         Counter(item for item in planned if isinstance(item, str)),
     )
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Foresees a run, planned or made, with all rivals, and tells how well it separates them."""
+
+    rivals: tuple[Rival, ...]
+    known: tuple[Knowledge, ...]
+    records: tuple[Record, ...]
+    drive: str
+    limits: Limits
+    noise: Mapping[str, float]
+
+    def __call__(self, run: Planned | Record) -> Trial | str:
+        """The trial, or why there is none."""
+        record, outputs = self._blank(run), self.rivals[0].fit.predictor.outputs
+        pairs = zip(self.rivals, self.known, strict=True)
+        found = [foresee(rival, known, record, self.noise) for rival, known in pairs]
+        failed = [item for item in found if isinstance(item, Status)]
+        if failed:
+            return failed[0].message
+        solved = [item for item in found if not isinstance(item, Status)]
+        if isinstance(run, Planned) and not _inside(self.limits, outputs, [y for _, y in solved]):
+            return BEYOND_LIMITS
+        separation = separate([item for item, _ in solved])
+        if isinstance(run, Planned):
+            return Trial(run.frequency, run.mean, run.amplitude, separation)
+        move = Motion.of(run, self.drive)
+        return Trial(run.frequency, move.mean, move.amplitude, separation, run.label)
+
+    def _blank(self, run: Planned | Record) -> Record:
+        """The run without its answers; a planned one under the conditions of the nearest made."""
+        outputs = self.rivals[0].fit.predictor.outputs
+        if isinstance(run, Record):
+            return blank_record(run, run.frequency, self.drive, run.harmonics[self.drive], outputs)
+        item, spread = run.waveform, _input_variance(self.records, self.drive)
+        waveform = replace(item, variances=np.full(item.orders.size, spread))
+        near = min(self.records, key=lambda record: _distance(record, run, self.drive))
+        return blank_record(near, run.frequency, self.drive, waveform, outputs)
 
 
 def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
@@ -236,21 +258,6 @@ def _input_variance(records: Sequence[Record], drive: str) -> float:
     """Variance of a coefficient of the driving channel, the median over runs."""
     known = [item.variances[item.orders > 0] for item in (r.harmonics[drive] for r in records)]
     return float(np.median(np.concatenate(known)))
-
-
-def _blank(
-    run: Planned | Record,
-    records: Sequence[Record],
-    drive: str,
-    outputs: tuple[str, ...],
-    spread: float,
-) -> Record:
-    if isinstance(run, Record):
-        return blank_record(run, run.frequency, drive, run.harmonics[drive], outputs)
-    item = run.waveform
-    waveform = replace(item, variances=np.full(item.orders.size, spread))
-    near = min(records, key=lambda record: _distance(record, run, drive))
-    return blank_record(near, run.frequency, drive, waveform, outputs)
 
 
 def _distance(record: Record, run: Planned, drive: str) -> float:
