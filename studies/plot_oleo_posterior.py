@@ -91,10 +91,10 @@ figure_force = plots.predictive(tree, "force")
 # **Other errors.** The same with a variance for each run, and with a discrepancy that repeats every
 # period. Under the discrepancy the slope comes near its truth while the base moves away from it:
 # what is missing may be taken for friction or for a discrepancy, and a discrepancy that is smooth
-# would rather be a step that lasts for half a cycle than the spike that it was (figure). An error model widens intervals; it does not make a wrong model right. Leaving out one run
-# at a time (``arviz.loo``) tells the error models apart. Importance sampling cannot leave out a
-# quarter of the data, and says so by a Pareto k above 0.7, but differences of this size need no
-# digits.
+# would rather be a step that lasts for half a cycle than the spike that it was (figure). An error
+# model widens intervals; it does not make a wrong model right. Leaving out one run at a time
+# (``arviz.loo``) tells the error models apart. Importance sampling cannot leave out a quarter of
+# the data, and says so by a Pareto k above 0.7, but differences of this size need no digits.
 
 study = Study("oleo_posterior", slow=True)
 trees = study.run(
