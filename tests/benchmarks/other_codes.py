@@ -16,7 +16,9 @@ from bayesoleo.model import Model
 #: Absolute tolerances are a part of the relative one, over the states' sizes: that one rules.
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 MOST_PERIODS = 200
-NAMES = ("lsoda", "lsoda_compiled", "bvp")
+#: LSODA three times: its right-hand side with NumPy's functions, as SciPy's examples have it; with
+#: those of ``math`` on Python's numbers, three times as fast; and compiled.
+NAMES = ("lsoda", "lsoda_python", "lsoda_compiled", "bvp")
 #: First mesh of ``solve_bvp``, as fine as the discretisation's; and where it may give up.
 NODES, MOST_NODES = 801, 100_000
 
@@ -30,7 +32,8 @@ def measure(model: Model, cases: list[Case]) -> dict[str, float]:
         force, frequency = case.record.harmonics["force"], case.record.frequency
         fast = bind(case.p, force, frequency)
         fast.rates(0.0, case.scale)  # compiles
-        rows["lsoda"].append(integrated(case, plain(explicit, case)))
+        rows["lsoda"].append(integrated(case, of_arrays(explicit, case)))
+        rows["lsoda_python"].append(integrated(case, of_numbers(explicit, case)))
         rows["lsoda_compiled"].append(integrated(case, fast.rates))
         rows["bvp"].append(boundary_value(case, fast))
     result: dict[str, float] = {}
@@ -46,19 +49,23 @@ def measure(model: Model, cases: list[Case]) -> dict[str, float]:
     return result
 
 
-def plain(explicit: Explicit, case: Case) -> Callable[[float, Array], list[float]]:
-    """The right-hand side in Python, as one writes it for SciPy."""
-    function = explicit.function("math")
+def of_arrays(explicit: Explicit, case: Case) -> Callable[[float, Array], Array]:
+    """The right-hand side with NumPy's functions, arrays in and out."""
+    function, force = explicit.function("numpy"), _force_of(case)
+    return lambda t, s: np.array(function(*s, force(t), *case.p))
+
+
+def of_numbers(explicit: Explicit, case: Case) -> Callable[[float, Array], list[float]]:
+    """The right-hand side on Python's own numbers."""
+    function, force, p = explicit.function("math"), _force_of(case), case.p.tolist()
+    return lambda t, s: function(*s.tolist(), force(t), *p)
+
+
+def _force_of(case: Case) -> Callable[[float], float]:
     coefficients = dense(case.record.harmonics["force"])
     orders = np.flatnonzero(coefficients)
     turns, coefficients = 2j * np.pi * case.record.frequency * orders, coefficients[orders]
-    p = case.p.tolist()
-
-    def rates(t: float, s: Array) -> list[float]:
-        force = float(np.dot(np.exp(turns * t), coefficients).real)
-        return function(*s.tolist(), force, *p)
-
-    return rates
+    return lambda t: float(np.dot(np.exp(turns * t), coefficients).real)
 
 
 def integrated(case: Case, rates: Callable) -> tuple[float, float]:

@@ -11,7 +11,7 @@ time, summed over threads.
 ``density``     one log density of the campaign
 ``equal``       both schemes at errors of 1e-5 and 1e-8
 ``scaling``     exponents of the cost
-``scipy``       LSODA until the motion repeats (right-hand side in Python, and compiled), solve_bvp
+``scipy``       LSODA until the motion repeats (NumPy, plain Python, compiled), solve_bvp
 ``peers``       CasADi's collocation of the same equations, shooting by Diffrax
 ``shooting``    shooting against discretisation at equal error
 ``end_stop``    the adaptive mesh on the stiffest end stop
