@@ -50,16 +50,18 @@ def solve_from_shot(
     Returns
     -------
     Solution or None
-        None where shooting finds nothing either, or cannot integrate the model.
+        None where shooting finds nothing either, or cannot integrate the model; also where kernels
+        are not compiled: an integrator that calls them back step by step takes minutes to fail.
     """
+    if not isinstance(kernels.residual, BlockKernel):
+        return None
     scheme, n = boundary.scheme, guess.shape[1]
     nodes, points = np.arange(n) / n, scheme.phases(n)
     rows = scheme.sample(guess[..., None], scheme.plan(np.zeros(1), n), boundary.step(n))
     first = np.cumsum([0, *(order + 1 for order in scheme.orders)])
     states = [int(first[j]) + k for j, order in enumerate(scheme.orders) for k in range(order)]
-    backend = "numba" if isinstance(kernels.residual, BlockKernel) else "numpy"
     try:
-        dynamics = dynamics_of(model, record, kernels.derived.active, backend)
+        dynamics = dynamics_of(model, record, kernels.derived.active)
     except ModelError:
         return None
     begin = np.ascontiguousarray(rows[0, states, 0, 0])
