@@ -26,7 +26,10 @@ def pages_with(language: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("page", pages_with("python"), ids=lambda page: page.stem)
-def test_python_of_a_page_runs_from_top_to_bottom(page: Path) -> None:
+def test_python_of_a_page_runs_from_top_to_bottom(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # pages save figures
     namespace: dict[str, object] = {}
     for number, body in enumerate(blocks(page, "python"), 1):
         exec(compile(body, f"{page.name}, Python block {number}", "exec"), namespace)
