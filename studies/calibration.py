@@ -4,7 +4,7 @@ Each replication depends on the seed and its own number; finished ones are kept 
 same command goes on where it was stopped:
 
     python studies/calibration.py spring --replications 2000 --out FOLDER --store
-    python studies/calibration.py oleo --replications 300 --out FOLDER --store
+    python studies/calibration.py oleo --replications 600 --out FOLDER --store
     python studies/calibration.py oleo-weighted --replications 1000 --out FOLDER --store
     python studies/calibration.py coverage --replications 300 --out FOLDER --store
 
