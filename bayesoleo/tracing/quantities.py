@@ -153,7 +153,8 @@ def _driven(assembly: Assembly, item: Quantity) -> sp.Expr | None:
 
 
 def _row(fit: Fit, r: int, item: sp.Symbol, phase: Array) -> Array:
-    """A symbol of the driven model: of a dof, an input or a constant."""
+    """A symbol of the driven model: of a dof, an input or a constant. Not a number where it is
+    none of them, as a channel fed back within an effect, or where the run has no solution."""
     run: RunPredictor = fit.predictor.runs[r]
     name, order = split_derivative(item)
     motions = run.known_motions()
@@ -166,4 +167,4 @@ def _row(fit: Fit, r: int, item: sp.Symbol, phase: Array) -> Array:
     if name in constants:
         present = fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
         return np.asarray(present[constants.index(name)])
-    raise ModelError(f"nothing says how {name!r} moves")
+    return np.full(phase.size, np.nan)

@@ -36,6 +36,9 @@ FEWEST_REPLACED = 2
 #: Named effects stay beside a function only if that is better by this much, which is called very
 #: strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90(430)).
 DECISIVE = 10.0
+#: Part of the excess that a name explained by itself, from which on it is not taken for the nearest
+#: to something else: a function of the same quantities repeats what it says, and adds freedom.
+OWN_RIGHT = 0.9
 #: Functions estimated before one is chosen.
 MOST_TRIED = 3
 
@@ -94,11 +97,13 @@ def with_unnamed(
     if found.p_value >= LEVEL:
         return outcome
     chances = [_Chance(state, base, found, outcome, False)] if room else []
-    if named:
+    if named and not _stands_by_itself(first):
         origin = first.before
         reference = origin.base()
         again = search(reference, origin.assembly, numerics.jobs)
         chances.append(_Chance(origin, reference, again, first, True))
+    if not chances:
+        return outcome
     reasons, common = [outcome.reason], chances[-1].base
     # What was found so far competes too: a function that explains less does not replace it.
     present = _worth(state.fit, common)
@@ -111,6 +116,11 @@ def with_unnamed(
                 return accepted
             reasons.append(reason)
     return replace(outcome, reason="; ".join(reasons))
+
+
+def _stands_by_itself(first: Round) -> bool:
+    """Whether the first effect explained nearly all of the excess alone."""
+    return first.accepted is not None and first.accepted.gain >= OWN_RIGHT
 
 
 @dataclass(frozen=True)

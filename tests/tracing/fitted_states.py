@@ -23,9 +23,14 @@ NUMERICS = Numerics(jobs=1, backend="numpy")
 Array = NDArray[np.float64]
 
 
-def fitted(reduced: ReducedCampaign, model: Model, drive: str | None = None) -> State:
+def fitted(
+    reduced: ReducedCampaign,
+    model: Model,
+    drive: str | None = None,
+    numerics: Numerics = NUMERICS,
+) -> State:
     """A model fitted to a campaign's runs."""
-    return fit_state(Assembly(model, drive), assign(reduced.records), NUMERICS)
+    return fit_state(Assembly(model, drive), assign(reduced.records), numerics)
 
 
 def options(state: State, effects: Sequence[str]) -> list[Option]:

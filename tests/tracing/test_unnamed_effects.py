@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fitted_states import NUMERICS, fitted, scored
@@ -148,8 +150,8 @@ def test_a_curve_in_an_equation_of_motion(tmp_path):
         )
 
     reduced = oscillator_campaign(tmp_path, restoring=restoring)
-    model = system("duffing")
-    state = fitted(reduced, model)
+    # Only compiled kernels follow the motion to where it settles, as one of the runs needs.
+    state = fitted(reduced, system("duffing"), numerics=replace(NUMERICS, backend="numba"))
     found = search(state.base(), state.assembly, 1)
     assert found.p_value < 0.01
     assert found.tried[0].target == "position"
