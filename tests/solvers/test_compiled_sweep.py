@@ -1,5 +1,7 @@
 """The compiled sweep of chunks takes the same iteration to the same orbit as the general one."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from periodic_problems import (
@@ -45,6 +47,22 @@ def test_orbits_agree(model, name, n):
     np.testing.assert_allclose(compiled.x, general.x, rtol=0, atol=1e-9 * size)
     # Steps with old derivatives come on top.
     assert abs(compiled.iterations[0] - general.iterations[0]) <= 1 + newton.MOST_CHORDS
+
+
+@pytest.mark.parametrize("name", ["radau3", "thesis"])
+def test_arrays_that_a_thread_keeps_carry_nothing_over(name):
+    """What a failure leaves behind is not seen by the next solve of the same sizes."""
+    boundary, p = discretised(duffing(quadratic=0.4), FORCE, 0.2, name, 65, backend="numba")
+    x = rest(boundary, 65)
+
+    def solved(constants):
+        return periodic.solve_periodic(boundary, constants, x)
+
+    with ThreadPoolExecutor(1) as fresh:
+        alone = fresh.submit(solved, p).result()
+    assert alone.status[0] == Status.CONVERGED.value
+    assert solved(np.full_like(p, np.nan)).status[0] != Status.CONVERGED.value
+    np.testing.assert_array_equal(solved(p).x, alone.x)
 
 
 def test_statuses_agree_where_the_gas_law_ends():

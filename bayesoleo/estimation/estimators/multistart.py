@@ -14,7 +14,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from bayesoleo import schema
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.estimators.estimate import estimate, polish
+from bayesoleo.estimation.estimators.estimate import Method, estimate, polish
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.problem import Array, Problem
 from bayesoleo.estimation.shown import columns
@@ -132,15 +132,18 @@ def multistart(
     InputError
         If ``rng`` is missing, or a given start does not fit.
     """
-    options = {"tolerance": tolerance, "max_iterations": max_iterations}
+
+    def from_start(start: Array, method: Method) -> PointEstimate:
+        return estimate(
+            problem, method, start=start, tolerance=tolerance, max_iterations=max_iterations
+        )
 
     def both_ways(item: tuple[int, Array]) -> list[PointEstimate]:
         index, start = item
-        direct = estimate(problem, "be", start=start, **options)  # type: ignore[arg-type]
-        robust = estimate(problem, "mbe", start=start, **options)  # type: ignore[arg-type]
-        found = [direct]
+        found, robust = [from_start(start, "be")], from_start(start, "mbe")
         if np.isfinite(robust.objective):
-            found.append(polish(problem, robust, **options))  # type: ignore[arg-type]
+            polished = polish(problem, robust, tolerance=tolerance, max_iterations=max_iterations)
+            found.append(polished)
         if progress is not None:
             progress(index, found[-1])
         return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,11 +160,11 @@ class PointEstimate:
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>{self.to_dataset()._repr_html_()}"
 
-    def to_dataset(self, **options: object) -> xr.Dataset:
+    def to_dataset(self, **options: Any) -> xr.Dataset:
         """Labelled arrays; see :func:`bayesoleo.estimation.to_dataset`."""
         from bayesoleo.estimation.estimators.table import to_dataset
 
-        return to_dataset(self, **options)  # type: ignore[arg-type]
+        return to_dataset(self, **options)
 
 
 def _listed(names: tuple[str, ...]) -> str:

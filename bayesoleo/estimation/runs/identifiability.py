@@ -58,9 +58,10 @@ def data_against_prior(
         if name not in known:
             raise InputError("no prior is given for this parameter", key=name)
     prior_sd = {name: known[name].sd for name in found}
-    held = [name for name in model.uncertain() if name not in found] if model is not None else []
+    parameters = {} if model is None else {n: model.parameters[n] for n in model.uncertain()}
+    held = [name for name in parameters if name not in found]
     for name in held:
-        prior = model.parameters[name].prior  # type: ignore[union-attr]
+        prior = parameters[name].prior
         assert prior is not None
         found[name] = prior_sd[name] = prior.sd
     width = np.array([prior_sd[name] for name in found])
