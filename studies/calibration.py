@@ -39,7 +39,7 @@ from bayesoleo.posterior import (
     laplace_mixture,
 )
 from bayesoleo.posterior import sample as draw
-from bayesoleo.posterior.calibration import DRAWS, rank_of, uniformity
+from bayesoleo.posterior.outcome.calibration import DRAWS, rank_of, uniformity
 from bayesoleo.storage.slots import Slots
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.posterior import LogDensity, importance_sample, laplace_mixture
 from bayesoleo.posterior import sample as draw
-from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
+from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
 
 Arrays = dict[str, NDArray]
 #: Ninety-per-cent intervals.

@@ -18,7 +18,7 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.systems.drop import drop_test
 from bayesoleo.systems.verbeek import TABLE_6_7
-from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 
 Fits = Mapping[str, tuple[Fit, Model]]
 

@@ -37,15 +37,15 @@ from bayesoleo.model import Model, driven_by
 from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
 from bayesoleo.simulation import to_simulated_run
 from bayesoleo.systems import system
-from bayesoleo.tracing.assembly import Assembly, Option
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.loop import close_loop
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.rounds import LEVEL
-from bayesoleo.tracing.scales import scales_of
-from bayesoleo.tracing.score import score_all
-from bayesoleo.tracing.significance import effective_tests
-from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.rounds import LEVEL
+from bayesoleo.tracing.deciding.state import State, fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly, Option
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import score_all
+from bayesoleo.tracing.scoring.significance import effective_tests
 
 SYSTEM, DRIVE = "f16n2d2", "displacement"
 REPLICATIONS, PLAIN = 5, 200

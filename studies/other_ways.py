@@ -28,7 +28,7 @@ import bayesoleo
 from bayesoleo import workflow
 from bayesoleo.plots import style
 from bayesoleo.plots.units import format_number
-from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.deciding.state import State, fit_state
 
 OUTPUT = "force"
 #: Degrees of the surface, thresholds of SINDy for columns of unit norm in noise units, points

@@ -16,7 +16,7 @@ import bayesoleo
 from bayesoleo import Normal, driven_by
 from bayesoleo.data import dataset_folder
 from bayesoleo.estimation import FunctionProblem, Shown, sampling_distribution
-from bayesoleo.tracing.fit import Numerics, fit_model
+from bayesoleo.tracing.fitting.fit import Numerics, fit_model
 
 POSITION = np.linspace(0.0, 0.9, 100)
 EXPONENT = 1.2

@@ -19,7 +19,7 @@ import bayesoleo
 from bayesoleo import Model, Parameter, driven_by
 from bayesoleo.data import ReducedCampaign
 from bayesoleo.errors import InputError
-from bayesoleo.tracing.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 
 #: Models by physics and variant; ``thesis`` leaves theta_4 and theta_6 unlinked.
 MODELS = {

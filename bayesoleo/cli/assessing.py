@@ -247,7 +247,7 @@ def replicate(
     from bayesoleo.estimation import sampling_distribution
     from bayesoleo.modelfile import load_model
     from bayesoleo.storage import provenance, write_tree
-    from bayesoleo.tracing.fit import fit_model
+    from bayesoleo.tracing.fitting.fit import fit_model
 
     if out is not None:
         shell.check_writable(out)

@@ -202,7 +202,7 @@ def settings(
         If there is no such scheme or error model, or the file of effects cannot be used.
     """
     from bayesoleo.modelfile import load_effects
-    from bayesoleo.posterior.error_models import check_word
+    from bayesoleo.posterior.density.error_models import check_word
     from bayesoleo.workflow import Settings
 
     if scheme not in SCHEMES:

@@ -155,7 +155,7 @@ def _write_records(reduced: ReducedCampaign, out: Path) -> None:
     import xarray as xr
 
     from bayesoleo.storage import provenance, write_tree
-    from bayesoleo.tracing.result import records_tree
+    from bayesoleo.tracing.outcome.result import records_tree
 
     campaign = reduced.campaign
     tree = xr.DataTree.from_dict(records_tree(list(reduced.records), campaign))

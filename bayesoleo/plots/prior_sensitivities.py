@@ -21,7 +21,7 @@ def prior_sensitivity(data: xr.Dataset) -> Figure:
     Parameters
     ----------
     data : xarray.Dataset
-        From :func:`bayesoleo.posterior.prior_sensitivity`.
+        From :func:`bayesoleo.posterior.outcome.prior_sensitivity`.
 
     Returns
     -------

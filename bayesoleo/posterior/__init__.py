@@ -1,18 +1,18 @@
 """Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
 
-from bayesoleo.posterior.comparison import compare, comparison_text
-from bayesoleo.posterior.density import LogDensity
-from bayesoleo.posterior.diagnostics import Comparison, compare_with_point
-from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
-from bayesoleo.posterior.hierarchy import hierarchical
-from bayesoleo.posterior.importance import Weighted, importance_sample
-from bayesoleo.posterior.laplace import Mode, find_mode, laplace_mixture
-from bayesoleo.posterior.mixture import Mixture
-from bayesoleo.posterior.predictive import choose_draws
-from bayesoleo.posterior.prior_sensitivity import prior_sensitivity
-from bayesoleo.posterior.sample import sample
-from bayesoleo.posterior.samples import Samples
-from bayesoleo.posterior.tree import to_datasets
+from bayesoleo.posterior.approximation.importance import Weighted, importance_sample
+from bayesoleo.posterior.approximation.laplace import Mode, find_mode, laplace_mixture
+from bayesoleo.posterior.approximation.mixture import Mixture
+from bayesoleo.posterior.density.error_models import ERROR_MODELS, error_model
+from bayesoleo.posterior.density.hierarchy import hierarchical
+from bayesoleo.posterior.density.log_density import LogDensity
+from bayesoleo.posterior.outcome.comparison import compare, comparison_text
+from bayesoleo.posterior.outcome.predictive import choose_draws
+from bayesoleo.posterior.outcome.prior_sensitivity import prior_sensitivity
+from bayesoleo.posterior.outcome.tree import to_datasets
+from bayesoleo.posterior.sampling.diagnostics import Comparison, compare_with_point
+from bayesoleo.posterior.sampling.sample import sample
+from bayesoleo.posterior.sampling.samples import Samples
 
 __all__ = [
     "ERROR_MODELS",

@@ -12,8 +12,8 @@ from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.plots.rankings import format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
-from bayesoleo.tracing.confirmation import LEAST_SHARE
-from bayesoleo.tracing.rounds import LEVEL
+from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
+from bayesoleo.tracing.deciding.rounds import LEVEL
 
 FLOOR = 1.15
 """A ratio of repeating error to noise below which a run is taken to be explained."""

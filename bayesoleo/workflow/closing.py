@@ -8,8 +8,8 @@ from pathlib import Path
 import xarray as xr
 
 from bayesoleo.model import Model
+from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop
 from bayesoleo.tracing.experiments.questions import Question, questions_of
-from bayesoleo.tracing.loop import ClosedLoop, close_loop
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.sampling import draw
 from bayesoleo.workflow.settings import Settings

@@ -10,9 +10,9 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo.estimation.runs.per_run import by_run_dataset
 from bayesoleo.model import Model
-from bayesoleo.tracing.fit import Fit, fit_model
-from bayesoleo.tracing.inference import at_mode, mode_group, mode_of
-from bayesoleo.tracing.result import point_group
+from bayesoleo.tracing.fitting.fit import Fit, fit_model
+from bayesoleo.tracing.outcome.inference import at_mode, mode_group, mode_of
+from bayesoleo.tracing.outcome.result import point_group
 from bayesoleo.workflow.result import finish
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.task import Say, Source, prepare, silent

@@ -16,12 +16,17 @@ from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.report import write_report
 from bayesoleo.storage import provenance, write_text_atomic, write_tree
 from bayesoleo.systems import equations, equations_latex
+from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.experiments.questions import Question
 from bayesoleo.tracing.experiments.stored import proposals_entry, proposals_group
-from bayesoleo.tracing.fit import Fit
-from bayesoleo.tracing.loop import ClosedLoop
-from bayesoleo.tracing.result import loop_groups, point_group, posterior_groups, records_tree
-from bayesoleo.tracing.summary import summarise
+from bayesoleo.tracing.fitting.fit import Fit
+from bayesoleo.tracing.outcome.result import (
+    loop_groups,
+    point_group,
+    posterior_groups,
+    records_tree,
+)
+from bayesoleo.tracing.outcome.summary import summarise
 from bayesoleo.workflow.task import Say, Task
 
 RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"

@@ -12,9 +12,9 @@ from bayesoleo import schema
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
-from bayesoleo.tracing.fit import Fit, fit_model
-from bayesoleo.tracing.inference import mixture_at
-from bayesoleo.tracing.result import point_group, posterior_groups, predictive_groups
+from bayesoleo.tracing.fitting.fit import Fit, fit_model
+from bayesoleo.tracing.outcome.inference import mixture_at
+from bayesoleo.tracing.outcome.result import point_group, posterior_groups, predictive_groups
 from bayesoleo.workflow.estimating import under_error_model
 from bayesoleo.workflow.result import finish
 from bayesoleo.workflow.settings import Settings

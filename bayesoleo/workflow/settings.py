@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bayesoleo.effects import Effect
-from bayesoleo.posterior.error_models import ERROR_MODELS
+from bayesoleo.posterior.density.error_models import ERROR_MODELS
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.inference import Inference
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.outcome.inference import Inference
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,11 @@ class Settings:
         What is estimated within its declared tolerance: conditions by run (``sd``), offset and gain
         of sensors (``accuracy``).
     error_model : {"independent", "per-run", "full", "correlated", "discrepancy", ...}
-        What the errors of the outputs have in common; see :mod:`bayesoleo.posterior.error_models`.
+        What the errors of the outputs have in common; see
+        :mod:`bayesoleo.posterior.density.error_models`.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated; see
-        :mod:`bayesoleo.posterior.hierarchy`.
+        :mod:`bayesoleo.posterior.density.hierarchy`.
     """
 
     seed: int = 0

@@ -22,9 +22,9 @@ from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.fit import first_steps
-from bayesoleo.tracing.roles import Roles, assign
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import first_steps
+from bayesoleo.tracing.fitting.roles import Roles, assign
 from bayesoleo.workflow.settings import Settings
 
 Say = Callable[[str], None]

@@ -26,7 +26,7 @@ from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model.priors import Normal
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.systems import system
-from bayesoleo.tracing.fit import RESOLUTION, first_steps
+from bayesoleo.tracing.fitting.fit import RESOLUTION, first_steps
 from bayesoleo.workflow import Settings, prepare, reduce
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "estimation"))

@@ -12,7 +12,7 @@ from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.model import driven_by
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.systems import system
-from bayesoleo.tracing.fit import Numerics, fit_model
+from bayesoleo.tracing.fitting.fit import Numerics, fit_model
 
 
 @dataclass(frozen=True)

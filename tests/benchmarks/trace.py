@@ -25,11 +25,11 @@ import numpy as np
 
 from bayesoleo.data import ReducedCampaign, dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.systems import system
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.rounds import examine
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.rounds import examine
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import assign
 
 FOURTEEN_RUNS = "shaker-wall"
 

@@ -16,8 +16,8 @@ from bayesoleo.model.document import from_document, to_document
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.systems import system
-from bayesoleo.tracing.fit import Numerics, fit_model
-from bayesoleo.tracing.holdout import predict_held_out
+from bayesoleo.tracing.errors.holdout import predict_held_out
+from bayesoleo.tracing.fitting.fit import Numerics, fit_model
 from bayesoleo.workflow import Settings
 from bayesoleo.workflow import estimate as estimate_campaign
 

@@ -8,10 +8,10 @@ from scipy import integrate, special, stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.error_models import ERROR_MODELS, error_model
-from bayesoleo.posterior.error_models.correlated import covariance
-from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
-from bayesoleo.posterior.predictive import sd_of_averages
+from bayesoleo.posterior.density.error_models import ERROR_MODELS, error_model
+from bayesoleo.posterior.density.error_models.correlated import covariance
+from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
+from bayesoleo.posterior.outcome.predictive import sd_of_averages
 
 
 @dataclass

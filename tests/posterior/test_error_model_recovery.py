@@ -15,7 +15,7 @@ from bayesoleo.posterior import (
     sample,
     to_datasets,
 )
-from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
+from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
 
 RUNS, PERIODS, COUNT = 4, 4, 200
 

@@ -12,7 +12,7 @@ from kill_target import run
 from posterior_targets import Gaussian
 
 from bayesoleo.errors import ResultsError
-from bayesoleo.posterior import checkpoint
+from bayesoleo.posterior.sampling import checkpoint
 from bayesoleo.storage import atomic
 
 CHILD = Path(__file__).with_name("kill_target.py")

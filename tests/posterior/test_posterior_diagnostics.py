@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.posterior import compare_with_point
-from bayesoleo.posterior.diagnostics import (
+from bayesoleo.posterior.sampling.diagnostics import (
     autocorrelation_time,
     effective_size,
     nested_rhat,

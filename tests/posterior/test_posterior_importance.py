@@ -7,8 +7,8 @@ from scipy import stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import Mixture, importance_sample
-from bayesoleo.posterior.differences import derivatives
-from bayesoleo.posterior.error_models.fitted_start import climb
+from bayesoleo.posterior.density.differences import derivatives
+from bayesoleo.posterior.density.error_models.fitted_start import climb
 
 TAILS = np.array([0.05, 0.5, 0.95])
 

@@ -10,8 +10,8 @@ from scipy import stats
 from bayesoleo.errors import InputError
 from bayesoleo.model.priors import Normal
 from bayesoleo.posterior import LogDensity, Mixture, Mode, find_mode, laplace_mixture
-from bayesoleo.posterior.laplace import gauss_newton_covariance, mixture_of
-from bayesoleo.posterior.mixture import DEGREES_OF_FREEDOM
+from bayesoleo.posterior.approximation.laplace import gauss_newton_covariance, mixture_of
+from bayesoleo.posterior.approximation.mixture import DEGREES_OF_FREEDOM
 from bayesoleo.solvers.status import Status
 
 

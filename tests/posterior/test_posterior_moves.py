@@ -7,7 +7,7 @@ from posterior_targets import Gaussian
 from scipy import stats
 
 from bayesoleo.posterior import Mixture
-from bayesoleo.posterior.moves import (
+from bayesoleo.posterior.sampling.moves import (
     Counted,
     Grouped,
     IndependenceMove,

@@ -9,7 +9,7 @@ from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
-from bayesoleo.posterior.segment import REASONS
+from bayesoleo.posterior.sampling.segment import REASONS
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:

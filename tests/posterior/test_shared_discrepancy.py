@@ -8,9 +8,9 @@ from scipy import stats
 
 from bayesoleo.estimation.problems.campaign_problem import _samples_of
 from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.error_models import error_model
-from bayesoleo.posterior.error_models.discrepancy import basis, spectrum
-from bayesoleo.posterior.error_models.shared import _dense, _diagonal
+from bayesoleo.posterior.density.error_models import error_model
+from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
+from bayesoleo.posterior.density.error_models.shared import _dense, _diagonal
 from bayesoleo.prediction.records import Harmonics, Record
 
 WORD = "shared-discrepancy"

@@ -11,12 +11,12 @@ from bayesoleo.data import ReducedCampaign
 from bayesoleo.effects import find_effect
 from bayesoleo.model import Model
 from bayesoleo.prediction.records import Record
-from bayesoleo.tracing.assembly import Assembly, Option
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.scales import scales_of
-from bayesoleo.tracing.score import Score, score_all
-from bayesoleo.tracing.state import State, fit_state
+from bayesoleo.tracing.deciding.state import State, fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly, Option
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import Score, score_all
 
 #: NumPy's kernels need no compilation; one thread, for tests run side by side.
 NUMERICS = Numerics(jobs=1, backend="numpy")

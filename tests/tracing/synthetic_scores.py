@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesoleo.data.noise_spectrum import noise_spectrum
-from bayesoleo.tracing.base import Base, RunBase
+from bayesoleo.tracing.scoring.base import Base, RunBase
 
 PER_PERIOD = 50
 

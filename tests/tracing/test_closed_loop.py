@@ -23,10 +23,10 @@ from small_campaigns import (
 from bayesoleo import schema
 from bayesoleo.effects import find_effect
 from bayesoleo.systems import system
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.loop import close_loop
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.summary import summarise
+from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.outcome.summary import summarise
 
 #: A cut through the catalogue: the loop's logic needs no more, and whole ones are marked slow.
 EFFECTS = tuple(

@@ -12,8 +12,8 @@ from small_campaigns import damper, damper_campaign
 from synthetic_scores import base_of_noise
 
 from bayesoleo.data.noise_spectrum import noise_spectrum
-from bayesoleo.tracing.colour import inflation_of
-from bayesoleo.tracing.significance import corrected_p
+from bayesoleo.tracing.scoring.colour import inflation_of
+from bayesoleo.tracing.scoring.significance import corrected_p
 
 SEEDS = 30
 

@@ -10,12 +10,12 @@ from fitted_states import NUMERICS
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.effects import find_effect
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.confirmation import fall_on_hold_out, judged
-from bayesoleo.tracing.holdout import crossed
-from bayesoleo.tracing.loop import close_loop
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.confirmation import fall_on_hold_out, judged
+from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.errors.holdout import crossed
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import assign
 
 RUNS = (("a", 0.5, 0.010, "fit"), ("d", 0.8, 0.008, "hold-out"), ("e", 1.6, 0.006, "hold-out"))
 

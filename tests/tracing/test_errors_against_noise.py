@@ -17,8 +17,8 @@ from small_campaigns import (
 
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.solvers.status import Status
-from bayesoleo.tracing.errors_table import error_table
-from bayesoleo.tracing.holdout import Prediction
+from bayesoleo.tracing.errors.errors_table import error_table
+from bayesoleo.tracing.errors.holdout import Prediction
 
 TRUTH = {"damping": DAMPING, "stiffness": STIFFNESS, "cubic": CUBIC}
 #: More runs than usual, so that the pooled ratio is known well.

@@ -8,7 +8,13 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run
-from bayesoleo.tracing.fit import FEWEST_STEPS, LARGEST_SHIFT, Numerics, first_steps, fit_model
+from bayesoleo.tracing.fitting.fit import (
+    FEWEST_STEPS,
+    LARGEST_SHIFT,
+    Numerics,
+    first_steps,
+    fit_model,
+)
 
 MODEL = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.0, [3.0, 0.0, 0.5])}, periods=3.0)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import assign
 
 
 @pytest.mark.slow

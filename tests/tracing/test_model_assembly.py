@@ -12,7 +12,7 @@ from bayesoleo.effects import Amplitude, Effect, Scales, find_effect
 from bayesoleo.model import Normal
 from bayesoleo.model.expressions import symbol
 from bayesoleo.systems import system
-from bayesoleo.tracing.assembly import Assembly
+from bayesoleo.tracing.fitting.assembly import Assembly
 
 SCALES = Scales(
     position={"displacement": (-0.01, 0.01), "position": (-0.01, 0.01), "stroke": (0.01, 0.2)},

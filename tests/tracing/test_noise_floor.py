@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import PeriodicAverage, periodic_average
-from bayesoleo.tracing.errors_table import ErrorTable, RunError
-from bayesoleo.tracing.floor import FLOOR_RATIO, is_at_floor, limit
+from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
+from bayesoleo.tracing.errors.floor import FLOOR_RATIO, is_at_floor, limit
 
 
 def average(per_period: int, periods: int, seed: int = 0) -> PeriodicAverage:

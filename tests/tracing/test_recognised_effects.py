@@ -9,8 +9,8 @@ from small_campaigns import damper, damper_campaign, oscillator_campaign, spring
 
 from bayesoleo.effects import catalogue
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.tracing.score import score_all
-from bayesoleo.tracing.significance import classes
+from bayesoleo.tracing.scoring.score import score_all
+from bayesoleo.tracing.scoring.significance import classes
 
 
 def preload(x, v, t):

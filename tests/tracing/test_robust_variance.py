@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesoleo.tracing.robust import clustered_variance
+from bayesoleo.tracing.deciding.robust import clustered_variance
 
 SAMPLES, STRETCHES, DRAWS = 240, 6, 3000
 

@@ -10,7 +10,7 @@ from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.roles import assign
+from bayesoleo.tracing.fitting.roles import assign
 
 
 @pytest.fixture(scope="module")

@@ -23,11 +23,11 @@ from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics
 from bayesoleo.systems import system
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.base import RunBase
-from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.score import score_all
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import RunBase
+from bayesoleo.tracing.scoring.score import score_all
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from fitted_states import NUMERICS, fitted, options
 from scipy import stats
 from small_campaigns import damper, damper_campaign, spring_damper_force
 
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.roles import Roles
-from bayesoleo.tracing.score import Score, score_all
-from bayesoleo.tracing.significance import SAME, classes, corrected_p, effective_tests
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.score import Score, score_all
+from bayesoleo.tracing.scoring.significance import SAME, classes, corrected_p, effective_tests
 
 
 class Place:

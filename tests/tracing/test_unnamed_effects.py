@@ -16,13 +16,13 @@ from bayesoleo.effects.unnamed import Axis, Spline, bspline_values
 from bayesoleo.model.document import from_document, to_document
 from bayesoleo.model.expressions import symbol
 from bayesoleo.systems import equations_latex, system
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.loop import close_loop
-from bayesoleo.tracing.result import loop_groups
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.shapes import shapes
-from bayesoleo.tracing.summary import summarise
-from bayesoleo.tracing.unnamed import search
+from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.outcome.result import loop_groups
+from bayesoleo.tracing.outcome.shapes import shapes
+from bayesoleo.tracing.outcome.summary import summarise
+from bayesoleo.tracing.unnamed.search import search
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quadratic_damping", "quintic_stiffness")))
 ABOUT = {"campaign": "small", "model": "small", "drive": "displacement", "seed": 0}

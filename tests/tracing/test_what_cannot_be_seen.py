@@ -10,10 +10,10 @@ from fitted_states import fitted, options
 from small_campaigns import MASS, oscillator_campaign
 
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.tracing.base import Base, RunBase
-from bayesoleo.tracing.projection import coefficients, information_beside, squared_distance
-from bayesoleo.tracing.score import INVISIBLE, SPANNED, _evaluate, score_all
-from bayesoleo.tracing.sensitivities import Block
+from bayesoleo.tracing.scoring.base import Base, RunBase
+from bayesoleo.tracing.scoring.projection import coefficients, information_beside, squared_distance
+from bayesoleo.tracing.scoring.score import INVISIBLE, SPANNED, _evaluate, score_all
+from bayesoleo.tracing.scoring.sensitivities import Block
 
 SAMPLES = 400
 

@@ -11,8 +11,8 @@ from small_campaigns import damper
 from bayesoleo.model.drive import driven_by
 from bayesoleo.model.kernels import kernels
 from bayesoleo.systems import system
-from bayesoleo.tracing.refit import AS_LIKELY, Refit
-from bayesoleo.tracing.rounds import Ranked, _only_varies
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit
+from bayesoleo.tracing.deciding.rounds import Ranked, _only_varies
 
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 NEARLY = np.array([1.0, 0.1])

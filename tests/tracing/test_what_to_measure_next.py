@@ -13,12 +13,12 @@ from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
 from bayesoleo.model import Output
 from bayesoleo.systems import system
+from bayesoleo.tracing.deciding.rounds import examine
 from bayesoleo.tracing.experiments.foresee import Rival
 from bayesoleo.tracing.experiments.propose import propose_runs
 from bayesoleo.tracing.experiments.rig import Limits, Motion, planned_runs
 from bayesoleo.tracing.experiments.rivals import named, rivals_of, standing
-from bayesoleo.tracing.fit import fit_model
-from bayesoleo.tracing.rounds import examine
+from bayesoleo.tracing.fitting.fit import fit_model
 
 FREE = (-np.inf, np.inf)
 STIFFNESS, NOISE = 1000.0, 40.0
@@ -44,7 +44,7 @@ def examined(reduced, model, *effects):
 
 
 def _roles(reduced):
-    from bayesoleo.tracing.roles import assign
+    from bayesoleo.tracing.fitting.roles import assign
 
     return assign(reduced.records)
 

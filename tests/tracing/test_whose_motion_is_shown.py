@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from bayesoleo.model import Model, Output
-from bayesoleo.tracing.result import _place
+from bayesoleo.tracing.outcome.result import _place
 
 TWO = Model(
     "two masses on one another",

@@ -19,13 +19,13 @@ from bayesoleo.estimation import estimate, sampling_distribution
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.forecast import predict
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.assembly import Assembly
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.masked import without_masked
-from bayesoleo.tracing.roles import assign
-from bayesoleo.tracing.scales import scales_of
-from bayesoleo.tracing.score import score_all
-from bayesoleo.tracing.state import fit_state
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.masked import without_masked
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import score_all
 from bayesoleo.workflow import Settings
 
 SETTINGS = Settings(jobs=1, steps=64, quick=True)

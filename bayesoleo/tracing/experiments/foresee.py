@@ -16,7 +16,7 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.experiments.separation import Foreseen
-from bayesoleo.tracing.fit import Fit
+from bayesoleo.tracing.fitting.fit import Fit
 
 Array = NDArray[np.float64]
 

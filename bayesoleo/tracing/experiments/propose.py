@@ -13,7 +13,7 @@ from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.parallel import single_blas_thread, thread_map
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
-from bayesoleo.tracing.errors_table import ErrorTable, RunError
+from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
 from bayesoleo.tracing.experiments.foresee import (
     POINTS,
     Knowledge,

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 from bayesoleo.errors import InputError
 from bayesoleo.prediction.records import Record
-from bayesoleo.tracing.errors_table import ErrorTable, error_table
+from bayesoleo.tracing.deciding.loop import ClosedLoop
+from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.errors.errors_table import ErrorTable, error_table
+from bayesoleo.tracing.errors.holdout import predict_fitted
 from bayesoleo.tracing.experiments.foresee import Rival
 from bayesoleo.tracing.experiments.propose import Proposals, drive_of, propose_runs
 from bayesoleo.tracing.experiments.rig import Limits, Range
 from bayesoleo.tracing.experiments.rivals import label, named, rivals_of, standing
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.holdout import predict_fitted
-from bayesoleo.tracing.loop import ClosedLoop
-from bayesoleo.tracing.rounds import Ranked, Round
+from bayesoleo.tracing.fitting.fit import Numerics
 
 #: Why effects are to be told apart.
 ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"

@@ -9,11 +9,11 @@ import numpy as np
 
 from bayesoleo.errors import InputError
 from bayesoleo.parallel import thread_map
-from bayesoleo.tracing.confirmation import LEAST_SHARE
+from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
+from bayesoleo.tracing.deciding.refit import Refit, refit
+from bayesoleo.tracing.deciding.rounds import LEVEL, Ranked, Round
 from bayesoleo.tracing.experiments.foresee import Rival
-from bayesoleo.tracing.fit import Numerics
-from bayesoleo.tracing.refit import Refit, refit
-from bayesoleo.tracing.rounds import LEVEL, Ranked, Round
+from bayesoleo.tracing.fitting.fit import Numerics
 
 #: Rivals compared at most: each of them has to be estimated.
 MOST_RIVALS = 4

@@ -1,0 +1,1 @@
+"""The log posterior density: errors, unknowns and priors over coordinates without bounds."""

@@ -1,0 +1,171 @@
+r"""One full covariance over the outputs, the same for every sample.
+
+``V = D R D`` with variances ``D^2``, flat in their logarithms, and a correlation matrix ``R`` that
+is uniform over all there are. Its coordinates are :math:`\operatorname{artanh}` of canonical
+partial correlations, which any numbers make a valid ``R`` of.
+
+References
+----------
+Verbeek (1993), eqs. 2.27-2.28. Lewandowski, Kurowicka and Joe (2009), "Generating random
+correlation matrices based on vines and extended onion method", *Journal of Multivariate Analysis*
+100, sections 2 and 3 (uniform is their :math:`\eta = 1`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import betaln
+
+from bayesoleo import schema
+from bayesoleo.errors import InputError
+from bayesoleo.estimation.problems.residuals import RunSamples
+from bayesoleo.posterior.density.error_models.base import (
+    Array,
+    ErrorModel,
+    Frame,
+    Quantity,
+    log_mean_squares,
+)
+
+_LOG_2_PI = float(np.log(2 * np.pi))
+# Correlations of a start are kept so far from one that their coordinates are finite.
+_MOST = 0.999
+
+
+class FullErrors(ErrorModel):
+    """Outputs of one sample are correlated, samples are independent."""
+
+    word = "full"
+
+    def __init__(self, frame: Frame) -> None:
+        super().__init__(frame)
+        frame.sampled()
+        if len(frame.outputs) < 2:
+            raise InputError(
+                "a covariance over outputs needs two of them",
+                key="error_model",
+                value=self.word,
+                hint='use error_model="independent"',
+            )
+        if (frame.counts != frame.counts[:, :1]).any():
+            raise InputError(
+                "a covariance over outputs needs them at the same samples",
+                key="error_model",
+                value=frame.counts.tolist(),
+                hint='use error_model="independent"',
+            )
+        self._pairs = [(i, j) for i in range(len(frame.outputs)) for j in range(i)]
+
+    def _declare(self) -> tuple[Quantity, ...]:
+        outputs = self.frame.outputs
+        correlations = tuple(
+            Quantity(
+                schema.correlation(outputs[j], outputs[i]),
+                -1.0,
+                1.0,
+                long_name=f"correlation of the errors of {outputs[j]} and {outputs[i]}",
+            )
+            for i in range(len(outputs))
+            for j in range(i)
+        )
+        return (*self.frame.log_variances(), *correlations)
+
+    def _factor(self, eta: Array) -> Array:
+        """Cholesky factors of correlation matrices, shape (W, s, s), from coordinates (W, m)."""
+        s = len(self.frame.outputs)
+        factor = np.zeros((len(eta), s, s))
+        factor[:, 0, 0] = 1.0
+        left = np.ones((len(eta), s))
+        for k, (i, j) in enumerate(self._pairs):
+            partial = np.tanh(np.ascontiguousarray(eta[:, s + k]))
+            factor[:, i, j] = partial * np.sqrt(left[:, i])
+            left[:, i] *= (1 - partial) * (1 + partial)
+            factor[:, i, i] = np.sqrt(left[:, i])
+        return factor
+
+    def natural(self, eta: Array) -> Array:
+        factor, s = self._factor(eta), len(self.frame.outputs)
+        out = np.array(eta, dtype=float)
+        for k, (i, j) in enumerate(self._pairs):
+            out[:, s + k] = sum(factor[:, i, c] * factor[:, j, c] for c in range(j + 1))
+        return out
+
+    def coordinates(self, natural: Array) -> Array:
+        out, s = np.array(natural, dtype=float), len(self.frame.outputs)
+        for row in out:
+            matrix = np.eye(s)
+            for k, (i, j) in enumerate(self._pairs):
+                matrix[i, j] = matrix[j, i] = row[s + k]
+            factor = np.linalg.cholesky(matrix)
+            for k, (i, j) in enumerate(self._pairs):
+                rest = np.sqrt(1.0 - np.sum(factor[i, :j] ** 2))
+                row[s + k] = np.arctanh(factor[i, j] / rest)
+        return out
+
+    def log_prior(self, eta: Array) -> Array:
+        s = len(self.frame.outputs)
+        total = np.zeros(len(eta))
+        for k, quantity in enumerate(self.quantities[:s]):
+            total += quantity.log_prior(np.ascontiguousarray(eta[:, k]))
+        for k, (_, j) in enumerate(self._pairs):
+            # A partial correlation given j others is 2 B - 1 with B ~ Beta(a, a).
+            a = 1.0 + 0.5 * (s - 2 - j)
+            z = np.ascontiguousarray(eta[:, s + k])
+            log_rest = 2.0 * (np.log(2.0) - np.logaddexp(z, -z))  # ln(1 - tanh(z)^2)
+            total += a * log_rest - (2 * a - 1) * np.log(2.0) - betaln(a, a)
+        return total
+
+    def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, Array]:
+        s = len(self.frame.outputs)
+        found = super().sample_prior(rng, size)
+        eta = np.zeros((size, len(self.quantities)))
+        for k, (_, j) in enumerate(self._pairs):
+            a = 1.0 + 0.5 * (s - 2 - j)
+            eta[:, s + k] = np.arctanh(2 * rng.beta(a, a, size) - 1)
+        natural = self.natural(eta)
+        return found | {name: natural[:, s + k] for k, name in enumerate(self.names[s:])}
+
+    def of_run(self, run: int, residual: Array, eta: Array) -> Array:
+        s, count = len(self.frame.outputs), residual.shape[2]
+        factor, sd = self._factor(eta), np.exp(0.5 * np.ascontiguousarray(eta[:, :s]))
+        total = np.full(len(eta), -0.5 * s * count * _LOG_2_PI)
+        white = np.empty_like(residual)
+        for i in range(s):
+            row = residual[:, i] / sd[:, i, None]
+            for j in range(i):
+                row -= factor[:, i, j, None] * white[:, j]
+            white[:, i] = row / factor[:, i, i, None]
+            total -= count * np.log(sd[:, i] * factor[:, i, i])
+            for lane, row_of_lane in enumerate(white[:, i]):
+                total[lane] -= 0.5 * np.sum(row_of_lane * row_of_lane)
+        return total
+
+    def products(self, run: int, columns: Sequence[Array], eta: Array) -> Array:
+        s = len(self.frame.outputs)
+        root = np.exp(0.5 * eta[:s])[:, None] * self._factor(eta[None])[0]
+        inverse = np.linalg.inv(root)
+        white = np.einsum("ab,bkn->akn", inverse, np.stack(columns))
+        return np.asarray(np.einsum("akn,aln->kl", white, white))
+
+    def draw(
+        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+    ) -> Array:
+        white = super().draw(natural, run, samples, rng)
+        sd = np.sqrt(self.variance(natural, run))[:, :, None]
+        return np.asarray(sd * (self._factor(self.coordinates(natural)) @ (white / sd)))
+
+    def start(self, residuals: Sequence[Array]) -> Array:
+        every = np.concatenate(residuals, axis=1)
+        moments = every @ every.T
+        sd = np.sqrt(np.maximum(np.diag(moments), np.finfo(float).tiny))
+        correlation = _MOST * moments / np.outer(sd, sd)
+        natural = [correlation[i, j] for i, j in self._pairs]
+        start = np.concatenate([log_mean_squares(residuals), natural])
+        return self.coordinates(start[None])[0]
+
+    def spread(self) -> Array:
+        sd = super().spread()
+        sd[len(self.frame.outputs) :] = 1.0 / np.sqrt(self.frame.counts[:, 0].sum())
+        return sd

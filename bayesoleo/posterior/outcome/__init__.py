@@ -1,0 +1,1 @@
+"""What samples say: trees, predictions, the point estimate beside them, calibration."""

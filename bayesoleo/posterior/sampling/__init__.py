@@ -1,0 +1,1 @@
+"""Ensembles of walkers: moves, segments that survive a kill, and when to stop."""

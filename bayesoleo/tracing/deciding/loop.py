@@ -1,0 +1,226 @@
+"""The closed loop: fit, look for what is missing, add it, compare, until nothing more is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from bayesoleo import schema
+from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.rounds import Round, examine
+from bayesoleo.tracing.deciding.state import State, fit_state
+from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
+from bayesoleo.tracing.fitting.assembly import Assembly, Step
+from bayesoleo.tracing.fitting.fit import Fit, Numerics
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.projection import information_beside, squared_distance
+
+#: A constant known to a tolerance is freed if the data know it this many times better.
+FREED_BY = 2.0
+#: Part of the excess that added effects must explain for the loop to call the model's lack found.
+MOSTLY = 0.5
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Everything that happened.
+
+    Parameters
+    ----------
+    rounds : tuple of Round
+        The last one accepts nothing.
+    first, final : State
+        The model as declared - constants that had to be freed are estimated in both - and with
+        all effects that were added.
+    roles : Roles
+    notes : tuple of str
+        What a reader should know.
+    """
+
+    rounds: tuple[Round, ...]
+    first: State
+    final: State
+    roles: Roles
+    notes: tuple[str, ...]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Ids of the effects in the final model, in the order in which they were added."""
+        return tuple(effect for effect, _ in self.final.assembly.added)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Where each of them sits."""
+        return tuple(target for _, target in self.final.assembly.added)
+
+    @property
+    def verdict(self) -> str:
+        """One of the three verdicts of the summary."""
+        if not self.effects:
+            return schema.NOTHING_MISSING if self.final.at_floor else schema.UNEXPLAINED
+        if self.final.at_floor:
+            return schema.EFFECT_ADDED
+        explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
+        return schema.EFFECT_ADDED if explained > MOSTLY else schema.UNEXPLAINED
+
+
+def _excess(state: State) -> float:
+    """Squared ratio to the noise beyond one, of held-out runs where there are any."""
+    table = state.hold_errors if state.hold_errors.entries else state.fit_errors
+    return float(sum(max(entry.ratio**2 - 1.0, 0.0) for entry in table.entries))
+
+
+def close_loop(
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    effects: Sequence[Effect] | None = None,
+    seed: int = 0,
+    max_effects: int = 4,
+    unnamed: bool = True,
+    say: Say = lambda _: None,
+) -> ClosedLoop:
+    """Fit a model, and add the effects that it lacks one after the other.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        The declared model and its drive.
+    roles : Roles
+        Runs to fit and to hold out.
+    numerics : Numerics
+        Scheme, mesh, threads.
+    effects : sequence of Effect, optional
+        Instead of the catalogue.
+    seed : int
+        For the correction for the search.
+    max_effects : int
+        Effects added at most.
+    unnamed : bool
+        Whether a smooth function may be added where no named effect explains what is left.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    ClosedLoop
+    """
+    notes: list[str] = []
+    if roles.strategy != "declared":
+        notes.append(roles.description)
+    state = fit_state(assembly, roles, numerics, progress=say)
+    state = _freed(state, roles, numerics, notes, say)
+    first, rounds = state, list[Round]()
+    while True:
+        say(f"round {len(rounds) + 1}: {_ratios(state)}")
+        limit = _limit(state.assembly.steps, len(rounds), max_effects)
+        outcome = examine(state, roles, numerics, effects=effects, seed=seed, limit=limit, say=say)
+        if outcome.after is None and unnamed and max_effects > 0:
+            opening = rounds[0] if rounds else outcome
+            room = len(state.assembly.steps) < max_effects
+            outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
+        rounds.append(outcome)
+        if outcome.after is None:
+            break
+        state = _pruned(outcome.after, roles, numerics, notes, say)
+    notes += _warnings(state.fit)
+    notes += unnamed_notes(rounds)
+    notes += [f"could not be predicted: run {text}" for text in state.unsolved]
+    if not state.at_floor:
+        notes.append(
+            "intervals count independent noise only: while an error remains that repeats, they are"
+            " too narrow"
+        )
+    return ClosedLoop(tuple(rounds), first, state, roles, tuple(notes))
+
+
+def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:
+    """Why a round may only rank; empty where it may add an effect."""
+    added = len(steps)
+    if max_effects == 0:
+        return "effects were to be ranked only, and none added"
+    if any(step.effect.family == FAMILY for step in steps):
+        return "an effect without a name was added: what is left may be what its splines leave"
+    if added >= max_effects:
+        return f"as many effects as allowed, {max_effects}, have been added"
+    if rounds > 2 * max_effects:
+        return f"effects were added and removed again for {rounds} rounds"
+    return ""
+
+
+def _ratios(state: State) -> str:
+    parts = [
+        f"{role} {output} {values['ratio_to_noise']:.2f}"
+        for role, table in state.by_role.items()
+        for output, values in table.items()
+    ]
+    return "ratio to noise: " + ", ".join(parts)
+
+
+def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
+    """Estimate constants known to a tolerance where a lack of fit remains and the data know them
+    better.
+
+    A wrong constant is no missing effect, and must not be mistaken for one.
+    """
+    names = state.fit.model.uncertain()
+    if not names or state.at_floor:
+        return state
+    base = state.base()
+    known = base.gram.shape[0] - len(names)
+    chosen = []
+    for k, name in enumerate(names, start=known):
+        # In units of the tolerance, whose own information is one.
+        if information_beside(base.gram, k) - 1.0 > FREED_BY**2:
+            chosen.append(name)
+    if not chosen:
+        return state
+    say(f"free {', '.join(chosen)}, known to a tolerance only")
+    notes.append(
+        f"{', '.join(chosen)}: fixed within a tolerance, freed because a lack of fit remained"
+    )
+    values = state.assembly.model().parameters
+    assembly = state.assembly.with_parameters(
+        {name: replace(values[name], fixed=False) for name in chosen}
+    )
+    return fit_state(assembly, roles, numerics, progress=say)
+
+
+def _pruned(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
+    """Take out effects that a later one has made superfluous."""
+    for step in state.assembly.steps[:-1]:
+        if _superfluous(state.fit, step):
+            say(f"remove {step.effect.id}: its posterior no longer excludes the null")
+            notes.append(f"{step.effect.id} was removed again: a later effect made it superfluous")
+            return fit_state(state.assembly.without(step), roles, numerics, progress=say)
+    return state
+
+
+def _superfluous(fit: Fit, step: Step) -> bool:
+    index = [k for k, name in enumerate(fit.problem.names) if name.split("[")[0] in step.amplitudes]
+    value, covariance = fit.point.theta[index], fit.point.covariance[np.ix_(index, index)]
+    if not index or not np.isfinite(covariance).all():
+        return False
+    return bool(stats.chi2.sf(squared_distance(value, covariance), len(index)) > 0.05)
+
+
+def _warnings(fit: Fit) -> list[str]:
+    found = []
+    if not fit.point.status.ok:
+        found.append(
+            f"the estimate of the final model did not converge: {fit.point.status.message}"
+        )
+    if fit.point.on_limit:
+        found.append(f"at the limit of their prior's support: {', '.join(fit.point.on_limit)}")
+    if not fit.shift <= 0.1:
+        found.append(
+            f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd"
+        )
+    return found

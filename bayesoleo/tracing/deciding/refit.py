@@ -1,0 +1,289 @@
+"""Estimate an extended model, starting where its score says, and weigh what it gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
+from bayesoleo.prediction.layout import Layout
+from bayesoleo.prediction.predictor import RunPrediction
+from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.tracing.deciding.robust import clustered_variance
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.fitting.masked import weights
+from bayesoleo.tracing.scoring.base import Base, replicate
+from bayesoleo.tracing.scoring.projection import squared_distance
+from bayesoleo.tracing.scoring.score import Score
+from bayesoleo.tracing.scoring.significance import SAME
+
+Array = NDArray[np.float64]
+
+#: A new amplitude's prior is normal about its null, this many times as wide as the score expects it
+#: to be: weak, but proper.
+PRIOR_WIDTH = 10.0
+#: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
+SHAPE_SPREAD = 1.0
+#: Two effects explain the data equally well if the data are less than twenty times as likely by the
+#: one as by the other; where more than noise is left, if that differs by less than this factor.
+AS_LIKELY, AS_WELL = 2.0 * float(np.log(20.0)), 1.25
+
+
+@dataclass(frozen=True)
+class Refit:
+    """An extended model after estimation.
+
+    Parameters
+    ----------
+    score : Score
+        Of the candidate.
+    assembly : Assembly
+        With the effect and its priors in it, at the estimate.
+    fit : Fit
+        On the fitted runs.
+    share : float
+        Part of the present excess that it explains after estimation.
+    contribution : ndarray, shape (n,)
+        What it changes in the prediction, thinned, in noise units.
+    remaining : float
+        Sum of squares that it leaves beyond the noise's, and what of that noise alone could feign.
+    inflation : float
+        Variance of the new amplitudes over what white noise gives, where noise is coloured.
+    freedom : int
+        Degrees of freedom that it was measured with; zero where it is the score's.
+    fall : float
+        Of the weighted sum of squares.
+    reached : bool
+        Whether noise alone could leave what it leaves.
+    price : float
+        By which an unknown has to lower the sum to be worth it: the logarithm of the number of
+        samples (Schwarz 1978).
+    """
+
+    score: Score
+    assembly: Assembly
+    fit: Fit
+    share: float
+    contribution: Array
+    remaining: float
+    inflation: float
+    freedom: int
+    fall: float
+    reached: bool
+    price: float
+
+    def resembles(self, other: Refit) -> bool:
+        """Whether the data cannot tell two estimated effects apart.
+
+        Where both come down to the noise, the noise says how sure a difference is: effects may do
+        different things and be as likely, if they are small (Burnham and Anderson 2002, section
+        2.6), and nearly the same and not, if they are large. Where more is left a likelihood
+        promises too much, and effects that do nearly the same are not told apart.
+        """
+        if not (np.isfinite(self.share) and np.isfinite(other.share)):
+            return False
+        gap = self.worth - other.worth
+        if abs(gap) < AS_LIKELY * max(self.inflation, other.inflation):
+            return True
+        lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
+        if (self.reached and other.reached) or lengths == 0:
+            return False
+        cosine = float(self.contribution @ other.contribution) / float(lengths)
+        low, high = sorted((self.remaining, other.remaining))
+        return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
+
+    def outdoes(self, other: Score) -> bool:
+        """Whether noise alone is left, and an effect that was only scored explains less of it."""
+        mine, its = (one.fall - self.price * one.size for one in (self.score, other))
+        return self.reached and mine - its > AS_LIKELY * max(self.inflation, other.inflation)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns that the effect adds."""
+        return self.score.size
+
+    @property
+    def worth(self) -> float:
+        """Fall of the sum beyond the price of the unknowns."""
+        return self.fall - self.price * self.size
+
+    def excludes_null(self, level: float = 0.975) -> bool:
+        """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
+
+        One amplitude: the probability of its own side of zero is at least ``level``; several: zero
+        lies outside their joint region.
+        """
+        names = [name for name in self.fit.problem.names if name in self.score.names]
+        index = [self.fit.problem.names.index(name) for name in names]
+        value = self.fit.point.theta[index]
+        # Coloured noise, measured by its scatter between periods, widens the white covariance.
+        white = self.fit.point.covariance[np.ix_(index, index)]
+        covariance = white * self.inflation
+        if not np.isfinite(covariance).all():
+            return False
+        free = self.freedom or np.inf
+        if len(index) == 1:
+            return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
+        distance = squared_distance(value, covariance)
+        if self.freedom:
+            return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
+        return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
+
+
+def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
+    """Estimate the model extended by a candidate.
+
+    Parameters
+    ----------
+    base : Base
+        What the candidate was scored against.
+    score : Score
+        Gives starts and the scale of priors.
+    numerics : Numerics
+        The mesh is the present fit's.
+    """
+    assembly = score.option.assembly.with_values(base.fit.shared)
+    assembly = assembly.with_parameters(new_parameters(assembly, score))
+    model = assembly.model()
+    start = _start(base, score, model)
+    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
+    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
+    fit = fit_model(
+        model,
+        base.fit.records,
+        quick,
+        start=start,
+        tolerance=1e-4,
+        max_iterations=15,
+        share=base.fit.predictor,
+    )
+    share, contribution = compare(base, fit)
+    if not np.isfinite(share):
+        share = -np.inf  # what cannot be solved at its estimate explains nothing
+    remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
+    grown = assembly.with_values(fit.shared)
+    inflation, freedom = _inflation(fit, score)
+    fall = share * base.fall_back
+    reached = base.excess - fall < base.feigned
+    price = float(np.log(sum(run.residual.size for run in base.runs)))
+    return Refit(
+        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price
+    )
+
+
+def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
+    """Variance of the new amplitudes between stretches of the runs over white noise's, and its
+    degrees of freedom.
+
+    Periodic runs: as scored. What a model leaves of a transient is seldom white, and at the null,
+    where effects are scored, it is mostly the effect itself; so it is measured on what the estimate
+    leaves. An unknown moves by the sum of its influence times the residual (Huber 1967): its
+    variance is that of the stretches' sums.
+    """
+    if all(record.periodic for record in fit.records):
+        return score.inflation, 0
+    free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
+    own = [k for k, name in enumerate(fit.problem.names) if name in score.names]
+    parts = [
+        _stretches(run, predicted, replicate(record), fit, free, own)
+        for run, predicted, record in zip(
+            fit.predictor.runs, fit.predictions, fit.records, strict=True
+        )
+    ]
+    pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
+    if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
+        return score.inflation, 0
+    worst, freedom = 1.0, 0
+    for k, row in enumerate(own):
+        overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
+        variance, degrees = clustered_variance(pulls[k], sizes[k], overlap)
+        ratio = variance / fit.point.covariance[row, row]
+        if degrees > 0 and ratio > worst:
+            worst, freedom = ratio, max(1, int(degrees))
+    return worst, freedom
+
+
+def _stretches(
+    run: RunPredictor,
+    predicted: RunPrediction,
+    stretch: NDArray[np.int64],
+    fit: Fit,
+    free: NDArray[np.int64],
+    own: list[int],
+) -> tuple[Array, Array, Array]:
+    """By new unknown and stretch: pull ``a @ r``, ``a @ a`` and ``a @ J``, in noise units."""
+    unit = np.sqrt(fit.point.variance)[:, None]
+    columns = predicted.sensitivity[:, free] / unit[:, None] * weights(run.record)
+    influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
+    residual = (run.measured - predicted.y) / unit
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1])
+
+    def summed(values: Array) -> Array:
+        return np.add.reduceat(values, edges, axis=-1)
+
+    pulls = summed(np.einsum("kyn,yn->kn", influence, residual))
+    sizes = summed(np.einsum("kyn,kyn->kn", influence, influence))
+    mixed = summed(np.einsum("kyn,yln->kln", influence, columns))
+    return pulls, sizes, np.moveaxis(mixed, 1, 2)
+
+
+def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
+    """Parameters of the effect with starts and priors from its score."""
+    present = assembly.model().parameters
+    changed: dict[str, Parameter] = {}
+    for name in score.option.candidate.parameters:
+        own = [
+            abs(v)
+            for key, v in zip(score.names, score.expected, strict=True)
+            if key.split("[")[0] == name
+        ]
+        if score.option.candidate.family == FAMILY:
+            own = [abs(v) for v in score.expected]  # a curve's coefficients are of one size
+        size = max(max(own), 1e-30)
+        sign = score.option.candidate.sign.get(name, 0)
+        value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0
+        prior: Normal | TruncatedNormal = Normal(0.0, PRIOR_WIDTH * size)
+        if sign:
+            low, high = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
+            prior = TruncatedNormal(0.0, PRIOR_WIDTH * size, low, high)
+            value = value if value * sign > 0 else sign * 1e-3 * size
+        changed[name] = replace(present[name], value=value, prior=prior)
+    for name, value in score.shapes.items():
+        changed[name] = replace(present[name], value=value, prior=LogNormal(value, SHAPE_SPREAD))
+    return changed
+
+
+def _start(base: Base, score: Score, model: Model) -> Array:
+    """Present estimates, by-run ones included, and the expected values of the new unknowns."""
+    layout = Layout.of(model, [record.label for record in base.fit.records])
+    known: Mapping[str, float] = base.fit.values | dict(
+        zip(score.names, map(float, score.expected), strict=True)
+    )
+    start = layout.start(model)
+    for k, name in enumerate(layout.names):
+        if "[" in name and name in known:
+            start[k] = known[name]
+    priors = layout.priors(model)
+    for k, prior in enumerate(priors):
+        low, high = prior.support
+        if not low < start[k] < high:
+            start[k] = model.parameters[layout.parameters[k]].value
+    return start
+
+
+def compare(base: Base, fit: Fit) -> tuple[float, Array]:
+    """Part of the excess that a refitted model takes away, and how it changes the prediction."""
+    before = after = 0.0
+    changes = []
+    for r, run in enumerate(base.runs):
+        residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
+        before += float(run.residual @ run.residual)
+        after += float(residual @ residual)
+        changes.append((run.residual - residual)[run.chosen])
+    return (before - after) / base.fall_back, np.concatenate(changes)

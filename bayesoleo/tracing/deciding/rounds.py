@@ -1,0 +1,291 @@
+"""One round of the search: score every effect, estimate the best few, confirm one on runs that were
+not used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.parallel import thread_map
+from bayesoleo.tracing.deciding.confirmation import confirmed
+from bayesoleo.tracing.deciding.refit import Refit, refit
+from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import Base
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import Score, score_all
+from bayesoleo.tracing.scoring.significance import classes, corrected_p, effective_tests
+from bayesoleo.tracing.unnamed.search import Search
+
+#: The search ends at the floor if no candidate explains this part of the excess.
+FLOOR_SHARE = 0.10
+#: Nominal probability of adding an effect to data that lack none.
+LEVEL = 0.01
+#: Candidates estimated before one is chosen, and how far behind the best a score may lie to be
+#: among them.
+MOST_REFITS, NEAR = 6, 0.25
+#: The same of what merely varies from run to run.
+MOST_VARYING = 3
+#: Effects after estimation within this share of the best are as good; the simplest of them is
+#: taken.
+AS_GOOD = 0.02
+
+#: Family of effects that let a parameter vary from run to run.
+RUN_TO_RUN = "run-to-run"
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A scored candidate with what the search makes of it.
+
+    Parameters
+    ----------
+    score : Score
+    p_value : float
+        Corrected for the search.
+    gain : float
+        Share of the excess, after estimation where it was estimated.
+    refitted : bool
+        Whether it was.
+    same : tuple of str
+        Ids of effects that these data cannot tell from it.
+    refit : Refit or None
+        The extended model, where it was estimated.
+    closest : tuple of (str, float)
+        Of an unnamed effect: the named ones most like it, with the cosine between what they change.
+    """
+
+    score: Score
+    p_value: float
+    gain: float
+    refitted: bool
+    same: tuple[str, ...]
+    refit: Refit | None = None
+    closest: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def effect(self) -> str:
+        """Canonical id."""
+        return self.score.option.candidate.effect
+
+    @property
+    def target(self) -> str:
+        """Where it sits."""
+        return self.score.option.candidate.target
+
+    @property
+    def varies(self) -> bool:
+        """Whether it merely lets something vary from run to run."""
+        return self.score.option.candidate.family == RUN_TO_RUN
+
+
+@dataclass(frozen=True)
+class Round:
+    """Outcome of one round.
+
+    Parameters
+    ----------
+    before : State
+        The model that was examined.
+    ranking : tuple of Ranked
+        Best first.
+    failed : dict of str to str
+        Effects that could not be scored, with the reason.
+    accepted : Ranked or None
+    after : State or None
+        With the accepted effect in.
+    reason : str
+        One sentence.
+    tests : float
+        Effective number of independent tests of the search.
+    unnamed : Search or None
+        The smooth functions that were tried where no named effect explains what is left.
+    """
+
+    before: State
+    ranking: tuple[Ranked, ...]
+    failed: dict[str, str]
+    accepted: Ranked | None
+    after: State | None
+    reason: str
+    tests: float
+    unnamed: Search | None = None
+
+
+def examine(
+    state: State,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    effects: Sequence[Effect] | None,
+    seed: int,
+    limit: str = "",
+    say: Say,
+) -> Round:
+    """Look for the effect that a fitted model lacks.
+
+    Parameters
+    ----------
+    state : State
+        The fitted model.
+    roles : Roles
+        Runs.
+    numerics : Numerics
+        Scheme, threads.
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    seed : int
+        For the correction for the search.
+    limit : str
+        Why effects are only ranked and none is accepted; empty where one may be.
+    say : callable
+        Told what is being done.
+    """
+    if limit and any(step.effect.family == FAMILY for step in state.assembly.steps):
+        # A curve takes up what named effects would have explained: to rank them says nothing.
+        return Round(state, (), {}, None, None, limit, 1.0)
+    scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
+    options = state.assembly.options(scales, None if effects is None else tuple(effects))
+    say(f"score {len(options)} candidates")
+    base = state.base()
+    scores, failed = score_all(base, options, numerics.jobs)
+    tests = effective_tests(scores, seed)
+    ranking = _rank(scores, tests, {})
+    stop = _stopping_reason(state, ranking)
+    if stop is not None or limit:
+        return Round(state, ranking, failed, None, None, stop or limit, tests)
+    refits = _refit_best(base, ranking, numerics, say)
+    ranking = _rank(scores, tests, refits)
+    accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, say)
+    return Round(state, ranking, failed, accepted, after, reason, tests)
+
+
+def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tuple[Ranked, ...]:
+    groups = classes(scores)
+    ranked = []
+    for k, score in enumerate(scores):
+        same = _same(scores, k, groups[k], refits)
+        fitted = refits.get(id(score))
+        if fitted is not None and not np.isfinite(fitted.share):
+            fitted = None  # an estimate that failed says no more than the score
+        # The excess is known up to noise: what explains all of it must not seem to explain more.
+        gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
+        p = corrected_p(score, tests)
+        ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted))
+    # What was estimated is known better than what was only scored, and comes first.
+    return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
+
+
+def _same(
+    scores: Sequence[Score], k: int, group: Sequence[int], refits: dict[int, Refit]
+) -> tuple[str, ...]:
+    """Effects that look like number ``k``, by their estimates where both have one."""
+    own, found = refits.get(id(scores[k])), []
+    for j, other in enumerate(scores):
+        estimated = refits.get(id(other))
+        if j == k:
+            continue
+        if own is not None and estimated is not None:
+            alike = own.resembles(estimated)
+        else:
+            alike = j in group and not (own is not None and own.outdoes(other))
+        if alike:
+            effect, target = other.option.key
+            same_id = effect == scores[k].option.candidate.effect
+            found.append(f"{effect} @ {target}" if same_id else effect)
+    return tuple(dict.fromkeys(found))
+
+
+def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
+    worst = state.worst_ratio
+    best = max((item.gain for item in ranking), default=0.0)
+    if state.at_floor and best < FLOOR_SHARE:
+        return (
+            f"nothing is missing: the residual is {worst:.2f} times its noise at most"
+            f" and no effect explains more than {100 * best:.0f} % of the excess"
+        )
+    if not any(item.p_value < LEVEL for item in ranking):
+        return "no effect is significant after the correction for the search"
+    return None
+
+
+def _refit_best(
+    base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say
+) -> dict[int, Refit]:
+    """Estimate the best few effects of physics, and what merely varies from run to run where that
+    may explain more than they do."""
+    significant = [item for item in ranking if item.p_value < LEVEL and item.gain > 0]
+    named = [item for item in significant if not item.varies]
+    found = _refit_few(base, named, MOST_REFITS, numerics, say)
+    explained = max((result.share for result in found.values()), default=0.0)
+    varying = [item for item in significant if item.varies and item.gain > explained]
+    return found | _refit_few(base, varying, MOST_VARYING, numerics, say)
+
+
+def _refit_few(
+    base: Base, pool: Sequence[Ranked], most: int, numerics: Numerics, say: Say
+) -> dict[int, Refit]:
+    """Estimate the best of a pool, best first, as far as they score near it."""
+    chosen = [item.score for item in pool[:most] if item.gain >= NEAR * pool[0].gain]
+    if not chosen:
+        return {}
+    say(f"estimate the best {len(chosen)}: {', '.join(s.option.candidate.effect for s in chosen)}")
+    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    return {id(score): result for score, result in zip(chosen, results, strict=True)}
+
+
+def _only_varies(item: Ranked, refits: dict[int, Refit]) -> bool:
+    """Whether an effect merely lets something vary from run to run, without need.
+
+    Much that physics does differs between runs, so a parameter of each run's own takes a part of it
+    up, whatever is missing. It is needed where it explains all that is left and no effect of
+    physics does, by more than its additional unknowns are worth (Schwarz 1978).
+    """
+    if not item.varies:
+        return False
+    own = refits[id(item.score)]
+    physics = [r for r in refits.values() if r.score.option.candidate.family != RUN_TO_RUN]
+    return not (own.reached and own.worth > max((r.worth for r in physics), default=0.0))
+
+
+def _next(tried: Sequence[Ranked], refits: dict[int, Refit]) -> Ranked:
+    """Of effects by falling gain the best for its unknowns, or the simplest near the best.
+
+    What an unknown is worth is known where only noise is left.
+    """
+    if refits[id(tried[0].score)].reached:
+        return max(tried, key=lambda one: refits[id(one.score)].worth)
+    near = [one for one in tried if one.gain >= max(tried[0].gain, 0.0) - AS_GOOD]
+    return min(near, key=lambda one: refits[id(one.score)].size)
+
+
+def _choose(
+    state: State,
+    base: Base,
+    ranking: Sequence[Ranked],
+    refits: dict[int, Refit],
+    roles: Roles,
+    numerics: Numerics,
+    say: Say,
+) -> tuple[Ranked | None, State | None, str]:
+    """The best effect that the runs not used confirm."""
+    last = {id(r): _only_varies(r, refits) for r in ranking if r.refitted}
+    tried = sorted(
+        (item for item in ranking if item.refitted), key=lambda item: (last[id(item)], -item.gain)
+    )
+    reasons = []
+    while tried:
+        item = _next([one for one in tried if last[id(one)] == last[id(tried[0])]], refits)
+        tried.remove(item)
+        after, reason = confirmed(state, item, refits[id(item.score)], roles, numerics, say)
+        if after is not None:
+            return item, after, reason
+        reasons.append(reason)
+    return None, None, "; ".join(reasons) or "no candidate could be estimated"

@@ -1,0 +1,150 @@
+"""A model in its present state: fitted, held against the noise on fitted and held-out runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo.machines import connected, each_done
+from bayesoleo.model import Model
+from bayesoleo.prediction.records import Record
+from bayesoleo.prediction.stability import Stability
+from bayesoleo.tracing.errors.errors_table import ErrorTable, error_table
+from bayesoleo.tracing.errors.floor import is_at_floor
+from bayesoleo.tracing.errors.holdout import Prediction, predict_fitted, predict_held_out
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import Base, base_of
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything known of one model.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        At the estimate.
+    fit : Fit
+        On the fitted runs.
+    fitted, held_out : list of Prediction
+        By run.
+    fit_errors, hold_errors : ErrorTable
+        Of these.
+    """
+
+    assembly: Assembly
+    fit: Fit
+    fitted: list[Prediction]
+    held_out: list[Prediction]
+    fit_errors: ErrorTable
+    hold_errors: ErrorTable
+
+    @property
+    def errors(self) -> ErrorTable:
+        """One entry each run and output: that of the held-out prediction where there is one."""
+        held = {entry.run for entry in self.hold_errors.entries}
+        rest = tuple(entry for entry in self.fit_errors.entries if entry.run not in held)
+        return ErrorTable((*rest, *self.hold_errors.entries))
+
+    @property
+    def stability(self) -> Stability | None:
+        """Of the periodic solutions of fitted and held-out runs; None where there are none."""
+        known = self.fit.stability
+        if known is None:
+            return None
+        # Where runs are held out in turn, all of them are fitted as well.
+        runs = {p.record.label: p.predictor.runs[0] for p in self.held_out}
+        runs = {label: run for label, run in runs.items() if label not in known.runs}
+        matrices = [run.anchor.monodromy if run.anchor else None for run in runs.values()]
+        jumps = np.array([run.jumps for run in runs.values()], dtype=np.int64)
+        return known.together(Stability.of(tuple(runs), matrices, jumps))
+
+    @property
+    def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Pooled errors by role, as in the summary."""
+        return {**self.fit_errors.by_role(), **self.hold_errors.by_role()}
+
+    @property
+    def worst_ratio(self) -> float:
+        """Largest pooled ratio to the noise over roles and outputs."""
+        tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
+        return float(np.max([table.worst_ratio() for table in tables]))
+
+    @property
+    def at_floor(self) -> bool:
+        """Whether fitted and held-out runs are all down to their noise."""
+        return all(is_at_floor(table) for table in (self.fit_errors, self.hold_errors))
+
+    @property
+    def unsolved(self) -> tuple[str, ...]:
+        """Runs whose prediction failed, with the reason."""
+        found = [*self.fitted, *self.held_out]
+        return tuple(f"{p.record.label}: {p.status.message}" for p in found if not p.status.ok)
+
+    def base(self) -> Base:
+        """What candidates are scored against."""
+        entries = self.fit_errors.entries
+        return base_of(self.fit, {(entry.run, entry.output): entry for entry in entries})
+
+
+def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
+    """Predict all runs at a fit and compare with what was measured."""
+    fitted = predict_fitted(fit)
+    held_out = (
+        _left_out(fit, roles)
+        if roles.strategy == "leave-one-run-out"
+        else predict_held_out(fit, roles.held_out)
+    )
+    jobs = fit.numerics.jobs
+    return State(
+        assembly.with_values(fit.shared),
+        fit,
+        fitted,
+        held_out,
+        error_table(fitted, {p.record.label: "fit" for p in fitted}, jobs=jobs),
+        error_table(held_out, {p.record.label: "hold-out" for p in held_out}, jobs=jobs),
+    )
+
+
+def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:
+    """Each run predicted by a fit to all the others, from the joint estimate."""
+    numerics = replace(fit.numerics, steps=fit.steps, scheduler=None)
+    left_out = _LeftOut(fit.model, fit.records, numerics, fit.problem.names, fit.point.theta)
+    with connected(fit.numerics.scheduler) as client:
+        # Here each fit has all threads for itself.
+        found = dict(each_done(left_out, roles.held_out, client=client, jobs=1))
+    return [found[index] for index in range(len(roles.held_out))]
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """One run predicted by the others, wherever it is sent."""
+
+    model: Model
+    records: tuple[Record, ...]
+    numerics: Numerics
+    names: tuple[str, ...]
+    theta: np.ndarray
+
+    def __call__(self, record: Record) -> Prediction:
+        others = [other for other in self.records if other.label != record.label]
+        keep = [k for k, name in enumerate(self.names) if not name.endswith(f"[{record.label}]")]
+        partial = fit_model(self.model, others, self.numerics, start=self.theta[keep])
+        return predict_held_out(partial, [record])[0]
+
+
+def fit_state(
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    start: np.ndarray | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> State:
+    """Fit an assembly and describe its state."""
+    fit = fit_model(assembly.model(), roles.fitted, numerics, start=start, progress=progress)
+    return state_of(assembly, fit, roles)

@@ -1,0 +1,205 @@
+"""The end of a round that found no name: let a smooth function of one or two quantities explain
+what is left, and say which named effects come closest to it.
+
+Named effects go first, one after the other. If something is left then, two answers compete with
+what was found so far: the function beside the named effects, and the function *instead* of them. A
+named effect may have been no more than the nearest to what is in the data. The weighted sum of
+squares decides, less the logarithm of the number of averaged values for each unknown (Schwarz
+1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the runs that
+were not used decide, as for every effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.confirmation import confirmed
+from bayesoleo.tracing.deciding.refit import Refit, compare, refit
+from bayesoleo.tracing.deciding.rounds import LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.fitting.fit import Fit, Numerics
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import Base
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import Score
+from bayesoleo.tracing.scoring.significance import SAME
+from bayesoleo.tracing.unnamed.search import Search, closest, search
+
+#: Unnamed effects added at most.
+MOST_UNNAMED = 1
+#: Where no further effect may be added, a function may stand instead of so many or more.
+FEWEST_REPLACED = 2
+#: Named effects stay beside a function only if that is better by this much, which is called very
+#: strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90(430)).
+DECISIVE = 10.0
+#: Part of the excess that a name explained by itself, from which on it is not taken for the nearest
+#: to something else: a function of the same quantities repeats what it says, and adds freedom.
+OWN_RIGHT = 0.9
+#: Functions estimated before one is chosen.
+MOST_TRIED = 3
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """A function added to one of two models, after estimation."""
+
+    state: State
+    search: Search
+    refit: Refit
+    ranking: tuple[Score, ...]
+    instead: bool
+
+
+def with_unnamed(
+    outcome: Round, first: Round, roles: Roles, numerics: Numerics, *, room: bool = True, say: Say
+) -> Round:
+    """A round that accepted nothing, with an unnamed effect where one explains what is left.
+
+    Parameters
+    ----------
+    outcome : Round
+        Accepted nothing.
+    first : Round
+        Of the same loop: its model has none of the effects that were added.
+    roles : Roles
+        Runs.
+    numerics : Numerics
+        Scheme, threads.
+    room : bool
+        Whether one more effect may be added; else one may only stand instead of others.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Round
+        Where a function is confirmed it is the accepted effect, first in the ranking. Where it
+        stands instead of effects added before, the new state has none of them.
+    """
+    state = outcome.before
+    steps = state.assembly.steps
+    named = len(steps) > len(first.before.assembly.steps)
+    unnamed = sum(step.effect.family == FAMILY for step in steps)
+    if unnamed >= MOST_UNNAMED or (not named and (state.at_floor or not room)):
+        return outcome
+    if not room and len(steps) < FEWEST_REPLACED:
+        return outcome  # named ones had no chance to come together
+    say("look for an effect without a name")
+    base = state.base()
+    found = search(base, state.assembly, numerics.jobs)
+    outcome = replace(outcome, unnamed=found)
+    if found.p_value >= LEVEL:
+        return outcome
+    chances = [_Chance(state, base, found, outcome, False)] if room else []
+    if named and not _stands_by_itself(first):
+        origin = first.before
+        reference = origin.base()
+        again = search(reference, origin.assembly, numerics.jobs)
+        chances.append(_Chance(origin, reference, again, first, True))
+    if not chances:
+        return outcome
+    reasons, common = [outcome.reason], chances[-1].base
+    # What was found so far competes too: a function that explains less does not replace it.
+    present = _worth(state.fit, common)
+    for k in range(MOST_TRIED):
+        answers = [item for chance in chances for item in chance.answers(k, numerics)]
+        answers = [item for item in answers if _merit(item, common) > present]
+        for answer in sorted(answers, key=lambda item: -_merit(item, common)):
+            accepted, reason = _accepting(outcome, answer, roles, numerics, say)
+            if accepted.accepted is not None:
+                return accepted
+            reasons.append(reason)
+    return replace(outcome, reason="; ".join(reasons))
+
+
+def _stands_by_itself(first: Round) -> bool:
+    """Whether the first effect explained nearly all of the excess alone."""
+    return first.accepted is not None and first.accepted.gain >= OWN_RIGHT
+
+
+@dataclass(frozen=True)
+class _Chance:
+    """A model, and the functions that may be added to it."""
+
+    state: State
+    base: Base
+    search: Search
+    outcome: Round
+    instead: bool
+
+    def answers(self, k: int, numerics: Numerics) -> list[_Answer]:
+        """The function that does best but for ``k`` others, estimated; none where there are fewer.
+
+        The score says which, by the same measure as estimates are judged.
+        """
+        price = float(np.log(max(self.base.noise, 2.0)))
+        leading = self.search.leading(MOST_TRIED)
+        found = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
+        scales = scales_of(
+            self.state.fit, self.state.assembly.drive, tuple(self.state.assembly.native.dofs)
+        )
+        ranking = tuple(item.score for item in self.outcome.ranking)
+        return [
+            _Answer(
+                self.state,
+                self.search,
+                refit(self.base, item.score(self.base, self.state.assembly, scales), numerics),
+                ranking,
+                self.instead,
+            )
+            for item in found
+        ]
+
+
+def _merit(answer: _Answer, reference: Base) -> float:
+    """What a function is worth; one that stands instead of names needs none of them."""
+    merit = _worth(answer.refit.fit, reference)
+    return merit + DECISIVE if answer.instead else merit
+
+
+def _worth(fit: Fit, reference: Base) -> float:
+    """Fall of the weighted sum of squares from a common model, less the price of the unknowns."""
+    share, _ = compare(reference, fit)
+    if not np.isfinite(share):
+        return -np.inf
+    values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
+    return share * reference.fall_back - len(fit.problem.names) * float(np.log(values))
+
+
+def _accepting(
+    outcome: Round, answer: _Answer, roles: Roles, numerics: Numerics, say: Say
+) -> tuple[Round, str]:
+    """The round with the answer accepted, if it is confirmed, and why."""
+    result = answer.refit
+    near = closest(result.contribution, answer.ranking)
+    gain = min(max(result.share, 0.0), 1.0) if np.isfinite(result.share) else 0.0
+    same = tuple(name.split(" @ ")[0] for name, cosine in near if cosine > 0 and cosine**2 > SAME)
+    item = Ranked(result.score, answer.search.p_value, gain, True, same, result, near)
+    after, reason = confirmed(answer.state, item, result, roles, numerics, say)
+    if after is None:
+        return outcome, reason
+    if answer.instead:
+        before = [step.effect.id for step in outcome.before.assembly.steps]
+        reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
+    ranking = (item, *outcome.ranking)
+    return replace(outcome, ranking=ranking, accepted=item, after=after, reason=reason), reason
+
+
+def unnamed_notes(rounds: Sequence[Round]) -> list[str]:
+    """What is to be said of effects that were added without a name."""
+    found = []
+    for entry in rounds:
+        item = entry.accepted
+        if item is None or item.score.option.candidate.family != FAMILY:
+            continue
+        title = item.score.option.assembly.steps[-1].effect.title
+        near = ", ".join(f"{effect} (cosine {cosine:.2f})" for effect, cosine in item.closest)
+        text = f"{item.effect} is no named effect. {title}, in the balance of {item.target}"
+        found.append(text + (f"; the named ones most like it: {near}" if near else ""))
+    return found

@@ -1,0 +1,1 @@
+"""What a fitted model leaves, on fitted and held-out runs, against the noise."""

@@ -1,0 +1,1 @@
+"""What a closed loop returns: the tree of results, the summary, predictions, shapes."""

@@ -1,0 +1,332 @@
+"""A closed loop as one DataTree, in the layout of :mod:`bayesoleo.schema`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from bayesoleo import schema
+from bayesoleo.data import Campaign
+from bayesoleo.estimation import to_dataset
+from bayesoleo.model import Coordinate
+from bayesoleo.posterior import LogDensity, Samples, to_datasets
+from bayesoleo.prediction.records import Record
+from bayesoleo.tracing.deciding.loop import ClosedLoop
+from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.errors.holdout import Prediction, predict_fitted
+from bayesoleo.tracing.fitting.fit import Fit
+from bayesoleo.tracing.fitting.masked import weights
+from bayesoleo.tracing.outcome.predictive import PHASES, predictive_group
+from bayesoleo.tracing.outcome.shapes import shape_group
+
+Array = NDArray[np.float64]
+
+
+def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.Dataset]:
+    """Groups that hold what was measured: observed data, constant data and noise."""
+    units = {name: channel.si_unit for name, channel in campaign.channels.items()}
+    labels = [record.label for record in records]
+    channels = [name for name in units if all(name in record.samples for record in records)]
+    rows = (schema.RUN, schema.SAMPLE)
+    observed = {
+        name: _padded([r.samples[name] for r in records], rows, units[name], name)
+        for name in channels
+    }
+    observed[schema.TIME] = _padded(
+        [r.time - r.time[0] for r in records], rows, "s", "time since the first sample"
+    )
+    observed[schema.PHASE] = _padded([r.phase for r in records], rows, "1", "phase in cycles")
+    constant = {
+        schema.FREQUENCY: _by_run([r.frequency for r in records], "Hz", "fundamental frequency"),
+        schema.FREQUENCY_SD: _by_run(
+            [r.frequency_sd for r in records], "Hz", "its standard deviation"
+        ),
+        schema.PERIODS: _by_run([r.periods for r in records], "1", "whole periods"),
+        schema.ROLE: (schema.RUN, [r.role for r in records]),
+        schema.RUN_GROUP: (schema.RUN, [r.group for r in records]),
+    }
+    condition_units = {
+        name: unit for run in campaign.runs for name, unit in run.condition_units.items()
+    }
+    for name, unit in condition_units.items():
+        constant[name] = _by_run([r.conditions.get(name, np.nan) for r in records], unit, name)
+    noise = {
+        name: _by_run(
+            [r.signal_noise[name] for r in records], units[name], f"noise of a sample of {name}"
+        )
+        for name in channels
+    }
+    coords = {schema.RUN: labels}
+    return {
+        schema.OBSERVED_DATA: xr.Dataset(observed, coords=coords),
+        schema.CONSTANT_DATA: xr.Dataset(constant, coords=coords),
+        schema.NOISE: xr.Dataset(noise, coords=coords),
+    }
+
+
+def point_group(fit: Fit) -> xr.Dataset:
+    """The group ``point``, with the mesh on which it was found and what that may have moved."""
+    point = to_dataset(fit.point, mbe=fit.mbe, units=_units(fit))
+    if fit.model.dofs:
+        scheme = fit.numerics.scheme
+        point.attrs |= {"scheme": scheme, "steps": fit.steps, "mesh_shift": fit.shift}
+    return point
+
+
+def _units(fit: Fit) -> list[str]:
+    layout = fit.predictor.layout
+    return [
+        fit.model.parameters[layout.parameters[layout.names.index(name)]].unit
+        for name in fit.problem.names
+    ]
+
+
+def posterior_groups(
+    fit: Fit, samples: Samples, seed: int, density: LogDensity | None = None
+) -> dict[str, xr.Dataset]:
+    """The groups posterior, prior, sample_stats, log_likelihood and log_prior."""
+    units = dict(zip(fit.problem.names, _units(fit), strict=True))
+    units |= {name: fit.model.outputs[name].unit for name in fit.predictor.outputs}
+    scattering = [] if density is None else density.unknowns.scattering
+    for name in scattering:
+        unit = fit.model.parameters[name].unit
+        support = fit.problem.priors[fit.problem.names.index(f"{name}[{samples.runs[0]}]")].support
+        units[schema.population_mean(name)] = unit
+        # With a bound the spread is that of a logarithm.
+        units[schema.spread(name)] = "1" if np.isfinite(support).any() else unit
+    groups = to_datasets(samples, fit.problem.priors, units=units, seed=seed, density=density)
+    groups[schema.POSTERIOR].attrs[schema.BETWEEN_RUNS] = json.dumps(list(scattering))
+    return groups
+
+
+def predictive_groups(
+    fit: Fit, samples: Samples, density: LogDensity, seed: int
+) -> dict[str, xr.Dataset]:
+    """The groups prediction and posterior_predictive of the fitted runs."""
+    found = predict_fitted(fit)
+    return {
+        schema.PREDICTION: _predictions([("before", fit, found)]),
+        schema.POSTERIOR_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
+    }
+
+
+def loop_groups(
+    loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
+) -> dict[str, xr.Dataset]:
+    """The groups prediction, residual, discovery, unnamed and posterior_predictive."""
+    groups = {
+        schema.PREDICTION: _predictions(
+            [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
+        ),
+        schema.RESIDUAL: _residuals(loop),
+        schema.DISCOVERY: _discovery(loop.rounds),
+    }
+    shape = shape_group(loop)
+    if shape is not None:
+        groups[schema.UNNAMED] = shape
+    if drawn is not None:
+        final, (samples, density) = loop.final, drawn
+        groups[schema.POSTERIOR_PREDICTIVE] = predictive_group(
+            final.fit, ordered(final), samples, density.errors, seed
+        )
+    return groups
+
+
+# -- pieces ---------------------------------------------------------------------------
+
+
+def _padded(values: Sequence[Array], dims: tuple[str, str], unit: str, name: str) -> xr.Variable:
+    table = np.full((len(values), max(map(len, values))), np.nan)
+    for row, item in zip(table, values, strict=True):
+        row[: len(item)] = item
+    return xr.Variable(dims, table, {schema.UNITS: unit, schema.LONG_NAME: name})
+
+
+def _by_run(values: Sequence[float], unit: str, name: str) -> xr.Variable:
+    return xr.Variable(schema.RUN, np.asarray(values), {schema.UNITS: unit, schema.LONG_NAME: name})
+
+
+def ordered(state: State) -> list[Prediction]:
+    """One prediction a run, the held-out one where there is one."""
+    held = {p.record.label: p for p in state.held_out}
+    rest = [p for p in state.fitted if p.record.label not in held]
+    return [*rest, *held.values()]
+
+
+def _stages(loop: ClosedLoop) -> list[tuple[str, State]]:
+    return [("before", loop.first)] + (
+        [("after", loop.final)] if loop.final is not loop.first else []
+    )
+
+
+def _predictions(stages: Sequence[tuple[str, Fit, list[Prediction]]]) -> xr.Dataset:
+    data = {}
+    for stage, fit, found in stages:
+        for b, output in enumerate(fit.predictor.outputs):
+            unit = fit.model.outputs[output].unit
+            data[f"{output}_{stage}"] = _padded(
+                [p.y[b] for p in found], (schema.RUN, schema.SAMPLE), unit, f"predicted {output}"
+            )
+    return xr.Dataset(data, coords={schema.RUN: [p.record.label for p in stages[0][2]]})
+
+
+def _residuals(loop: ClosedLoop) -> xr.Dataset:
+    data, rows = {}, (schema.RUN, schema.SAMPLE)
+    for stage, state in _stages(loop):
+        found = ordered(state)
+        for b, output in enumerate(state.fit.predictor.outputs):
+            unit = state.fit.model.outputs[output].unit
+            errors = [state.errors.at(output, p.record.label) for p in found]
+            data[f"{output}_{stage}"] = _padded(
+                [_counted(p.record, p.record.samples[output] - p.y[b]) for p in found],
+                rows,
+                unit,
+                f"residual of {output}",
+            )
+            means = np.stack([e.average.on_phase(PHASES) for e in errors])
+            data[f"{output}_{stage}_mean"] = xr.Variable(
+                (schema.RUN, schema.PHASE),
+                means,
+                {
+                    schema.UNITS: unit,
+                    schema.LONG_NAME: f"residual of {output}, average over periods",
+                },
+            )
+            data[schema.noise(output)] = _by_run(
+                [e.noise for e in errors], unit, "standard error of that average"
+            )
+    for name, (values, unit, text) in _coordinate(loop).items():
+        data[name] = _padded(values, rows, unit, text)
+    coords = {
+        schema.RUN: [p.record.label for p in ordered(loop.first)],
+        schema.PHASE: np.arange(PHASES) / PHASES,
+    }
+    return xr.Dataset(data, coords=coords)
+
+
+def _counted(record: Record, residual: Array) -> Array:
+    """A residual without the samples that do not count."""
+    return np.where(weights(record) > 0, residual, np.nan)
+
+
+def _place(loop: ClosedLoop) -> Coordinate | None:
+    """The coordinate to look at: where the first added effect acts, else the best candidate, else
+    the first that has a velocity."""
+    moving = [c for c in loop.final.assembly.native.coordinates() if c.velocity is not None]
+    ranking = loop.rounds[-1].ranking
+    for target in (*loop.targets, *(item.target for item in ranking[:1])):
+        for place in moving:
+            if target in (place.name, place.target):
+                return place
+    return moving[0] if moving else None
+
+
+def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
+    """Position and velocity, with unit and name, of one coordinate for plots of the residual."""
+    state, place = loop.final, _place(loop)
+    native = state.assembly.native
+    if place is None:
+        return {}
+    unit = native.dofs[place.name].unit if place.name in native.dofs else native.inputs[place.name]
+    position, velocity = [], []
+    for prediction in ordered(state):
+        record, run = prediction.record, prediction.predictor.runs[0]
+        motion = run.known_motions().get(place.name)
+        if motion is not None:
+            rows = motion(record.position)
+            position.append(rows[0])
+            velocity.append(rows[1])
+            continue
+        channel = place.name if place.name in record.signals else state.assembly.drive
+        if channel is None:
+            return {}
+        item = record.signals[channel]
+        position.append(item.evaluate(record.position, record.rate))
+        velocity.append(item.evaluate(record.position, record.rate, 1))
+    return {
+        schema.STROKE: (position, unit, f"position of {place.name}"),
+        schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s", f"velocity of {place.name}"),
+    }
+
+
+def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
+    keys = list(dict.fromkeys(_key(item) for entry in rounds for item in entry.ranking))
+    shape = (len(rounds), len(keys))
+    numbers = {name: np.full(shape, np.nan) for name in (schema.GAIN, schema.P_VALUE, schema.Z)}
+    texts = {
+        name: np.full(shape, "", dtype=object)
+        for name in (schema.EXPECTED, schema.INDISTINGUISHABLE)
+    }
+    family = np.full(len(keys), "", dtype=object)
+    for r, entry in enumerate(rounds):
+        for item in entry.ranking:
+            k = keys.index(_key(item))
+            numbers[schema.GAIN][r, k], numbers[schema.P_VALUE][r, k] = item.gain, item.p_value
+            numbers[schema.Z][r, k] = item.score.z
+            expected = dict(zip(item.score.names, map(float, item.score.expected), strict=True))
+            texts[schema.EXPECTED][r, k] = json.dumps(expected)
+            texts[schema.INDISTINGUISHABLE][r, k] = json.dumps(list(item.same))
+            family[k] = item.score.option.candidate.family
+    dims = (schema.ROUND, schema.EFFECT)
+    data: dict[str, xr.Variable] = {
+        name: xr.Variable(dims, values, {schema.UNITS: "1"}) for name, values in numbers.items()
+    }
+    data |= {name: xr.Variable(dims, values.astype(str)) for name, values in texts.items()}
+    data[schema.CANDIDATE_FAMILY] = xr.Variable(schema.EFFECT, family.astype(str))
+    data |= _error_tables(rounds)
+    data[schema.ACCEPTED] = xr.Variable(
+        schema.ROUND, np.array([e.accepted.effect if e.accepted else "" for e in rounds])
+    )
+    data[schema.ACCEPTED_TARGET] = xr.Variable(
+        schema.ROUND, np.array([e.accepted.target if e.accepted else "" for e in rounds])
+    )
+    data[schema.REASON] = xr.Variable(schema.ROUND, np.array([e.reason for e in rounds]))
+    first = rounds[0].before
+    coords = {
+        schema.ROUND: np.arange(1, len(rounds) + 1),
+        schema.EFFECT: np.array(keys, dtype=str),
+        schema.OUTPUT: list(first.errors.outputs),
+        schema.RUN: [p.record.label for p in ordered(first)],
+    }
+    return xr.Dataset(data, coords=coords)
+
+
+def _key(item: Ranked) -> str:
+
+    return f"{item.effect} at {item.score.option.candidate.target}"
+
+
+def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
+    dims = (schema.ROUND, schema.OUTPUT, schema.RUN)
+    first = rounds[0].before
+    runs = [p.record.label for p in ordered(first)]
+    names = {
+        schema.RMS: "rms",
+        schema.REPEATING: "repeating",
+        schema.NOISE: "noise",
+        schema.RATIO_TO_NOISE: "ratio",
+    }
+    return {
+        name: xr.Variable(
+            dims,
+            np.array(
+                [
+                    [
+                        [getattr(e.before.errors.at(o, run), field) for run in runs]
+                        for o in first.errors.outputs
+                    ]
+                    for e in rounds
+                ]
+            ),
+            {
+                schema.LONG_NAME: name,
+                schema.UNITS: "1" if field == "ratio" else "SI unit of each output",
+            },
+        )
+        for name, field in names.items()
+    }

@@ -1,0 +1,157 @@
+"""The summary of a closed loop: plain dicts that ``summary.json`` is made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesoleo import schema
+from bayesoleo.posterior import Samples
+from bayesoleo.tracing.deciding.loop import ClosedLoop
+from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.state import State
+
+
+def summarise(
+    loop: ClosedLoop, samples: Samples | None, about: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe a closed loop in the terms of the summary's JSON Schema.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    samples : Samples or None
+        Posterior of the final model; without it the parameters have no mean and no interval.
+    about : mapping
+        ``campaign``, ``model``, ``drive``, ``seed`` and other keys for the top level.
+
+    Returns
+    -------
+    dict
+        Checked against the schema.
+    """
+    final, stability = loop.final, loop.final.stability
+    summary = {
+        **about,
+        "rounds": [_round(item) for item in loop.rounds],
+        "effects": list(loop.effects),
+        "targets": list(loop.targets),
+        "parameters": _parameters(final, samples),
+        "error_before": loop.first.by_role,
+        "error_after": final.by_role,
+        "verdict": loop.verdict,
+        "hold_out": loop.roles.description,
+        "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
+        "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
+        "stability": {} if stability is None else stability.as_plain(),
+        "branch_jumps": {
+            "estimate": 0 if stability is None else stability.branch_jumps,
+            "posterior": None if samples is None else samples.branch_jumps,
+        },
+        "notes": [
+            *loop.notes,
+            *([] if stability is None else stability.notes()),
+            *final.fit.point.doubts,
+            *_input_noise_notes(final),
+            *_sampler_notes(samples),
+        ],
+    }
+    clean = _finite(summary)
+    schema.validate_summary(clean)
+    return clean
+
+
+def _round(item: Round) -> dict[str, Any]:
+    return {
+        "error": item.before.errors.by_run(),
+        "candidates": [_candidate(ranked) for ranked in item.ranking],
+        "accepted": item.accepted.effect if item.accepted else None,
+        "accepted_target": item.accepted.target if item.accepted else None,
+        "reason": item.reason,
+        "failed": dict(item.failed),
+    }
+
+
+def _candidate(ranked: Ranked) -> dict[str, Any]:
+    score, candidate = ranked.score, ranked.score.option.candidate
+    expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    near = [{"effect": effect, "cosine": cosine} for effect, cosine in ranked.closest]
+    return {
+        "effect": candidate.effect,
+        "target": candidate.target,
+        "family": candidate.family,
+        "gain": ranked.gain,
+        "p_value": ranked.p_value,
+        "expected": expected | {name: float(value) for name, value in score.shapes.items()},
+        "estimated": ranked.refitted,
+        "indistinguishable_from": list(ranked.same),
+    } | ({"closest": near} if near else {})
+
+
+def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, Any]]:
+    fit, table = state.fit, {}
+    for k, name in enumerate(fit.problem.names):
+        owner = fit.predictor.layout.parameters[fit.predictor.layout.names.index(name)]
+        entry: dict[str, Any] = {
+            "estimate": float(fit.point.theta[k]),
+            "mean": None,
+            "sd": float(fit.point.sd[k]),
+            "interval": None,
+            "unit": fit.model.parameters[owner].unit,
+        }
+        if samples is not None:
+            draws = samples.draws[:, :, samples.names.index(name)]
+            low, high = np.quantile(draws, [0.025, 0.975])
+            entry |= {
+                "mean": float(draws.mean()),
+                "sd": float(draws.std()),
+                "interval": [float(low), float(high)],
+            }
+        table[name] = entry
+    return table
+
+
+def _input_noise_notes(state: State) -> list[str]:
+    """Say where the noise of the input, sent through the model, is the larger part of the noise
+    floor."""
+    notes = []
+    for output in state.errors.outputs:
+        entries = [
+            e
+            for e in state.errors.entries
+            if e.output == output and e.input_noise > e.average.noise
+        ]
+        if entries:
+            worst = max(entries, key=lambda e: e.input_noise / e.average.noise)
+            times = worst.input_noise / worst.average.noise
+            notes.append(
+                f"input noise dominates the noise of {output} in {len(entries)} runs: in run"
+                f" {worst.run} it is {times:.1f} times the output's own"
+            )
+    return notes
+
+
+def _sampler_notes(samples: Samples | None) -> list[str]:
+    if samples is None:
+        return []
+    notes = [f"sampler: {samples.warning}"] if samples.warning else []
+    if samples.branch_jumps:
+        notes.append(
+            f"sampler: {samples.branch_jumps} solutions of runs left the branch of the estimate, in"
+            f" {samples.evaluations} evaluations: the posterior mixes several answers of the model"
+        )
+    return notes
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON has no words for by None."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

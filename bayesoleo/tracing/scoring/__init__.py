@@ -1,0 +1,1 @@
+"""Score effects at their null: what each would explain, how surely, and which look alike."""

@@ -1,0 +1,251 @@
+"""What every candidate is scored against: residuals and sensitivities of the present model, in
+units of the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.data.noise_spectrum import NoiseSpectrum
+from bayesoleo.prediction.input_noise import input_columns
+from bayesoleo.prediction.layout import Layout
+from bayesoleo.prediction.records import Record
+from bayesoleo.solvers.status import Status
+from bayesoleo.tracing.errors.errors_table import RunError
+from bayesoleo.tracing.fitting.fit import Fit
+from bayesoleo.tracing.fitting.masked import counted, weights
+from bayesoleo.tracing.scoring.sensitivities import present_constants, sensitivities_of
+
+Array = NDArray[np.float64]
+
+#: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
+#: would miss what repeats with it.
+MOST_SAMPLES = 1500
+#: Stretches of a transient whose scatter stands in for that between periods.
+STRETCHES = 8
+#: Directions of input noise that are counted in a run, and the squared size, in noise units, below
+#: which one is not worth it.
+MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
+
+
+@dataclass(frozen=True)
+class RunBase:
+    """One run in units of its noise: all arrays are divided by the noise of a sample, outputs one
+    after the other.
+
+    The noise covariance is ``I + B' B`` in these units; ``B``, from the input's noise, is counted
+    by Woodbury's identity.
+
+    Parameters
+    ----------
+    scale : ndarray, shape (m,)
+        Inverse standard deviation of a single sample's noise.
+    residual : ndarray, shape (m,)
+    sensitivity : ndarray, shape (l, m)
+        With respect to present unknowns and uncertain constants, each in units of its prior's
+        standard deviation.
+    input_noise : ndarray, shape (k, m)
+        ``B``: change of the outputs by one standard deviation of each input coefficient that
+        matters.
+    inverse : ndarray, shape (k, k)
+        ``(I + B B')^-1``.
+    period : ndarray of int, shape (m,)
+        Number of the period that each sample lies in.
+    mixed, moved : ndarray, shapes (k, l) and (k,)
+        ``B J`` and ``B e``, kept because every candidate needs them.
+    chosen : ndarray of int
+        Samples kept for comparing candidates with each other.
+    spectra : tuple of NoiseSpectrum
+        Of the outputs' noise; empty where it is taken as white.
+    """
+
+    scale: Array
+    residual: Array
+    sensitivity: Array
+    input_noise: Array
+    inverse: Array
+    period: NDArray[np.int64]
+    mixed: Array
+    moved: Array
+    chosen: NDArray[np.int64]
+    spectra: tuple[NoiseSpectrum, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        scale: Array,
+        residual: Array,
+        sensitivity: Array,
+        columns: Array,
+        period: NDArray[np.int64],
+        spectra: tuple[NoiseSpectrum, ...] = (),
+    ) -> RunBase:
+        """Keep the directions of input noise that matter against the noise of the samples."""
+        columns = columns * scale
+        size = np.sum(columns**2, axis=1)
+        kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
+        inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
+        e, J = residual * scale, sensitivity * scale
+        chosen = _choice(e.size)
+        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, chosen, spectra)
+
+    def products(self, new: Array) -> tuple[Array, Array, Array]:
+        """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
+        moved = self.input_noise @ new.T
+        through = self.inverse @ moved
+        cross = self.sensitivity @ new.T - self.mixed.T @ through
+        own = new @ new.T - moved.T @ through
+        return cross, own, new @ self.residual - self.moved @ through
+
+
+def _choice(size: int) -> NDArray[np.int64]:
+    """Some of so many samples, always the same."""
+    if size <= MOST_SAMPLES:
+        return np.arange(size)
+    return np.sort(np.random.default_rng(size).permutation(size)[:MOST_SAMPLES])
+
+
+@dataclass(frozen=True)
+class Base:
+    """What every candidate is scored against.
+
+    Parameters
+    ----------
+    fit : Fit
+        The present model.
+    runs : list of RunBase
+        Residuals and sensitivities by run.
+    gram : ndarray, shape (l, l)
+        ``J' W J``, with the prior precision of uncertain constants.
+    gradient : ndarray, shape (l,)
+        ``J' W e``.
+    noise : float
+        Expected sum of squares of the averaged residual, had only noise remained.
+    excess : float
+        Sum of squares of the averaged residual beyond that.
+    """
+
+    fit: Fit
+    runs: list[RunBase]
+    gram: Array
+    gradient: Array
+    noise: float
+    excess: float
+
+    @property
+    def fall_back(self) -> float:
+        """Denominator of shares: the excess, or what of it noise alone could feign."""
+        return max(self.excess, 0.0) + self.feigned
+
+    @property
+    def feigned(self) -> float:
+        """Excess that noise alone exceeds once in fifty times."""
+        return 2.0 * float(np.sqrt(2.0 * self.noise))
+
+
+def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
+    """Prepare scoring.
+
+    Parameters
+    ----------
+    fit : Fit
+        The present model.
+    errors : mapping of (run, output) to RunError
+        What is left in the fitted runs, and the noise.
+    """
+    tolerances = _tolerance_columns(fit)
+    gram, gradient = _prior_terms(fit)
+    runs, noise, excess = [], 0.0, 0.0
+    for r, record in enumerate(fit.records):
+        entries = [errors[record.label, output] for output in fit.predictor.outputs]
+        measured = fit.predictor.runs[r].measured
+        sigma = [_sigma(e.average.sigma, m) for e, m in zip(entries, measured, strict=True)]
+        run = _run_base(fit, r, sigma, tolerances[r], _spectra(entries))
+        cross, _, score = run.products(run.sensitivity)
+        gram, gradient = gram + cross, gradient + score
+        for entry, value in zip(entries, sigma, strict=True):
+            noise += counted(record) * (entry.noise / value) ** 2
+            excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
+        runs.append(run)
+    return Base(fit, runs, gram, gradient, noise, excess)
+
+
+def _prior_terms(fit: Fit) -> tuple[Array, Array]:
+    """What priors add to ``J' W J`` and ``J' W e``, unknowns in units of their priors' sd.
+
+    A constant known to a tolerance is no free parameter: its prior's precision, one in this unit,
+    stays with it, as that of a nuisance parameter does.
+    """
+    known = len(fit.problem.priors)
+    gram = np.diag(np.repeat([0.0, 1.0], [known, len(fit.model.uncertain())]))
+    gradient = np.zeros(len(gram))
+    for k, (name, prior) in enumerate(zip(fit.problem.names, fit.problem.priors, strict=True)):
+        if name in fit.problem.nuisances:
+            gram[k, k] += 1.0
+            gradient[k] -= (fit.point.theta[k] - prior.mean) / prior.sd
+    return gram, gradient
+
+
+def _run_base(
+    fit: Fit, r: int, sigma: Sequence[float], tolerances: Array, spectra: tuple[NoiseSpectrum, ...]
+) -> RunBase:
+    """One run at the present estimate, given the noise of a sample by output."""
+    run, record = fit.predictor.runs[r], fit.records[r]
+    names = fit.predictor.layout.names
+    free = [names.index(name) for name in fit.problem.names]
+    unit = np.array([prior.sd for prior in fit.problem.priors])
+    own = fit.predictions[r].sensitivity[:, free] * unit[:, None]
+    return RunBase.of(
+        np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
+        (run.measured - fit.predictions[r].y).ravel(),
+        flat(np.concatenate([own, tolerances], axis=1)),
+        flat(input_columns(run, present_constants(fit, r))),
+        np.tile(replicate(record), len(sigma)),
+        spectra,
+    )
+
+
+def _spectra(entries: Sequence[RunError]) -> tuple[NoiseSpectrum, ...]:
+    found = tuple(entry.spectrum for entry in entries if entry.spectrum is not None)
+    return found if len(found) == len(entries) else ()
+
+
+def replicate(record: Record) -> NDArray[np.int64]:
+    """Number of the period that each sample lies in; of a transient, of the stretch."""
+    if record.periodic:
+        return np.floor(record.phase + 1e-9).astype(np.int64)
+    return np.minimum((STRETCHES * record.position).astype(np.int64), STRETCHES - 1)
+
+
+def _sigma(noise: float, measured: Array) -> float:
+    """Noise of a sample; data without noise get a floor far below what any record resolves."""
+    return max(noise, 1e-9 * float(np.ptp(measured)), 1e-300)
+
+
+def flat(columns: Array) -> Array:
+    """Columns of shape (ny, k, N) as (k, ny N), outputs one after the other."""
+    outputs, count, samples = columns.shape
+    return np.moveaxis(columns, 1, 0).reshape(count, outputs * samples)
+
+
+def _tolerance_columns(fit: Fit) -> list[Array]:
+    """Sensitivities to the constants known to a tolerance only, in units of their priors' standard
+    deviations."""
+    names = fit.model.uncertain()
+    if not names:
+        return [
+            np.zeros((run.measured.shape[0], 0, run.measured.shape[1]))
+            for run in fit.predictor.runs
+        ]
+    model = fit.model.fixing(*fit.model.estimated()).freeing(*names)
+    scale = np.array([prior.sd for prior in Layout.of(model, ["any"]).priors(model)])
+    blocks = sensitivities_of(fit, model, [{}])
+    if isinstance(blocks, Status):
+        return [
+            np.zeros((run.measured.shape[0], len(scale), run.measured.shape[1]))
+            for run in fit.predictor.runs
+        ]
+    return [block * scale[:, None] for block in blocks[0].by_run]

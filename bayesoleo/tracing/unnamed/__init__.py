@@ -1,0 +1,1 @@
+"""Look for a smooth function where no named effect explains what is left."""

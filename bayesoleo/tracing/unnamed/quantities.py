@@ -1,0 +1,170 @@
+"""The quantities of a model along its estimated motion, at any phase of any run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo.effects.units import parse_unit, unit_of, unit_text
+from bayesoleo.effects.unnamed import Axis, bspline_values
+from bayesoleo.errors import ModelError
+from bayesoleo.model import Model, Output
+from bayesoleo.model.expressions import split_derivative, symbol
+from bayesoleo.prediction.inputs import signal_of
+from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.fit import Fit
+
+Array = NDArray[np.float64]
+
+#: Two quantities whose ranks agree to this are one and the same to a smooth function of either.
+ALIKE = 0.9995
+#: A quantity whose range is a smaller part of its size does not move.
+MOVES = 1e-6
+_PREFIX = "quantity_"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something of a model that varies in time.
+
+    Parameters
+    ----------
+    name, unit : str
+    expression : sympy.Expr
+        In the names of the model in its own drive.
+    """
+
+    name: str
+    expression: sp.Expr
+    unit: str
+
+
+def quantities_of(model: Model) -> list[Quantity]:
+    """Positions and velocities, states of first order, and the definitions that move.
+
+    Parameters
+    ----------
+    model : Model
+        In its own drive.
+    """
+    found: dict[str, Quantity] = {}
+
+    def add(name: str, expression: sp.Expr, unit: str) -> None:
+        found.setdefault(name, Quantity(name, expression, unit))
+
+    for item in model.coordinates():
+        unit = model.dofs[item.name].unit if item.name in model.dofs else model.inputs[item.name]
+        add(item.name, item.position, unit)
+        if item.velocity is not None:
+            rate = unit_text(parse_unit(unit) / parse_unit("s"))
+            add(f"velocity of {item.name}", item.velocity, rate)
+    for name in model.definitions:
+        own = _unit(model, name)
+        if own is not None and _moves(model, name):
+            add(name, symbol(name), own)
+    return list(found.values())
+
+
+def _moves(model: Model, definition: str) -> bool:
+    free = {split_derivative(item)[0] for item in model.expand(symbol(definition)).free_symbols}
+    return bool(free & {*model.dofs, *model.inputs})
+
+
+def _unit(model: Model, definition: str) -> str | None:
+    try:
+        return unit_text(unit_of(symbol(definition), model))
+    except ModelError:
+        return None  # bare numbers in a definition leave it without one
+
+
+class Motions:
+    """Values of quantities along the estimated motion.
+
+    Parameters
+    ----------
+    fit : Fit
+        The present model.
+    assembly : Assembly
+        It, with its drive.
+    quantities : sequence of Quantity
+    """
+
+    def __init__(self, fit: Fit, assembly: Assembly, quantities: Sequence[Quantity]):
+        self.fit = fit
+        self.quantities: list[Quantity] = []
+        self._functions = []
+        for item in quantities:
+            expression = _driven(assembly, item)
+            if expression is not None:
+                items = tuple(sorted(expression.free_symbols, key=str))
+                modules = [{"bspline": bspline_values}, "numpy"]
+                self._functions.append((sp.lambdify(items, expression, modules), items))
+                self.quantities.append(item)
+
+    def at(self, r: int, k: int, phase: Array) -> Array:
+        """Quantity number ``k`` in run number ``r`` at phases in cycles, shape (N,)."""
+        function, items = self._functions[k]
+        columns = [_row(self.fit, r, item, phase) for item in items]
+        with np.errstate(all="ignore"):
+            found: Array = np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)
+        return found
+
+    def axes(self) -> list[tuple[int, Axis]]:
+        """Quantities that move, each with its number and range, none that another one follows."""
+        found: list[tuple[int, Axis]] = []
+        kept: list[Array] = []
+        records = self.fit.records
+        for k, item in enumerate(self.quantities):
+            parts = [self.at(r, k, record.position) for r, record in enumerate(records)]
+            values = np.concatenate(parts)
+            if not np.isfinite(values).all():
+                continue
+            if np.ptp(values) <= MOVES * np.abs(values).max():
+                continue
+            if any(_alike(values, other) for other in kept):
+                continue
+            kept.append(values)
+            found.append((k, Axis.covering(item.name, item.expression, item.unit, values)))
+        return found
+
+
+def _alike(values: Array, other: Array) -> bool:
+    return bool(abs(stats.spearmanr(values, other).statistic) > ALIKE)
+
+
+def _driven(assembly: Assembly, item: Quantity) -> sp.Expr | None:
+    """A quantity in the names of the driven model: as an output, it is rewritten with the rest."""
+    name = f"{_PREFIX}{item.name}".replace(" ", "_")
+    native = assembly.native
+    watched = replace(
+        native, outputs={**native.outputs, name: Output({"itself": item.expression}, item.unit)}
+    )
+    try:
+        driven = replace(assembly, native=watched).model()
+    except ModelError:
+        return None
+    return driven.output(name) if name in driven.outputs else None
+
+
+def _row(fit: Fit, r: int, item: sp.Symbol, phase: Array) -> Array:
+    """A symbol of the driven model: of a dof, an input or a constant. Not a number where it is
+    none of them, as a channel fed back within an effect, or where the run has no solution."""
+    run: RunPredictor = fit.predictor.runs[r]
+    name, order = split_derivative(item)
+    motions = run.known_motions()
+    if name in motions:
+        rows: Array = motions[name](phase)
+        return rows[order]
+    if name in fit.predictor.model.inputs:
+        return signal_of(run.record, name).evaluate(phase, run.record.rate, order)
+    constants = run.kernels.derived.constants
+    if name in constants:
+        present = fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
+        return np.asarray(present[constants.index(name)])
+    return np.full(phase.size, np.nan)
