@@ -11,8 +11,8 @@ r"""A discrepancy part of which all runs share.
 A run shows what a model lacks, and so do the others: what is missing in all of them is alike where
 they go through the same part of the motion. If each had a discrepancy of its own
 (:class:`~bayesoleo.posterior.density.error_models.DiscrepancyErrors`), more runs would average it
-away, and intervals would shrink about a value that stays off. Here :math:`\kappa` says how much of it they share; at
-zero each has its own. Phases count from the crest of what drives a run.
+away, and intervals would shrink about a value that stays off. Here :math:`\kappa` says how much of
+it they share; at zero each has its own. Phases count from the crest of what drives a run.
 
 Runs are then not independent. The common curve has few coefficients, so each run adds a term to
 one small system; the log-likelihood of a run is that *given the runs before it*, whose sum is
