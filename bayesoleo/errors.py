@@ -75,3 +75,7 @@ class ResultsError(InputError):
 
 class DataWarning(UserWarning):
     """A record is usable but deserves a look."""
+
+
+class ModelWarning(UserWarning):
+    """A model is usable but deserves a look."""

@@ -8,6 +8,7 @@ import inspect
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +16,9 @@ from types import ModuleType
 
 from bayesoleo import model as declarations
 from bayesoleo.effects import Effect, catalogue
-from bayesoleo.errors import InputError, ModelError
+from bayesoleo.errors import InputError, ModelError, ModelWarning
 from bayesoleo.model import Model
+from bayesoleo.model.unused import unused
 from bayesoleo.systems import system
 
 DEFAULT_OBJECT, DEFAULT_EFFECTS = "model", "effects"
@@ -42,6 +44,11 @@ def load_model(text: str) -> Model:
         No such system, file or object; the object is not a model; the file raises something, which
         is told with its line.
 
+    Warns
+    -----
+    ModelWarning
+        If a model from a file declares what nothing in it uses.
+
     Examples
     --------
     >>> load_model("gas_spring").name
@@ -61,6 +68,13 @@ def load_model(text: str) -> Model:
     if not isinstance(model, Model):
         problem = f"{name} is not a Model but {type(model).__name__}"
         raise ModelError(problem, file=path, hint=_models_in(found, path))
+    for idle, kind in unused(model).items():
+        warnings.warn(
+            f"file {path}: {kind} {idle} of model {model.name!r} stands in no equation and no "
+            "output; nothing depends on it unless an effect does",
+            ModelWarning,
+            stacklevel=2,
+        )
     return model
 
 

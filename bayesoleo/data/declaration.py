@@ -134,7 +134,24 @@ def _channels(tables: Mapping[str, Any]) -> dict[str, Channel]:
         raise CampaignError(
             "no channel is declared", file=FILE, key="channels", hint="write [channels.<name>]"
         )
-    return {name: _channel(name, table) for name, table in tables.items()}
+    channels = {name: _channel(name, table) for name, table in tables.items()}
+    _check_columns(channels)
+    return channels
+
+
+def _check_columns(channels: Mapping[str, Channel]) -> None:
+    """Raise where two channels are one column: what is compared with itself is no measurement."""
+    owner: dict[str, str] = {}
+    for name, channel in channels.items():
+        if channel.column in owner:
+            raise CampaignError(
+                f"is the column of channel {owner[channel.column]} already",
+                file=FILE,
+                key=f"channels.{name}.column",
+                value=channel.column,
+                hint="name the column that holds this channel, or leave one of the two out",
+            )
+        owner[channel.column] = name
 
 
 def _channel(name: str, table: Any) -> Channel:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.compiled import BlockKernel
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
@@ -50,18 +49,17 @@ def solve_from_shot(
     Returns
     -------
     Solution or None
-        None where shooting finds nothing either, or cannot integrate the model; also where kernels
-        are not compiled: an integrator that calls them back step by step takes minutes to fail.
+        None where shooting finds nothing either, or cannot integrate the model.
     """
-    if not isinstance(kernels.residual, BlockKernel):
-        return None
     scheme, n = boundary.scheme, guess.shape[1]
     nodes, points = np.arange(n) / n, scheme.phases(n)
     rows = scheme.sample(guess[..., None], scheme.plan(np.zeros(1), n), boundary.step(n))
     first = np.cumsum([0, *(order + 1 for order in scheme.orders)])
     states = [int(first[j]) + k for j, order in enumerate(scheme.orders) for k in range(order)]
     try:
-        dynamics = dynamics_of(model, record, kernels.derived.active)
+        # Compiled whatever the mesh is solved with: that takes a second or two, and an integrator
+        # that calls NumPy's kernels back step by step takes minutes to fail.
+        dynamics = dynamics_of(model, record, kernels.derived.active, "numba")
     except ModelError:
         return None
     begin = np.ascontiguousarray(rows[0, states, 0, 0])

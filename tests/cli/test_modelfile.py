@@ -8,7 +8,7 @@ import pytest
 from small_rig import MODEL
 
 from bayesoleo.effects import catalogue
-from bayesoleo.errors import ModelError
+from bayesoleo.errors import ModelError, ModelWarning
 from bayesoleo.modelfile import load_effects, load_model
 
 
@@ -51,6 +51,12 @@ def test_error_names_the_line_of_the_file_and_not_of_what_it_calls(model):
     with pytest.raises(ModelError, match=r"spring.py: line 3: JSONDecodeError: ") as caught:
         load_model(str(model))
     assert "\n" not in str(caught.value)
+
+
+def test_what_nothing_uses_is_named(model):
+    model.write_text(MODEL.replace("mass*ddot", "2.0*ddot"))
+    with pytest.warns(ModelWarning, match=r"spring.py: parameter mass of model 'linear osc"):
+        load_model(str(model))
 
 
 def test_folder_cannot_be_a_model(tmp_path):

@@ -166,6 +166,10 @@ BAD_TOML = [
     ),
     ({'column = "x_mm"': 'colum = "x_mm"'}, "key channels.displacement.colum: unknown key"),
     (
+        {'column = "f_kN"': 'column = "x_mm"'},
+        "key channels.force.column: is the column of channel displacement already .*'x_mm'",
+    ),
+    (
         {'unit = "mm"': 'unit = "furlog"'},
         r"key channels.displacement.unit: unknown unit \(got 'furlog'\)",
     ),

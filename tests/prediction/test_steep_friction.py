@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction.orbits import periodic_orbit
@@ -43,6 +44,7 @@ def test_every_mass_is_solved_and_agrees_with_shooting() -> None:
     assert np.max(np.abs(found - known) / size) < 1.0 / 512
 
 
-def test_anchor_is_set_where_the_static_guess_fails() -> None:
-    predictor = Predictor(MODEL, [record_of(MODEL, PLAN)], jobs=1)
+@pytest.mark.parametrize("backend", ["numba", "numpy"])
+def test_anchor_is_set_where_the_static_guess_fails(backend: str) -> None:
+    predictor = Predictor(MODEL, [record_of(MODEL, PLAN)], backend=backend, jobs=1)
     assert predictor.set_anchor(np.array([LIGHT])) == [Status.CONVERGED]
