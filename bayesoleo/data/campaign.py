@@ -15,7 +15,7 @@ from bayesoleo.data.checked_table import FILE, choose
 from bayesoleo.data.declaration import Channel, Declaration, read_declaration
 from bayesoleo.data.declared_run import RunDeclaration
 from bayesoleo.data.files import read_columns
-from bayesoleo.data.gaps import Stretches, masked
+from bayesoleo.data.gaps import Stretches, bridged, masked
 from bayesoleo.data.registry import dataset_folder
 from bayesoleo.data.sampling import uniform_time, window
 from bayesoleo.errors import CampaignError
@@ -201,11 +201,12 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         # Cut first: what lies outside may have gaps.
         part = window(whole, declared.start, declared.stop)
         time = _frozen(uniform_time(whole[part], column, part.start) if column else whole[part])
+        away = masked(time, declared.mask)
         samples = {
-            name: _samples(channel, columns, whole, part) for name, channel in channels.items()
+            name: _samples(channel, columns, whole, part, away)
+            for name, channel in channels.items()
         }
         _check_periods(declared, time)
-        masked(time, declared.mask)
     except CampaignError as error:
         raise CampaignError(
             error.problem,
@@ -263,21 +264,30 @@ def _time(
     )
 
 
-def _samples(channel: Channel, columns: Mapping[str, Array], time: Array, part: slice) -> Array:
+def _samples(
+    channel: Channel,
+    columns: Mapping[str, Array],
+    time: Array,
+    part: slice,
+    away: NDArray[np.bool_],
+) -> Array:
     values = _column(columns, channel.column)
     if values.size != time.size:
         raise CampaignError(
             f"column has {values.size} samples and time {time.size}", column=channel.column
         )
     values, time = values[part], time[part]
-    missing = np.flatnonzero(~np.isfinite(values))
+    gap = ~np.isfinite(values)
+    missing = np.flatnonzero(gap & ~away)
     if missing.size:
         raise CampaignError(
             f"{missing.size} missing value(s), the first at {time[missing[0]]:.6g} s",
             column=channel.column,
             value=float(values[missing[0]]),
-            hint="cut the run there with start or stop, or fill the gap",
+            hint="cut the run there with start or stop, mask the gap, or fill it",
         )
+    if gap.any():  # what is masked does not count, so that any number will do
+        values = bridged(values[None], gap)[0]
     if np.ptp(values) == 0:
         raise CampaignError(
             "channel is constant",

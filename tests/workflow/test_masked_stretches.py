@@ -54,6 +54,28 @@ def broken(folder: Path, *, mask: bool, size: float = 1.0) -> Path:
     return folder
 
 
+def test_values_may_be_missing_where_they_are_masked(tmp_path):
+    whole = load_campaign(broken(tmp_path, mask=True)).run("a")
+    path = tmp_path / "a.csv"
+    rows = path.read_text(encoding="utf-8").splitlines()
+    inside = np.flatnonzero((whole.time >= FAULT[0]) & (whole.time <= FAULT[1]))
+    for k in inside[3:8]:
+        time, *others = rows[1 + k].split(",")
+        rows[1 + k] = ",".join([time, *[""] * len(others)])
+    path.write_text("\n".join(rows), encoding="utf-8")
+    gaps = load_campaign(tmp_path).run("a")
+    kept = np.setdiff1d(np.arange(whole.time.size), inside[3:8])
+    for name, values in gaps.samples.items():
+        assert np.isfinite(values).all()
+        np.testing.assert_array_equal(values[kept], whole.samples[name][kept])
+    (tmp_path / "campaign.toml").write_text(
+        (tmp_path / "campaign.toml").read_text(encoding="utf-8").replace("mask = ", "# "),
+        encoding="utf-8",
+    )
+    with pytest.raises(CampaignError, match="5 missing value.*mask the gap"):
+        load_campaign(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def masked(tmp_path_factory):
     return reduce_campaign(load_campaign(broken(tmp_path_factory.mktemp("m"), mask=True)), jobs=1)
