@@ -89,7 +89,7 @@ def candidates(
     found = (
         effect.extend(model, target, scales)
         for effect in chosen
-        if effect.id not in exclude
+        if effect.id not in exclude and effect.fits(scales)
         for target in effect.places(model)
         if f"{effect.id} at {target}" not in exclude and not effect.is_in(model, target)
     )

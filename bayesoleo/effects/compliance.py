@@ -14,11 +14,10 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.effects.effect import Amplitude, Effect, Names
-from bayesoleo.effects.places import force_places, substitute
+from bayesoleo.effects.places import force_places, resisting_places, substitute
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.drive import MAXIMUM_DERIVATIVE
 from bayesoleo.model.expressions import (
-    WITHIN,
     derivative_symbol,
     partial,
     split_derivative,
@@ -28,24 +27,11 @@ from bayesoleo.model.expressions import (
 
 
 def _places(model: Model) -> Sequence[str]:
-    found = force_places(model)
-    laws = {
-        name: place
-        for name, place in found.items()
-        if place.kind == "output" and WITHIN not in place.name
-    }
-    # A force resists motion; a pressure that is measured beside it is no second one.
-    resisting = [
+    return tuple(
         name
-        for name, place in laws.items()
-        if place.velocity is not None and model.output(place.target).has(place.velocity)
-    ]
-    moved = [
-        name
-        for name, place in found.items()
-        if place.kind == "equation" and _shown_at(model, place) and _external(model, place) != 0
-    ]
-    return (*moved, *(resisting or laws))
+        for name, place in resisting_places(model).items()
+        if place.kind == "output" or (_shown_at(model, place) and _external(model, place) != 0)
+    )
 
 
 def _shown_at(model: Model, place: Coordinate) -> dict[str, sp.Expr]:

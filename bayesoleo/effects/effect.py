@@ -56,6 +56,8 @@ class Scales:
         Of all runs, in seconds.
     output_range : mapping of str to (float, float)
         Lowest and highest value measured, by output, in the output's unit.
+    kinds : frozenset of str
+        Of the runs: ``periodic``, ``transient`` or both.
     """
 
     position: Mapping[str, tuple[float, float]]
@@ -64,6 +66,7 @@ class Scales:
     shortest_period: float
     longest_period: float
     output_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    kinds: frozenset[str] = frozenset({"periodic"})
 
 
 @dataclass(frozen=True)
@@ -195,6 +198,10 @@ class Effect:
         In words, for listings.
     own_name_per_target : bool
         Name parameters after the target even where only one target exists.
+    driven : bool
+        Whether it changes the model as the rig drives it; sensors and compliance always do.
+    kind : str
+        ``periodic`` or ``transient`` where it can be told from such runs alone; else empty.
 
     Raises
     ------
@@ -218,6 +225,8 @@ class Effect:
     source: str = ""
     applies_to: str = "every model"
     own_name_per_target: bool = False
+    driven: bool = False
+    kind: str = ""
 
     def __post_init__(self) -> None:
         if not self.id.isidentifier():
@@ -230,8 +239,12 @@ class Effect:
 
     @property
     def on_channels(self) -> bool:
-        """Whether it sits between the system and its channels, and so depends on the drive."""
-        return self.family in ("sensor", "compliance")
+        """Whether it depends on the channel that drives the model."""
+        return self.driven or self.family in ("sensor", "compliance")
+
+    def fits(self, scales: Scales) -> bool:
+        """Whether the runs are of the kind that it needs."""
+        return not self.kind or scales.kinds == {self.kind}
 
     @property
     def _parts(self) -> tuple[Amplitude | Shape | Constant, ...]:

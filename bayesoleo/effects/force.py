@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import sympy as sp
 
 from bayesoleo.effects.effect import Amplitude, Effect, Names
 from bayesoleo.effects.force_effect import force_effect
-from bayesoleo.effects.places import is_quantity, substitute
+from bayesoleo.effects.places import is_quantity, moving_places, resisting_places, substitute
 from bayesoleo.model import Model
-from bayesoleo.model.expressions import symbol
+from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN, symbol, within
 
 #: Name under which a model may declare the acceleration of gravity.
 GRAVITY = "gravity"
@@ -54,6 +57,85 @@ def _heavier(model: Model, target: str, names: Names) -> Model:
     return substitute(model, {symbol(target): symbol(target) + names["gravity_error"]})
 
 
+#: Harmonics of the drive that a periodic force may have.
+HARMONICS = 5
+
+
+def _locked(model: Model) -> Sequence[str]:
+    """Balances of forces of models that something drives."""
+    return tuple(resisting_places(model)) if _drive(model) else ()
+
+
+def _drive(model: Model) -> str:
+    """The input whose phase counts: the first one."""
+    return next((name for name in model.inputs if WITHIN not in name), "")
+
+
+def _turning(model: Model, target: str, names: Names) -> Model:
+    """Chebyshev's polynomials in the cosine of the drive's phase are the cosines of its multiples;
+    those of the second kind, times the sine, the sines."""
+    place, drive = resisting_places(model)[target], _drive(model)
+    cosine, sine = (within(part, drive) for part in (COSINE, SINE))
+    c, s = symbol(cosine), symbol(sine)
+    force = sp.Add(
+        *(
+            names[f"cosine_{k}"] * sp.chebyshevt(k, c)
+            + names[f"sine_{k}"] * s * sp.chebyshevu(k - 1, c)
+            for k in range(1, HARMONICS + 1)
+        )
+    )
+    turned = replace(model, inputs={**model.inputs, cosine: "", sine: ""})
+    return turned.with_term(place.kind, place.target, "periodic_force", place.sign * force)
+
+
+# What the amplitudes of a law are to the motion, these are to the drive's phase: the same in every
+# run, however large the motion. Were they free by run, they would mimic every other effect.
+PERIODIC = Effect(
+    id="periodic_force",
+    family="force",
+    title="Force that repeats with the drive, the same in every run",
+    formula=r"\sum_{k=1}^{5} a_k \cos k \varphi + b_k \sin k \varphi,"
+    r" \quad \varphi = \arg x_1 + 2 \pi f t",
+    amplitudes=tuple(
+        Amplitude(f"{part}_{k}", "force", f"{letter}_{k}", f"{part} of harmonic {k} of the drive")
+        for k in range(1, HARMONICS + 1)
+        for part, letter in (("cosine", "a"), ("sine", "b"))
+    ),
+    places=_locked,
+    change=_turning,
+    source="Fourier series in the phase of the drive; Pintelon and Schoukens (2012), System"
+    " Identification: A Frequency Domain Approach, section 2.3",
+    applies_to="balances of forces, in periodic runs",
+    driven=True,
+    kind="periodic",
+)
+
+
+def _moved(model: Model) -> Sequence[str]:
+    """Equations of motion; a drift in a force law is that of its channel."""
+    return tuple(k for k, place in moving_places(model).items() if place.kind == "equation")
+
+
+def _drifting(model: Model, target: str, names: Names) -> Model:
+    place = moving_places(model)[target]
+    drift = place.sign * names["drifting_force"] * TIME
+    return model.with_term(place.kind, place.target, "drifting_force", drift)
+
+
+DRIFTING = Effect(
+    id="drifting_force",
+    family="force",
+    title="Force that drifts",
+    formula=r"F_t \, t",
+    amplitudes=(Amplitude("drifting_force", "force/s", "F_t", "rate of a force"),),
+    places=_moved,
+    change=_drifting,
+    source="first term of a Taylor series in time",
+    applies_to="equations of motion, in transient runs; in force laws it is sensor_drift",
+    driven=True,
+    kind="transient",
+)
+
 GRAVITY_ERROR = Effect(
     id="gravity_error",
     family="force",
@@ -67,4 +149,4 @@ GRAVITY_ERROR = Effect(
     applies_to=f"models that declare {GRAVITY}",
 )
 
-EFFECTS = (CONSTANT, OFFSET_BY_RUN, MASS, GRAVITY_ERROR)
+EFFECTS = (CONSTANT, OFFSET_BY_RUN, PERIODIC, DRIFTING, MASS, GRAVITY_ERROR)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.model import Coordinate, Model
-from bayesoleo.model.expressions import derivative_symbol, split_derivative
+from bayesoleo.model.expressions import WITHIN, derivative_symbol, split_derivative
 from bayesoleo.model.initial import with_starts
 
 
@@ -19,7 +19,8 @@ def force_places(model: Model) -> dict[str, Coordinate]:
     A target is the name of a second-order dof's equation, or of an output that follows an input (a
     force law). Where an output follows several inputs the target is ``output/input``.
     """
-    coordinates = model.coordinates()
+    # An input that goes with another one is no motion of its own.
+    coordinates = [item for item in model.coordinates() if WITHIN not in item.name]
     second = [item for item in coordinates if item.kind == "equation" and item.velocity is not None]
     laws = [item for item in coordinates if item.kind == "output"]
     # Where a balance of forces exists the forces act there: an output that shows an input as well
@@ -31,6 +32,19 @@ def force_places(model: Model) -> dict[str, Coordinate]:
         alone = shared[item.kind, item.target] == 1
         places[item.target if alone else f"{item.target}/{item.name}"] = item
     return places
+
+
+def resisting_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` whose balance resists motion: a pressure that is measured
+    beside a force is no second force."""
+    found = force_places(model)
+    laws = {name: place for name, place in found.items() if place.kind == "output"}
+    resisting = {
+        name: place
+        for name, place in laws.items()
+        if place.velocity is not None and model.output(place.target).has(place.velocity)
+    }
+    return {k: item for k, item in found.items() if k not in laws} | (resisting or laws)
 
 
 def moving_places(model: Model) -> dict[str, Coordinate]:

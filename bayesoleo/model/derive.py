@@ -69,7 +69,7 @@ def derive(model: Model, active: Sequence[str] | None = None) -> Derived:
     Raises
     ------
     ModelError
-        If a dof has an order above two, or an equation depends on time explicitly.
+        If a dof has an order above two.
     """
     orders = tuple(model.order(dof) for dof in model.dofs)
     for dof, order in zip(model.dofs, orders, strict=True):
@@ -81,10 +81,6 @@ def derive(model: Model, active: Sequence[str] | None = None) -> Derived:
     residual = tuple(model.equation(dof) for dof in model.dofs)
     output = tuple(model.output(name) for name in model.outputs)
     admissible = tuple(model.expand(expression) for expression in model.admissible)
-    if any(expression.has(TIME) for expression in residual):
-        raise ModelError(
-            f"model {model.name!r}: an equation depends on time", hint="use time in outputs only"
-        )
     states = tuple(
         derivative_symbol(dof, k)
         for dof, order in zip(model.dofs, orders, strict=True)

@@ -92,7 +92,8 @@ FUNCTIONS: dict[str, object] = {
     "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
 }
 
-#: Seconds since the first sample; for outputs only, a periodic state cannot depend on it.
+#: Seconds since the first sample; for outputs and for transients, a periodic state cannot depend
+#: on it.
 TIME = sp.Symbol("time", real=True)
 
 _DERIVATIVE = re.compile(r"^(d+)ot\((.+)\)$")
@@ -115,6 +116,11 @@ def within(channel: str, other: str) -> str:
     cut off alike in both.
     """
     return f"{channel}{WITHIN}{other}"
+
+
+#: First parts of the names of inputs that turn with a channel: the cosine and the sine of the phase
+#: of its first harmonic. Polynomials in both are the harmonics of the drive.
+COSINE, SINE = "drive_cosine", "drive_sine"
 
 
 def derivative_symbol(name: str, order: int) -> sp.Symbol:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
-from bayesoleo.model.expressions import WITHIN
+from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.prediction.records import Harmonics, Record, Signal
 
 Array = NDArray[np.float64]
@@ -58,6 +58,8 @@ def _restricted(record: Record, name: str) -> Signal | None:
     """One channel at the harmonics of another, as :func:`~bayesoleo.model.expressions.within`
     names it; of a transient, the channel itself."""
     channel, _, other = name.partition(WITHIN)
+    if channel in (COSINE, SINE) and other in record.harmonics:
+        return _turning(record.harmonics[other], channel)
     if channel not in record.signals or other not in record.signals:
         return None
     if not record.periodic:
@@ -70,6 +72,17 @@ def _restricted(record: Record, name: str) -> Signal | None:
         coefficients=item.coefficients[kept],
         variances=item.variances[kept],
     )
+
+
+def _turning(item: Harmonics, part: str) -> Harmonics | None:
+    """The first harmonic with unit amplitude, or a quarter of a turn behind it."""
+    first = np.flatnonzero(item.orders == 1)
+    if first.size == 0 or item.coefficients[first[0]] == 0:
+        return None
+    c, variance = item.coefficients[first], item.variances[first]
+    quarter = 1.0 if part == COSINE else -1j
+    size = np.abs(c)
+    return Harmonics(item.orders[first], quarter * c / size, variance / size**2)
 
 
 #: Rows computed before, by grid, channel and derivative; models of the same run share them.

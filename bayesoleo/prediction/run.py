@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Model
-from bayesoleo.model.expressions import WITHIN
+from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.anchor import PATH_PIECES, Anchor
 from bayesoleo.prediction.from_shot import solve_from_shot
@@ -104,6 +104,12 @@ class RunPredictor:
         self.model, self.kernels, self.record, self.steps = model, kernels, record, steps
         derived = kernels.derived
         self._check(record)
+        if any(expression.has(TIME) for expression in derived.residual):
+            raise ModelError(
+                f"model {model.name!r}: an equation depends on time, so that nothing periodic "
+                f"solves it, and run {record.label} is periodic",
+                hint="use time in outputs, or in equations of transients only",
+            )
         self.scheme = scheme(scheme_name, derived.orders)
         self.period = 1.0 / record.frequency
         self.points = self.scheme.phases(steps)
@@ -131,7 +137,8 @@ class RunPredictor:
     def _check(self, record: Record) -> None:
         # An input may be one measured channel at the harmonics of another.
         needed = [part for name in self.model.inputs for part in name.split(WITHIN)]
-        missing = [name for name in (*needed, *self.model.outputs) if name not in record.samples]
+        known = {*record.samples, COSINE, SINE}
+        missing = [name for name in (*needed, *self.model.outputs) if name not in known]
         if missing:
             raise CampaignError(
                 f"model {self.model.name!r} needs channel {missing[0]!r}, which the campaign lacks",

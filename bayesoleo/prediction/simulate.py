@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
+from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.run import RunPredictor
@@ -204,7 +205,7 @@ def _check_plan(model: Model, plan: RunPlan, values: Mapping[str, float]) -> Non
         if name not in model.parameters:
             hint = f"parameters there are: {', '.join(model.parameters)}"
             raise InputError("no such parameter", run=plan.label, key=name, hint=hint)
-    for name in model.inputs:
+    for name in _moved(model):
         if name not in plan.inputs:
             raise InputError(
                 f"model {model.name!r} needs the input {name!r}",
@@ -216,6 +217,13 @@ def _check_plan(model: Model, plan: RunPlan, values: Mapping[str, float]) -> Non
         if name not in plan.conditions and condition.default is None:
             hint = f"give conditions={{{name!r}: …}} in {condition.unit or 'its unit'}"
             raise InputError(f"no condition {name!r}", run=plan.label, hint=hint)
+
+
+def _moved(model: Model) -> tuple[str, ...]:
+    """Inputs that a plan states; those that turn with another one follow from it."""
+    return tuple(
+        name for name in model.inputs if not name.startswith((COSINE + WITHIN, SINE + WITHIN))
+    )
 
 
 def _check_channels(
@@ -243,7 +251,7 @@ def _clean_samples(
 ) -> dict[str, Array]:
     """All channels without noise, inputs first."""
     record = record_of(model, plan)
-    inputs = {name: record.samples[name] for name in model.inputs}
+    inputs = {name: record.samples[name] for name in _moved(model)}
     run = RunPredictor(model, kernels(model, model.estimated(), backend), record, steps, scheme)
     p = run.base_constants()
     for name, value in values.items():
@@ -264,7 +272,7 @@ def _clean_samples(
 def record_of(model: Model, plan: RunPlan) -> Record:
     """A record of the inputs alone, as a predictor takes it; phase counts from its first sample."""
     time = plan.time
-    turned = {name: _turned(plan.inputs[name], plan.phase) for name in model.inputs}
+    turned = {name: _turned(plan.inputs[name], plan.phase) for name in _moved(model)}
     samples = {
         name: item.evaluate(plan.frequency * time, plan.frequency) for name, item in turned.items()
     }

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import pytest
 
-from bayesoleo.effects import Scales
+from bayesoleo.effects import Candidate, Scales, candidates
+from bayesoleo.model import Model
 from bayesoleo.systems import system
 
 NAMES = ("f16n1d2", "f16n2d2", "f16n1d1_thesis", "duffing", "viscous_damper", "gas_spring")
@@ -20,6 +24,19 @@ def scales() -> Scales:
         shortest_period=0.5,
         longest_period=25.0,
     )
+
+
+@pytest.fixture(scope="session")
+def offered(scales) -> Callable[[Model], list[Candidate]]:
+    """Every candidate of a model, in periodic runs or in transients."""
+
+    def of(model: Model) -> list[Candidate]:
+        found = candidates(model, scales)
+        known = {(item.effect, item.target) for item in found}
+        transient = candidates(model, replace(scales, kinds=frozenset({"transient"})))
+        return found + [item for item in transient if (item.effect, item.target) not in known]
+
+    return of
 
 
 @pytest.fixture(scope="session", params=[*NAMES, "lorenz"])

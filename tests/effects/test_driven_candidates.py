@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from bayesoleo.effects import candidates, find_effect
+from bayesoleo.effects import find_effect
 from bayesoleo.model import driven_by
 from bayesoleo.systems import system
 
 
 @pytest.mark.parametrize("name", ["f16n1d2", "f16n2d2", "duffing"])
-def test_every_candidate_can_be_driven_by_displacement(name, scales):
+def test_every_candidate_can_be_driven_by_displacement(name, offered):
     model = system(name)
-    for candidate in candidates(model, scales):
+    for candidate in offered(model):
         driven = driven_by(candidate.model, "displacement")
         assert "displacement" in driven.inputs, candidate.effect
         assert "force" in driven.outputs, candidate.effect

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from bayesoleo.effects import candidates, find_effect
+from bayesoleo.effects import find_effect
 from bayesoleo.effects.units import balance_unit, parse_unit, unit_of, unit_text
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.systems import system
 
 
-def test_every_balance_of_an_extended_model_has_one_unit(united_model, scales):
-    for candidate in candidates(united_model, scales):
+def test_every_balance_of_an_extended_model_has_one_unit(united_model, offered):
+    for candidate in offered(united_model):
         extended = candidate.model
         for dof in extended.dofs:
             unit_of(extended.equation(dof), extended)  # raises where summands differ

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesoleo.effects import candidates
 from bayesoleo.model import driven_by
 from bayesoleo.model.expressions import symbol
 from bayesoleo.model.kernels import kernels
@@ -24,8 +23,8 @@ def rows(names_and_orders) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["f16n1d2", "viscous_damper"])
-def test_kernels_are_finite_at_the_null(name, scales):
-    for candidate in candidates(system(name), scales):
+def test_kernels_are_finite_at_the_null(name, offered):
+    for candidate in offered(system(name)):
         model = driven_by(candidate.model, "displacement")
         compiled = kernels(model, backend="numpy")
         derived = compiled.derived

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from bayesoleo.effects import Candidate, candidates
+from bayesoleo.effects import Candidate
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import derivative_symbol, partial, split_derivative, symbol
 
@@ -44,9 +44,9 @@ def value(expression: sp.Expr, state: dict) -> float:
     return float(sp.lambdify([], expression.xreplace({k: sp.Float(v) for k, v in state.items()}))())
 
 
-def test_extended_model_at_null_is_the_old_one(model, scales):
+def test_extended_model_at_null_is_the_old_one(model, offered):
     rng = np.random.default_rng(1)
-    found = candidates(model, scales)
+    found = offered(model)
     assert found
     for candidate in found:
         pairs = [(model.output(c), candidate.model.output(c)) for c in model.outputs]
@@ -62,9 +62,9 @@ def test_extended_model_at_null_is_the_old_one(model, scales):
                 assert new == pytest.approx(old, rel=1e-9, abs=1e-6), candidate.effect
 
 
-def test_added_equations_determine_the_added_dofs_at_null(model, scales):
+def test_added_equations_determine_the_added_dofs_at_null(model, offered):
     rng = np.random.default_rng(2)
-    for candidate in candidates(model, scales):
+    for candidate in offered(model):
         for dof in set(candidate.model.dofs) - set(model.dofs):
             null = {symbol(name): sp.Float(0.0) for name in candidate.parameters}
             slope = partial(candidate.model.equation(dof), symbol(dof)).xreplace(null)
@@ -74,9 +74,9 @@ def test_added_equations_determine_the_added_dofs_at_null(model, scales):
             assert np.any(np.abs(slopes) > 1e-9), (candidate.effect, dof)
 
 
-def test_amplitudes_move_something(model, scales):
+def test_amplitudes_move_something(model, offered):
     """No amplitude is left out of the extended model."""
-    for candidate in candidates(model, scales):
+    for candidate in offered(model):
         expressions = [candidate.model.output(c) for c in candidate.model.outputs]
         expressions += [candidate.model.equation(d) for d in candidate.model.dofs]
         free = set().union(*(e.free_symbols for e in expressions))
@@ -84,8 +84,8 @@ def test_amplitudes_move_something(model, scales):
         assert new <= free, candidate.effect
 
 
-def test_candidates_respect_their_contract(model, scales):
-    for candidate in candidates(model, scales):
+def test_candidates_respect_their_contract(model, offered):
+    for candidate in offered(model):
         added = set(candidate.model.parameters) - set(model.parameters)
         assert added >= {*candidate.parameters, *candidate.shapes}
         assert set(candidate.sign) == set(candidate.parameters)

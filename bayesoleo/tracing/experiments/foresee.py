@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.model import Model
-from bayesoleo.model.expressions import WITHIN
+from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import Predictor
@@ -155,6 +155,7 @@ def foresee(
     """
     fit = rival.fit
     fed_back = [name for name in known.model.inputs if WITHIN in name]
+    fed_back = [name for name in fed_back if not name.startswith((COSINE, SINE))]
     record = replace(record, harmonics={**record.harmonics, **_nothing(fed_back)})
     for _ in range(PASSES if fed_back else 1):
         predictor = Predictor(

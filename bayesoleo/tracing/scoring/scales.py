@@ -52,7 +52,8 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
         )
         for k, name in enumerate(fit.predictor.outputs)
     }
-    return Scales(position, velocity, outputs, min(periods), max(periods), ranges)
+    kinds = frozenset(record.kind for record in fit.records)
+    return Scales(position, velocity, outputs, min(periods), max(periods), ranges, kinds)
 
 
 def _places(record: Record) -> np.ndarray:
