@@ -143,7 +143,8 @@ def _blocks(rows: NDArray[Any]) -> NDArray[Any]:
     """Rows (k, N) as blocks (blocks, k, BLOCK), the last one filled up with the last sample."""
     fill = -rows.shape[1] % BLOCK
     whole = np.concatenate([rows, np.repeat(rows[:, -1:], fill, axis=1)], axis=1)
-    return np.ascontiguousarray(whole.reshape(len(rows), -1, BLOCK).swapaxes(0, 1))
+    count = whole.shape[1] // BLOCK  # not left to reshape: a model may have no inputs
+    return np.ascontiguousarray(whole.reshape(len(rows), count, BLOCK).swapaxes(0, 1))
 
 
 def _places(plan: SamplePlan, order: NDArray[np.int64]) -> Places:

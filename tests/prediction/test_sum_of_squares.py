@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from synthetic_runs import answered, harmonics, oleo_runs, run, stroke
 
+from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model.drive import driven_by
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.solvers.status import Status, count
@@ -121,6 +122,25 @@ def test_comparing_block_by_block_is_comparing_predictions(model, channel, signa
         found = one.predict(predictor.constants(theta, r))
         expected = np.sum((one.measured - found.y) ** 2, axis=2)
         np.testing.assert_allclose(squares[:, r], expected, rtol=1e-12)
+
+
+def test_a_model_without_inputs_is_compared_too():
+    """A mass hanging at rest, as far down as its weight and spring say."""
+    hanging = Model(
+        "hanging mass",
+        dofs={"q": "m"},
+        parameters={"weight": Parameter(3.0, "N", sd=1.0), "k": Parameter(2.0, "N/m", sd=1.0)},
+        equations={"q": "ddot(q) + dot(q) + k*q - weight"},
+        outputs={"displacement": Output("q", "m")},
+    )
+    blank = run("a", {}, 0.5, others=("displacement",))
+    predictor = Predictor(hanging, [blank], steps=STEPS, jobs=1)
+    predictor.set_anchor(np.array([3.0, 2.0]))
+    squares, status = predictor.sum_of_squares(np.array([[3.0, 2.0], [3.3, 2.0]]))
+    assert (status == Status.CONVERGED).all()
+    samples = blank.samples["displacement"]
+    expected = [np.sum((samples - rest) ** 2) for rest in (1.5, 1.65)]
+    np.testing.assert_allclose(squares[:, 0, 0], expected, rtol=1e-12)
 
 
 def test_a_predictor_sent_to_another_process_is_the_same(predictor, vectors, whole):
