@@ -19,6 +19,7 @@ from bayesoleo.estimation.objectives.linearise import (
 from bayesoleo.estimation.objectives.objective import Objective
 from bayesoleo.estimation.problems.problem import Array, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
+from bayesoleo.parallel import single_blas_thread
 from bayesoleo.prediction.stability import Stability
 
 # Residuals below this part of the largest sample are rounding: of a sum of hundreds of terms, or of
@@ -41,7 +42,8 @@ def summarise(
     covariance = likelihood = np.full((unknowns, unknowns), np.nan)
     if history:
         error = _error_covariance(problem, outcome, objective, bias_corrected)
-        covariance, likelihood = _covariances(scale, outcome, objective, error)
+        with single_blas_thread():  # factors are small: threads would take longer to meet
+            covariance, likelihood = _covariances(scale, outcome, objective, error)
     held = on_limit(scale.room(outcome.theta))
     return PointEstimate(
         names=tuple(problem.names),
