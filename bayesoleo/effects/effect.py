@@ -58,6 +58,8 @@ class Scales:
         Lowest and highest value measured, by output, in the output's unit.
     kinds : frozenset of str
         Of the runs: ``periodic``, ``transient`` or both.
+    hum : float, optional
+        Frequency of a line in what transients leave that no input has, Hz.
     """
 
     position: Mapping[str, tuple[float, float]]
@@ -67,6 +69,7 @@ class Scales:
     longest_period: float
     output_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     kinds: frozenset[str] = frozenset({"periodic"})
+    hum: float | None = None
 
 
 @dataclass(frozen=True)
@@ -133,8 +136,8 @@ class Amplitude:
 Grid = Callable[[Model, str, Scales], tuple[float, ...]]
 
 
-def always(_: Model) -> bool:
-    """The default of conditions on a model."""
+def always(_: Model | Scales) -> bool:
+    """The default of conditions."""
     return True
 
 
@@ -202,6 +205,8 @@ class Effect:
         Whether it changes the model as the rig drives it; sensors and compliance always do.
     kind : str
         ``periodic`` or ``transient`` where it can be told from such runs alone; else empty.
+    shown : callable (scales) -> bool
+        Whether there is anything in the runs to scan for.
 
     Raises
     ------
@@ -227,6 +232,7 @@ class Effect:
     own_name_per_target: bool = False
     driven: bool = False
     kind: str = ""
+    shown: Callable[[Scales], bool] = always
 
     def __post_init__(self) -> None:
         if not self.id.isidentifier():
@@ -243,8 +249,8 @@ class Effect:
         return self.driven or self.family in ("sensor", "compliance")
 
     def fits(self, scales: Scales) -> bool:
-        """Whether the runs are of the kind that it needs."""
-        return not self.kind or scales.kinds == {self.kind}
+        """Whether the runs are of the kind that it needs, and show what its shapes start from."""
+        return (not self.kind or scales.kinds == {self.kind}) and self.shown(scales)
 
     @property
     def _parts(self) -> tuple[Amplitude | Shape | Constant, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names
+from bayesoleo.effects.effect import Amplitude, Effect, Names, Scales, Shape
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.places import is_quantity, moving_places, resisting_places, substitute
 from bayesoleo.model import Model
@@ -136,6 +136,38 @@ DRIFTING = Effect(
     kind="transient",
 )
 
+
+def _humming(model: Model, target: str, names: Names) -> Model:
+    place = resisting_places(model)[target]
+    turn = 2 * sp.pi * names["frequency"] * TIME
+    force = names["cosine"] * sp.cos(turn) + names["sine"] * sp.sin(turn)
+    return model.with_term(place.kind, place.target, "humming_force", place.sign * force)
+
+
+def _heard(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+    """The frequency of the line; any where nothing hums, for whoever extends a model by hand."""
+    return (scales.hum or 1.0 / scales.shortest_period,)
+
+
+HUMMING = Effect(
+    id="humming_force",
+    family="force",
+    title="Periodic force at a frequency of its own",
+    formula=r"a_r \cos 2 \pi f_h t + b_r \sin 2 \pi f_h t",
+    amplitudes=tuple(
+        Amplitude(part, "force", f"{letter}_r", f"{part} part of a hum, by run", by_run=True)
+        for part, letter in (("cosine", "a"), ("sine", "b"))
+    ),
+    places=lambda model: tuple(resisting_places(model)),
+    change=_humming,
+    shapes=(Shape("frequency", "Hz", "f_h", "frequency of a hum", _heard),),
+    source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
+    applies_to="balances of forces, in transient runs with a line that no input has",
+    driven=True,
+    kind="transient",
+    shown=lambda scales: scales.hum is not None,
+)
+
 GRAVITY_ERROR = Effect(
     id="gravity_error",
     family="force",
@@ -149,4 +181,4 @@ GRAVITY_ERROR = Effect(
     applies_to=f"models that declare {GRAVITY}",
 )
 
-EFFECTS = (CONSTANT, OFFSET_BY_RUN, PERIODIC, DRIFTING, MASS, GRAVITY_ERROR)
+EFFECTS = (CONSTANT, OFFSET_BY_RUN, PERIODIC, HUMMING, DRIFTING, MASS, GRAVITY_ERROR)

@@ -25,9 +25,11 @@ from bayesoleo.effects import catalogue, find_effect
 from bayesoleo.errors import ModelError
 from bayesoleo.systems import system
 from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.roles import assign
 from bayesoleo.tracing.outcome.summary import summarise
+from bayesoleo.tracing.scoring.hum import line_of
 from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import score_all
 
@@ -147,11 +149,11 @@ def test_transients_have_no_phase_of_a_drive(hum):
     assert "drifting_force" not in {o.candidate.effect for o in state.assembly.options(scales)}
 
 
-RATE = 0.05
+RATE, HUM, OWN = 0.05, 0.3, 4.37
 
 
-def pushed(rng, rate, span=20.0, step=0.01):
-    """A hardening spring under a sum of sines that nothing repeats, and a force that drifts."""
+def pushed(rng, unmeasured, span=12.0, step=0.01):
+    """A hardening spring under a sum of sines that nothing repeats, and a force nobody measured."""
     time = np.arange(0.0, span, step)
     frequencies, phases = rng.uniform(0.3, 2.5, 12), rng.uniform(0, 2 * np.pi, 12)
 
@@ -159,7 +161,7 @@ def pushed(rng, rate, span=20.0, step=0.01):
         return 0.15 * np.sin(2 * np.pi * np.outer(t, frequencies) + phases).sum(axis=1)
 
     def rates(t, s):
-        force = push(np.atleast_1d(t))[0] + rate * t
+        force = push(np.atleast_1d(t))[0] + unmeasured(t)
         return [s[1], force - SPRING * s[0] - DRAG * s[1] - HARDENING * s[0] ** 3]
 
     found = solve_ivp(rates, (0, time[-1]), [0.0, 0.0], "DOP853", time, rtol=1e-8, atol=1e-11)
@@ -172,19 +174,69 @@ def written(folder, runs):
     return reduce_campaign(load_campaign(folder), jobs=1)
 
 
-@pytest.mark.slow
-def test_a_force_that_drifts_in_a_transient_is_first_with_its_rate(tmp_path):
+def shaken(folder, unmeasured):
+    """Three transients, from rest; the model's start is estimated."""
     runs = []
     for k, (label, role) in enumerate((("a", "fit"), ("b", "fit"), ("c", "hold-out"))):
-        time, force, x = pushed(np.random.default_rng(k), RATE)
+        time, force, x = pushed(np.random.default_rng(k), lambda t, k=k: unmeasured(t, k))
         samples = {"force": force, "displacement": x}
         runs.append(SimulatedRun(label, time, samples, role=role, kind="transient"))
-    # The drift is a force that nobody measured: it pushes, and resisting is positive.
-    state = fitted(written(tmp_path, runs), system("duffing"))
+    roles = assign(written(folder, runs).records)
+    return fit_state(Assembly(system("duffing"), starts=True), roles, NUMERICS), roles
+
+
+@pytest.mark.slow
+def test_a_force_that_drifts_in_a_transient_is_first_with_its_rate(tmp_path):
+    state, _ = shaken(tmp_path, lambda t, _: RATE * t)
     found, failed = scored(state)
     assert found[0].option.key == ("drifting_force", "position")
+    # It pushes, and a resisting force is positive.
     assert found[0].expected[0] == pytest.approx(-RATE, rel=0.05)
     assert not [k for k in failed if k.startswith("drifting_force")]
+
+
+@pytest.mark.slow
+def test_a_hum_in_transients_is_named_with_frequency_and_size(tmp_path):
+    """Its phase differs from run to run."""
+    _, roles = shaken(tmp_path, lambda t, k: HUM * np.cos(2 * np.pi * OWN * t + 2.0 * k))
+    assembly = Assembly(system("duffing"), starts=True)
+    few = tuple(map(find_effect, ("humming_force", "coulomb_friction", "quintic_stiffness")))
+    loop = close_loop(assembly, roles, NUMERICS, effects=few, max_effects=1, unnamed=False)
+    assert loop.effects == ("humming_force",)
+    point = loop.final.fit.point
+    where = loop.final.fit.problem.names.index("humming_force_frequency")
+    assert abs(point.theta[where] - OWN) < 4 * point.sd[where] < 2e-3
+    for run in "ab":
+        size = np.hypot(*(point[f"humming_force_{part}[{run}]"] for part in ("cosine", "sine")))
+        assert size == pytest.approx(HUM, rel=0.02)
+
+
+@pytest.mark.slow
+def test_what_does_not_hum_is_not_offered_a_frequency(tmp_path):
+    state, _ = shaken(tmp_path, lambda t, _: 0.0)
+    scales = scales_of(state.fit, None, ("position",))
+    assert scales.hum is None
+    offered = {option.candidate.effect for option in state.assembly.options(scales)}
+    assert "humming_force" not in offered
+
+
+def test_a_line_is_found_at_its_frequency_and_noise_has_none():
+    rng, step, size = np.random.default_rng(1), 0.01, 2000
+    time = step * np.arange(size)
+    alarms = 0
+    for _ in range(200):
+        found = line_of(rng.standard_normal(size), [], step)
+        alarms += found[0] < 0.01
+    # Of two hundred with the probability 0.01, more than eight come once in a thousand times.
+    assert alarms <= 8
+    loud = np.cos(2 * np.pi * 17.123 * time) + rng.standard_normal(size)
+    p, frequency = line_of(loud, [], step)
+    assert p < 1e-6
+    assert frequency == pytest.approx(17.123, abs=0.01)
+    p, _ = line_of(
+        loud, [np.cos(2 * np.pi * 17.123 * time) + 0.1 * rng.standard_normal(size)], step
+    )
+    assert p > 1e-3, "what the drive has is no hum"
 
 
 def test_an_equation_in_time_is_refused_of_a_periodic_run_by_name(tmp_path):

@@ -8,6 +8,7 @@ from bayesoleo.effects import Scales
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
+from bayesoleo.tracing.scoring.hum import hum_of
 
 POINTS = 512
 
@@ -53,7 +54,8 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
         for k, name in enumerate(fit.predictor.outputs)
     }
     kinds = frozenset(record.kind for record in fit.records)
-    return Scales(position, velocity, outputs, min(periods), max(periods), ranges, kinds)
+    times = min(periods), max(periods)
+    return Scales(position, velocity, outputs, *times, ranges, kinds, hum_of(fit))
 
 
 def _places(record: Record) -> np.ndarray:
