@@ -61,14 +61,14 @@ def reduce(
     if out is not None:
         _write_records(found, out)
     if as_json:
-        units = {name: channel.si_unit for name, channel in found.campaign.channels.items()}
+        units = found.campaign.units
         facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
-        facts["findings"] = findings(found.records)
+        facts["findings"] = findings(found.records, units)
         shell.print_json(tables.plain(facts))
     else:
         _print_records(found, shell.console())
         told = frequency_findings(found.records)
-        for sentence in findings(found.records):
+        for sentence in findings(found.records, found.campaign.units):
             if sentence not in told:
                 shell.complain(f"warning: {sentence}")
 

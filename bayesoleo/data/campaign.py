@@ -102,6 +102,11 @@ class Campaign:
     sha256: str
     rig: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of each channel."""
+        return {name: channel.si_unit for name, channel in self.channels.items()}
+
     def run(self, label: str) -> Run:
         """The run with this label.
 

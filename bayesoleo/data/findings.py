@@ -3,7 +3,7 @@ part of the true one, a channel in which nothing repeats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -82,49 +82,64 @@ def periods_per_motion(record: Record) -> tuple[int, str]:
     return 1, ""
 
 
-def findings(records: Sequence[Record]) -> list[str]:
+def findings(records: Sequence[Record], units: Mapping[str, str] | None = None) -> list[str]:
     """Sentences about records that are usable but deserve a look.
 
     Parameters
     ----------
     records : sequence of Record
         Reduced runs.
+    units : mapping of str to str, optional
+        SI unit of each channel, for the numbers.
 
     Returns
     -------
     list of str
         Each names the run, what was found and what to write.
     """
+    known = {} if units is None else units
     periods = [_about_period(record) for record in records]
     found = [sentence for sentences in periods for sentence in sentences]
-    found += [_sentence(record, item) for record in records for item in drifting(record)]
+    found += [
+        _sentence(record, item, _unit(known, item.channel))
+        for record in records
+        for item in drifting(record)
+    ]
     for record, doubts in zip(records, periods, strict=True):
         # Lines between the harmonics of a wrong frequency are harmonics of the true one.
-        found += [] if doubts else _about_channels(record)
+        found += [] if doubts else _about_channels(record, known)
     return found
 
 
-def _about_channels(record: Record) -> list[str]:
+def _unit(units: Mapping[str, str], channel: str) -> str:
+    """What follows a number; nothing where the channel is one."""
+    unit = units.get(channel, "(SI)")
+    return f" {unit}" if unit else ""
+
+
+def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
     """What channels show beside what is measured: foreign lines, cut-off ends, coarse steps."""
     where = f"run {record.label}: "
     found = [
         f"{where}{line.channel} has a line at {line.frequency:.4g} Hz with the amplitude "
-        f"{line.amplitude:.3g} (SI), which is no harmonic of {record.frequency:.4g} Hz: something "
-        "periodic besides the drive; it counts as noise"
+        f"{line.amplitude:.3g}{_unit(units, line.channel)}, which is no harmonic of "
+        f"{record.frequency:.4g} Hz: something periodic besides the drive; it counts as noise"
         for line in foreign_lines(record)
     ]
     found += [
-        f"{where}{item.channel} is cut off at its {item.end} value, {item.value:.4g} (SI), for "
-        f"{100 * item.share:.2g} % of the samples; mask these stretches"
+        f"{where}{item.channel} is cut off at its {item.end} value, {item.value:.4g}"
+        f"{_unit(units, item.channel)}, for {100 * item.share:.2g} % of the samples; "
+        "mask these stretches"
         for item in clipped(record)
     ]
     for channel, step in coarse_steps(record).items():
         stays = repeating_rounding(step, record.signal_noise[channel])
+        unit = _unit(units, channel)
         found.append(
-            f"{where}{channel} goes in steps of {step:.3g} (SI), "
+            f"{where}{channel} goes in steps of {step:.3g}{unit}, "
             f"{step / max(record.signal_noise[channel], 1e-300):.2g} times the noise of a sample; "
-            f"where samples fall on the same phases in every period an error of {stays:.2g} of "
-            "rounding repeats itself"
+            f"where samples fall on the same phases in every period an error of "
+            f"{stays:.2g}{unit} of rounding repeats itself"
         )
     return found
 
@@ -169,11 +184,11 @@ def _about_period(record: Record) -> list[str]:
     ]
 
 
-def _sentence(record: Record, item: Drift) -> str:
+def _sentence(record: Record, item: Drift, unit: str) -> str:
     by_mean = abs(item.mean) / item.mean_sd >= abs(item.amplitude) / item.amplitude_sd
     if by_mean:
         size, sd = item.mean, item.mean_sd
-        what = f"mean moves by {size:.3g} ± {sd:.1g} (SI)"
+        what = f"mean moves by {size:.3g} ± {sd:.1g}{unit}"
     else:
         size, sd = 100 * item.amplitude, 100 * item.amplitude_sd
         what = f"amplitude changes by {size:.3g} ± {sd:.1g} %"

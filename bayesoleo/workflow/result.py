@@ -61,7 +61,7 @@ def write_result(
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
     files = {} if out is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
-    summary["notes"] = [*summary["notes"], *findings(task.reduced.records)]
+    summary["notes"] = [*summary["notes"], *findings(task.reduced.records, task.campaign.units)]
     unit = _drive_unit(task, loop)
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     groups = {schema.POINT: point_group(fit), **loop_groups(loop, drawn, seed)}

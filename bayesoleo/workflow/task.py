@@ -206,5 +206,5 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
             bool(effect.places(driven if effect.family == "sensor" else model))
             for effect in (catalogue() if settings.effects is None else settings.effects)
         ),
-        "findings": findings(task.reduced.records),
+        "findings": findings(task.reduced.records, task.campaign.units),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,16 +67,17 @@ def test_rounding_that_repeats_is_what_is_measured():
 
 
 def test_findings_name_what_is_wrong_with_a_channel(tmp_path):
-    records = damper_campaign(tmp_path, spring_damper_force, periods=16).records
-    assert findings(records) == []
+    reduced = damper_campaign(tmp_path, spring_damper_force, periods=16)
+    records, units = reduced.records, reduced.campaign.units
+    assert findings(records, units) == []
     record = records[0]
     force, t = record.samples["force"], record.time
     cut = replace(record, samples={**record.samples, "force": np.minimum(force, 10.0)})
-    (text,) = findings([cut])
-    assert "force is cut off at its highest value, 10 (SI)" in text
+    (text,) = findings([cut], units)
+    assert "force is cut off at its highest value, 10 N," in text
     coarse = replace(record, samples={**record.samples, "force": np.round(force / 2.0) * 2.0})
-    (text,) = findings([coarse])
-    assert "force goes in steps of 2 (SI)" in text
+    (text,) = findings([coarse], units)
+    assert "force goes in steps of 2 N," in text
     hum = replace(record, samples={**record.samples, "force": force + np.sin(2 * np.pi * 17.3 * t)})
-    (text,) = findings([hum])
-    assert "force has a line at 17.3" in text
+    (text,) = findings([hum], units)
+    assert re.search(r"force has a line at 17\.3\d* Hz with the amplitude \S+ N, ", text)
