@@ -63,3 +63,12 @@ def test_given_steps_are_kept_and_their_shift_is_told():
     found = fit(1e-4, 64)
     assert found.steps == 64
     assert found.shift > LARGEST_SHIFT
+
+
+def test_a_mesh_that_nobody_asks_about_is_not_looked_at():
+    """The estimate is the same; one on a mesh that is too coarse is kept."""
+    numerics = Numerics("thesis", None, jobs=1, backend="numpy")
+    found = fit_model(MODEL, [record(1e-4)], numerics, tolerance=1e-8, check_mesh=False)
+    assert np.isnan(found.shift)
+    assert found.steps == FEWEST_STEPS
+    np.testing.assert_array_equal(found.point.theta, fit(1e-4, FEWEST_STEPS).point.theta)

@@ -162,6 +162,7 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         tolerance=1e-4,
         max_iterations=15,
         share=base.fit.predictor,
+        check_mesh=False,
     )
     share, contribution = compare(base, fit)
     if not np.isfinite(share):
