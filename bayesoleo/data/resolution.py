@@ -3,7 +3,8 @@ r"""What a converter does to a record: values on a grid, and values cut off at i
 Rounding to steps :math:`\Delta` adds an error of variance :math:`\Delta^2/12`. Where noise spreads
 over more than a step it is white, and is counted with the noise, which is measured from the same
 samples. Where a channel is quieter than that, and samples fall on the same phases in every period,
-the error repeats itself and looks like something missing. Its variance is then (Widrow and Kollar
+the error repeats itself and looks like something missing; it is counted with the noise of the
+average. Its variance is then (Widrow and Kollar
 2008, Quantization Noise)
 
 .. math:: \sum_k \frac{\Delta^2}{2 \pi^2 k^2} e^{-4 \pi^2 k^2 \sigma^2 / \Delta^2}.
@@ -29,6 +30,8 @@ _VALUES, _ON, _MOST_OFF = 6, 0.02, 0.01
 #: in all as have any other within a tenth of the range of it: of a sinusoid that is rounded, at
 #: most 2.4 times as many samples have the extreme value as the next.
 _IN_A_ROW, _TIMES = 4, 5.0
+#: Phases at which the rate of a signal is looked at.
+_PHASES = 512
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,57 @@ def repeating_rounding(step: float, noise: float) -> float:
     k = np.arange(1, 200)
     spread = np.exp(-4.0 * (np.pi * k * noise / max(step, 1e-300)) ** 2)
     return float(step * np.sqrt(np.sum(spread / (2.0 * (np.pi * k) ** 2))))
+
+
+def rounding_that_repeats(step: float, scatter: float) -> float:
+    """The same, given what samples of the same phase scatter by after rounding.
+
+    Of the variance of noise and rounding together, ``noise**2 + step**2 / 12``, the part that
+    repeats does not scatter; the noise for which the rest is the scatter is found by bisection.
+
+    Parameters
+    ----------
+    step : float
+        Of the grid.
+    scatter : float
+        Standard deviation of a sample about the average over periods.
+    """
+    low, high = 0.0, step  # of noise as large as a step no rounding repeats
+    for _ in range(40):
+        noise = 0.5 * (low + high)
+        rest = noise**2 + step**2 / 12.0 - repeating_rounding(step, noise) ** 2
+        low, high = (noise, high) if rest < scatter**2 else (low, noise)
+    return repeating_rounding(step, low)
+
+
+def rounding_in_average(record: Record, channel: str) -> float:
+    """Standard error that rounding leaves in a channel's average over periods, beyond its noise.
+
+    Where samples fall on other phases in every period, the signal has moved on by then; errors of
+    rounding add up as the steps that it moved turn.
+
+    Parameters
+    ----------
+    record : Record
+    channel : str
+
+    Returns
+    -------
+    float
+        SI; zero for a transient, and where steps are small against the noise.
+    """
+    scatter = record.signal_noise[channel]
+    step = step_of(record.samples[channel]) if record.periodic else 0.0
+    if step <= COARSE * scatter:
+        return 0.0
+    time_step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    samples = 1.0 / (record.frequency * time_step)
+    phases = np.arange(_PHASES) / _PHASES
+    rate = record.harmonics[channel].evaluate(phases, record.frequency, 1)
+    turn = np.pi * rate * (samples - round(samples)) * time_step / step
+    together = np.sinc(record.periods * turn / np.pi) / np.sinc(turn / np.pi)
+    share = float(np.mean(np.clip(together, -1.0, 1.0) ** 2))
+    return rounding_that_repeats(step, scatter) * float(np.sqrt(share))
 
 
 def coarse_steps(record: Record) -> dict[str, float]:

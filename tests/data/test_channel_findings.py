@@ -10,6 +10,7 @@ import pytest
 from small_campaigns import damper_campaign, spring_damper_force
 
 from bayesoleo.data import findings, foreign_line, repeating_rounding, step_of
+from bayesoleo.data.resolution import rounding_that_repeats
 
 FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
 
@@ -64,6 +65,20 @@ def test_rounding_that_repeats_is_what_is_measured():
         floor = np.sqrt(noise**2 + step**2 / 12) / np.sqrt(800)
         expected = np.hypot(repeating_rounding(step, noise), floor if noise else 0.0)
         assert left == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.2, 0.4])
+def test_rounding_that_repeats_follows_from_what_scatters(noise):
+    """The same phases in 400 periods: what the mean is off by, by the scatter about it alone."""
+    rng, step = np.random.default_rng(6), 0.5
+    clean = 10 * np.sin(2 * np.pi * np.arange(997) / 997) + 0.123
+    rounded = step * np.round((clean + step * noise * rng.standard_normal((400, 997))) / step)
+    mean = rounded.mean(axis=0)
+    scatter = float(np.sqrt(np.sum((rounded - mean) ** 2) / 399 / 997))
+    off = np.mean((mean - clean) ** 2) - scatter**2 / 400
+    found = rounding_that_repeats(step, scatter)
+    # A thousand errors of rounding, each known to the noise of a mean.
+    assert found**2 == pytest.approx(off, rel=0.05, abs=0.15 * scatter**2 / 400)
 
 
 def test_findings_name_what_is_wrong_with_a_channel(tmp_path):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesoleo.data import PeriodicAverage, periodic_average
 from bayesoleo.data.local_average import LocalAverage, local_average
 from bayesoleo.data.noise_spectrum import NoiseSpectrum, noise_spectrum
+from bayesoleo.data.resolution import rounding_in_average
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.records import Record
@@ -37,6 +38,8 @@ class RunError:
         Part of the noise that comes from the input, SI.
     spectrum : NoiseSpectrum or None
         Of the noise that does not repeat; ``None`` for a transient.
+    rounding : float
+        Part of the noise that comes from rounding to coarse steps and repeats in every period, SI.
     """
 
     run: str
@@ -46,6 +49,7 @@ class RunError:
     average: PeriodicAverage | LocalAverage
     input_noise: float
     spectrum: NoiseSpectrum | None = None
+    rounding: float = 0.0
 
     @property
     def repeating(self) -> float:
@@ -54,9 +58,15 @@ class RunError:
 
     @property
     def noise(self) -> float:
-        """Standard error of that average, the input's noise included."""
+        """Standard error of that average, the input's noise and repeated rounding included."""
         own = self.average.noise if self.spectrum is None else self.spectrum.noise
-        return float(np.hypot(own, self.input_noise))
+        return float(np.sqrt(own**2 + self.input_noise**2 + self.rounding**2))
+
+    @property
+    def sigma(self) -> float:
+        """Noise of a single sample, with what repeats as large as many periods would average it."""
+        periods = self.average.samples / max(self.average.number, 1)
+        return float(np.hypot(self.average.sigma, self.rounding * np.sqrt(periods)))
 
     @property
     def coefficients(self) -> float:
@@ -172,6 +182,7 @@ def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
                 average,
                 float(spread[b]),
                 _spectrum(record, residual, average),
+                rounding_in_average(record, output),
             )
         )
     return entries

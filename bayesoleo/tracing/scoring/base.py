@@ -162,7 +162,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
     for r, record in enumerate(fit.records):
         entries = [errors[record.label, output] for output in fit.predictor.outputs]
         measured = fit.predictor.runs[r].measured
-        sigma = [_sigma(e.average.sigma, m) for e, m in zip(entries, measured, strict=True)]
+        sigma = [_sigma(e.sigma, m) for e, m in zip(entries, measured, strict=True)]
         run = _run_base(fit, r, sigma, tolerances[r], _spectra(entries))
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
