@@ -21,7 +21,7 @@ from bayesoleo.compiled import BLOCK, ArrayKernel, BlockKernel, Kernel, load
 from bayesoleo.model.derive import Derived, derive
 from bayesoleo.model.expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model.model import Model
-from bayesoleo.model.printing import code
+from bayesoleo.model.printing import code, statements
 from bayesoleo.model.structured import Structured
 
 
@@ -202,14 +202,25 @@ def arctan(x):
 
 def _function(name: str, items: Sequence[sp.Expr], derived: Derived, backend: str) -> str:
     """One kernel: a loop over the points of a block (Numba) or operations on rows (NumPy)."""
-    block = backend == "numba"
-    names, loads_constant, loads_point = _names(derived, items, block)
-    constants = {symbol(c) for c in derived.constants if symbol(c) in names}
+    body = (_looped if backend == "numba" else _on_rows)(items, derived)
+    count = ", count" if backend == "numba" else ""
+    return "\n".join([f"def {name}(z, u, p, out{count}):", *(f"    {line}" for line in body)])
+
+
+def _on_rows(items: Sequence[sp.Expr], derived: Derived) -> list[str]:
+    rows = _rows(derived)
+    used, lines, results = statements(items, {item: f"{a}{k}" for item, (a, k) in rows.items()})
+    loads = [f"{a}{k} = {a}[{k}]" for item, (a, k) in rows.items() if item in used]
+    stores = [f"out[{k}][...] = {result}" for k, result in enumerate(results)] or ["pass"]
+    return [*loads, *lines, *stores]
+
+
+def _looped(items: Sequence[sp.Expr], derived: Derived) -> list[str]:
+    free = set().union(*(e.free_symbols for e in items)) if items else set()
+    rows = {item: place for item, place in _rows(derived).items() if item in free}
+    names = {item: f"{array}{k}" for item, (array, k) in rows.items()}
+    constants = {item for item, (array, _) in rows.items() if array == "p"}
     outside, inside, results = code(items, names, constants)
-    if not block:
-        lines = [f"out[{k}][...] = {result}" for k, result in enumerate(results)]
-        body = [*loads_constant, *outside, *loads_point, *inside, *lines] or ["pass"]
-        return "\n".join([f"def {name}(z, u, p, out):", *(f"    {line}" for line in body)])
     sizes = {
         "z": len(derived.states) * BLOCK,
         "u": len(derived.inputs) * BLOCK,
@@ -217,34 +228,18 @@ def _function(name: str, items: Sequence[sp.Expr], derived: Derived, backend: st
         "out": len(items) * BLOCK,
     }
     lines = [f"{key} = numba.carray({key}, ({size},))" for key, size in sizes.items() if size]
-    lines += [*loads_constant, *outside, "for i in range(count):"]
+    lines += [f"p{k} = p[{k}]" for array, k in rows.values() if array == "p"]
+    lines += [*outside, "for i in range(count):"]
+    loads = [f"{a}{k} = {a}[{k * BLOCK} + i]" for a, k in rows.values() if a != "p"]
     stores = [f"out[{k * BLOCK} + i] = {result}" for k, result in enumerate(results)] or ["pass"]
-    lines += [f"    {line}" for line in [*loads_point, *inside, *stores]]
-    body = [line.replace("np.arctan(", "arctan(") for line in lines]
-    return "\n".join([f"def {name}(z, u, p, out, count):", *(f"    {line}" for line in body)])
+    lines += [f"    {line}" for line in [*loads, *inside, *stores]]
+    return [line.replace("np.arctan(", "arctan(") for line in lines]
 
 
-def _names(
-    derived: Derived, expressions: Sequence[sp.Expr], block: bool
-) -> tuple[dict[sp.Symbol, str], list[str], list[str]]:
-    """Code names of the symbols that occur, with the lines that load them."""
-    used = set().union(*(e.free_symbols for e in expressions)) if expressions else set()
-    names: dict[sp.Symbol, str] = {}
-    constant, point = [], []
-
-    def row(array: str, k: int) -> str:
-        return f"{array}{k} = {array}[{k * BLOCK} + i]" if block else f"{array}{k} = {array}[{k}]"
-
-    for k, item in enumerate(derived.constants):
-        if symbol(item) in used:
-            names[symbol(item)] = f"p{k}"
-            constant.append(f"p{k} = p[{k}]")
-    for k, state in enumerate(derived.states):
-        if state in used:
-            names[state] = f"z{k}"
-            point.append(row("z", k))
+def _rows(derived: Derived) -> dict[sp.Symbol, tuple[str, int]]:
+    """Array and row of every symbol: constants, states, inputs."""
+    found = {symbol(name): ("p", k) for k, name in enumerate(derived.constants)}
+    found |= {state: ("z", k) for k, state in enumerate(derived.states)}
     for k, (channel, order) in enumerate(derived.inputs):
-        if derivative_symbol(channel, order) in used:
-            names[derivative_symbol(channel, order)] = f"u{k}"
-            point.append(row("u", k))
-    return names, constant, point
+        found[derivative_symbol(channel, order)] = "u", k
+    return found

@@ -11,6 +11,7 @@ from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model.derive import derive
 from bayesoleo.model.expressions import FUNCTIONS, symbol
 from bayesoleo.model.kernels import _counts, _results, kernels
+from bayesoleo.model.printing import statements
 from bayesoleo.systems import system
 from bayesoleo.systems.oleo import thermomechanical_oleo
 
@@ -235,3 +236,16 @@ def test_conditions_and_states_take_their_declared_places():
 def test_kernels_fill_as_many_rows_as_they_say(name):
     derived = derive(system(name))
     assert {key: len(make()) for key, make in _results(derived).items()} == _counts(derived)
+
+
+def test_numpy_computes_a_shared_subexpression_once():
+    a, q = symbol("a"), symbol("q")
+    shared = sp.sin(a * q)
+    used, lines, results = statements([shared + q, 2 * shared, q], {a: "p0", q: "z0"})
+    assert used == {a, q}
+    assert sum("np.sin(" in line for line in lines) == 1
+    scope = {"np": np, "p0": 0.3, "z0": np.array([1.0, -2.0])}
+    exec("\n".join(lines), scope)
+    sine = np.sin(0.3 * scope["z0"])
+    for text, expected in zip(results, [sine + scope["z0"], 2 * sine, scope["z0"]], strict=True):
+        np.testing.assert_allclose(eval(text, scope), expected, rtol=1e-15)
