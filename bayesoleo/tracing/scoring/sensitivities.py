@@ -99,10 +99,13 @@ def _of_run(fit: Fit, r: int, run: RunPredictor, p: Array) -> Array | Status:
     """Derivatives of one run's outputs, shape (L, ny, na, N)."""
     run.motions = fit.predictor.runs[r].known_motions()
     run.watched = False  # at the null nothing has moved
-    status = run.set_anchor(p[0])
-    if status is not Status.CONVERGED:
-        return status
-    samples = run.predict(p, derivatives=True)
+    if len(p) == 1:
+        samples = run.evaluate(p[0])
+    else:
+        status = run.set_anchor(p[0])
+        if status is not Status.CONVERGED:
+            return status
+        samples = run.predict(p, derivatives=True)
     if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
         return Status(int(samples.status.max()))
     constants = run.kernels.derived.constants
