@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
+    "effect_table",
     "sphinx-mathjax-offline",  # formulas show without a network
 ]
 exclude_patterns = ["_build", "_ext", "_templates"]

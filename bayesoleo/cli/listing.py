@@ -16,6 +16,7 @@ PANEL = "What is built in"
 #: How parts of LaTeX read in a terminal; longer ones first, since some begin alike.
 _READABLE = {
     r"\ddot q": "q̈",
+    r"\ddot y": "ÿ",
     r"\dot q": "q̇",
     r"\dot w": "ẇ",
     r"\dot y": "ẏ",
@@ -26,6 +27,11 @@ _READABLE = {
     r"\left": "",
     r"\right": "",
     r"\arctan": "arctan",
+    r"\arg": "arg",
+    r"\cos": "cos",
+    r"\sin": "sin",
+    r"\sum_{k=1}^{5}": "Σ_k",
+    r"\varphi": "φ",
     r"\max": "max",
     r"\quad": "  ",
     r"\approx": "≈",
@@ -189,7 +195,7 @@ def effects(
 def _units(parameters: Mapping[str, Any]) -> str:
     """Units of the amplitudes."""
     amplitudes = [p for p in parameters.values() if p["kind"].startswith("amplitude")]
-    return ", ".join(item["unit"] or "1" for item in amplitudes)
+    return ", ".join(dict.fromkeys(item["unit"] or "1" for item in amplitudes))
 
 
 def _print_effect(item: Mapping[str, Any], console: Console) -> None:
@@ -208,11 +214,13 @@ def _print_effect(item: Mapping[str, Any], console: Console) -> None:
             entry["unit"] or "1",
             entry["kind"],
             sides[entry["sign"]] if "sign" in entry else "–",
+            entry.get("scan") or ("0" if "null" in entry else "–"),
             entry["description"],
         ]
         for name, entry in item["parameters"].items()
     ]
-    console.print(tables.table(["parameter", "unit", "kind", "sign", "what it is"], rows, 5))
+    head = ["parameter", "unit", "kind", "sign", "null or scan", "what it is"]
+    console.print(tables.table(head, rows, 6))
 
 
 def readable(latex: str) -> str:

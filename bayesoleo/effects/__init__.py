@@ -11,16 +11,9 @@ A catalogue effect, and one of your own:
 """
 
 from bayesoleo.effects.catalogue import candidates, catalogue, describe, find_effect
-from bayesoleo.effects.effect import (
-    FAMILIES,
-    Amplitude,
-    Candidate,
-    Constant,
-    Effect,
-    Scales,
-    Shape,
-)
+from bayesoleo.effects.effect import FAMILIES, Candidate, Effect
 from bayesoleo.effects.force_effect import State, force_effect
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 
 __all__ = [
     "FAMILIES",

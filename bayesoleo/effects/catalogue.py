@@ -20,7 +20,8 @@ from bayesoleo.effects import (
     stiffness,
     thermal,
 )
-from bayesoleo.effects.effect import Amplitude, Candidate, Constant, Effect, Scales, Shape
+from bayesoleo.effects.effect import Candidate, Effect
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 
@@ -113,15 +114,17 @@ def describe(effect: Effect) -> dict[str, Any]:
     -------
     dict
         ``id``, ``family``, ``title``, ``formula`` (LaTeX), ``parameters`` (name to ``unit``,
-        ``latex``, ``description``, ``kind``, ``sign``), ``source``, ``applies_to``. Units are in
-        words of the place: ``force``, ``position``, ``channel``, ``parameter``.
+        ``latex``, ``description``, ``kind``; of amplitudes ``sign`` and ``null``, of shapes
+        ``scan``), ``source``, ``applies_to``. Units are in words of the place: ``force``,
+        ``position``, ``channel``, ``parameter``.
     """
     parameters: dict[str, dict[str, Any]] = {}
     for item in effect.amplitudes:
         by_run = "amplitude by run" if item.by_run else "amplitude"
         parameters[item.name] = _entry(item, item.latex, by_run) | {"sign": item.sign, "null": 0.0}
     for shape in effect.shapes:
-        parameters[shape.name] = _entry(shape, shape.latex, "shape")
+        scan = getattr(shape.grid, "text", "")
+        parameters[shape.name] = _entry(shape, shape.latex, "shape") | {"scan": scan}
     for constant in effect.constants:
         parameters[constant.name] = _entry(constant, "", "constant")
     return {

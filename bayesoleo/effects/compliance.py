@@ -13,7 +13,8 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names
+from bayesoleo.effects.effect import Effect, Names
+from bayesoleo.effects.parts import Amplitude
 from bayesoleo.effects.places import force_places, resisting_places, substitute
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.drive import MAXIMUM_DERIVATIVE
@@ -86,6 +87,7 @@ FRAME = Effect(
     ),
     places=_places,
     change=_yield,
+    source="Maxwell (1867), Phil. Trans. R. Soc. 157, 49-88: a spring in series",
     applies_to="force laws, and models that show a position that a force moves",
 )
 

@@ -6,9 +6,10 @@ length, whatever the zero of the position is.
 
 from __future__ import annotations
 
-from bayesoleo.effects.effect import Amplitude, Effect, Shape
+from bayesoleo.effects.effect import Effect
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import range_grid
+from bayesoleo.effects.parts import Amplitude, Shape
 
 _DEPTH = Shape(
     "depth",
@@ -39,7 +40,9 @@ def _stop(side: str, power: str, word: str) -> Effect:
         shapes=(_DEPTH,),
         formula=rf"{sign} k_h \max({inside}, 0){exponent}",
         title=f"{'End stop' if not power else 'Hertzian contact'} at the {side} end",
-        source="Verbeek (1993), section 4.3.3" if not power else "Hertz (1881)",
+        source="Verbeek (1993), section 4.3.3"
+        if not power
+        else "Hertz (1881), J. reine angew. Math. 92, 156-171",
     )
 
 
@@ -62,6 +65,7 @@ PLAY = force_effect(
     ),
     formula=r"- k_g \operatorname{clip}(q - q_\mathrm{mid}, -g, g)",
     title="Play: no stiffness in a gap about mid-stroke",
+    source="Nordin and Gutman (2002), Automatica 38(10), 1633-1649",
 )
 
 PRELOAD = force_effect(
@@ -80,6 +84,8 @@ PRELOAD = force_effect(
     ),
     formula=r"F_p \, \frac{2}{\pi} \arctan((q - q_\mathrm{mid}) / w)",
     title="Preload: a spring that is held between stops about mid-stroke",
+    source="Den Hartog and Mikina (1932), Forced vibrations with non-linear spring constants,"
+    " Trans. ASME 54, 157-164",
 )
 
 EFFECTS = (END_STOP_LOWER, END_STOP_UPPER, HERTZIAN_LOWER, HERTZIAN_UPPER, PLAY, PRELOAD)

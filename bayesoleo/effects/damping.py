@@ -11,9 +11,10 @@ from collections.abc import Callable
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names, Shape
+from bayesoleo.effects.effect import Effect, Names
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import values, velocity_grid
+from bayesoleo.effects.parts import Amplitude, Shape
 from bayesoleo.effects.places import damping_terms, force_places, is_quantity, moving_places
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import symbol
@@ -29,6 +30,7 @@ VISCOUS = force_effect(
     },
     formula=r"c_1 \dot q",
     title="Viscous damping",
+    source="Den Hartog (1956), Mechanical Vibrations, section 2.1",
 )
 
 QUADRATIC = force_effect(
@@ -61,6 +63,7 @@ POWER_LAW = force_effect(
     ),
     formula=r"F_a |\dot q / v_\mathrm{max}|^a \operatorname{sign} \dot q",
     title="Power-law damping",
+    source="Symans and Constantinou (1998), ISET J. Earthquake Technology 35(4), 185-206",
 )
 
 
@@ -87,7 +90,7 @@ def _scaling_effect(
             model = model.with_term(place.kind, place.target, name, term * scale)
         return model
 
-    needs = f", and {', '.join(requires)}" if requires else ""
+    needs = f", of models that declare {', '.join(requires)}" if requires else ""
     return Effect(
         id=id,
         family="damping",
@@ -181,6 +184,8 @@ CUBIC_EXTENSION = force_effect(
     },
     formula=r"c_{3-} \dot q^3 \,[\dot q < 0]",
     title="Flow that chokes in extension",
+    source="a term of third order where flow resists more than an orifice does; Milwitzky and Cook"
+    " (1953), NACA Report 1154, for orifice and snubber",
 )
 
 CAVITATING = force_effect(

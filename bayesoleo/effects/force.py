@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names, Scales, Shape
+from bayesoleo.effects.effect import BY_RUN, Effect, Names
 from bayesoleo.effects.force_effect import force_effect
+from bayesoleo.effects.grids import Scan
+from bayesoleo.effects.parts import Amplitude, Scales, Shape
 from bayesoleo.effects.places import is_quantity, moving_places, resisting_places, substitute
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN, symbol, within
@@ -23,6 +25,7 @@ CONSTANT = force_effect(
     {"constant_force": Amplitude("constant_force", "force", "F_0", "constant force")},
     formula="F_0",
     title="Constant force (preload, weight)",
+    source="Verbeek (1993), eq. 6.1: the weight",
 )
 
 OFFSET_BY_RUN = force_effect(
@@ -36,6 +39,7 @@ OFFSET_BY_RUN = force_effect(
     },
     formula="F_{0,r}",
     title="Constant force, different in every run",
+    source=BY_RUN,
 )
 
 MASS = force_effect(
@@ -45,6 +49,7 @@ MASS = force_effect(
     {"mass_error": Amplitude("mass_error", "force/(position/s**2)", r"\Delta m", "added mass")},
     formula=r"\Delta m \, \ddot q",
     title="Mass error (inertia)",
+    source="Newton (1687), second law",
 )
 
 
@@ -94,8 +99,7 @@ PERIODIC = Effect(
     id="periodic_force",
     family="force",
     title="Force that repeats with the drive, the same in every run",
-    formula=r"\sum_{k=1}^{5} a_k \cos k \varphi + b_k \sin k \varphi,"
-    r" \quad \varphi = \arg x_1 + 2 \pi f t",
+    formula=r"\sum_{k=1}^{5} a_k \cos k\varphi + b_k \sin k\varphi",
     amplitudes=tuple(
         Amplitude(f"{part}_{k}", "force", f"{letter}_{k}", f"{part} of harmonic {k} of the drive")
         for k in range(1, HARMONICS + 1)
@@ -103,8 +107,8 @@ PERIODIC = Effect(
     ),
     places=_locked,
     change=_turning,
-    source="Fourier series in the phase of the drive; Pintelon and Schoukens (2012), System"
-    " Identification: A Frequency Domain Approach, section 2.3",
+    source="Fourier series in the phase phi of the drive's first harmonic; Pintelon and Schoukens"
+    " (2012), System Identification: A Frequency Domain Approach, section 2.3",
     applies_to="balances of forces, in periodic runs",
     driven=True,
     kind="periodic",
@@ -130,7 +134,7 @@ DRIFTING = Effect(
     amplitudes=(Amplitude("drifting_force", "force/s", "F_t", "rate of a force"),),
     places=_moved,
     change=_drifting,
-    source="first term of a Taylor series in time",
+    source="the first term of a Taylor series in time of what is not modelled",
     applies_to="equations of motion, in transient runs; in force laws it is sensor_drift",
     driven=True,
     kind="transient",
@@ -149,6 +153,8 @@ def _heard(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
     return (scales.hum or 1.0 / scales.shortest_period,)
 
 
+_HEARD = Scan(_heard, "that of the highest line")
+
 HUMMING = Effect(
     id="humming_force",
     family="force",
@@ -160,7 +166,7 @@ HUMMING = Effect(
     ),
     places=lambda model: tuple(resisting_places(model)),
     change=_humming,
-    shapes=(Shape("frequency", "Hz", "f_h", "frequency of a hum", _heard),),
+    shapes=(Shape("frequency", "Hz", "f_h", "frequency of a hum", _HEARD),),
     source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
     applies_to="balances of forces, in transient runs with a line that no input has",
     driven=True,
@@ -178,6 +184,7 @@ GRAVITY_ERROR = Effect(
     ),
     places=_declares_gravity,
     change=_heavier,
+    source="Verbeek (1993), eq. 6.1: the weight",
     applies_to=f"models that declare {GRAVITY}",
 )
 

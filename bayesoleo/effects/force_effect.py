@@ -9,16 +9,9 @@ from dataclasses import dataclass
 
 import sympy as sp
 
-from bayesoleo.effects.effect import (
-    Amplitude,
-    Constant,
-    Effect,
-    Names,
-    Scales,
-    Shape,
-    free_name,
-)
+from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.grids import coordinate_of, velocity_grid
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 from bayesoleo.effects.places import (
     acceleration,
     force_places,

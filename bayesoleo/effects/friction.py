@@ -7,9 +7,11 @@ one, else with a scanned :math:`v_0`.
 
 from __future__ import annotations
 
-from bayesoleo.effects.effect import Amplitude, Shape
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import velocity_grid
+from bayesoleo.effects.parts import Amplitude, Shape
+
+ARMSTRONG = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), 1083-1138"
 
 COULOMB = force_effect(
     "coulomb_friction",
@@ -41,6 +43,7 @@ ASYMMETRIC = force_effect(
     },
     formula=r"\Delta F \, s(\dot q)^2",
     title="Friction different in the two directions",
+    source=ARMSTRONG,
 )
 
 STRIBECK = force_effect(
@@ -63,7 +66,7 @@ STRIBECK = force_effect(
     ),
     formula=r"F_s \, e^{-(\dot q / v_s)^2} s(\dot q)",
     title="Breakaway (Stribeck) friction",
-    source="Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), 1083-1138",
+    source=ARMSTRONG,
 )
 
 PRESSURE_DEPENDENT = force_effect(
@@ -91,6 +94,7 @@ STROKE_DEPENDENT = force_effect(
     },
     formula=r"\mu_q \, q \, s(\dot q)",
     title="Friction that changes along the stroke",
+    source=ARMSTRONG,
 )
 
 LOAD_DEPENDENT = force_effect(
@@ -104,6 +108,7 @@ LOAD_DEPENDENT = force_effect(
     },
     formula=r"\mu_F \, |F_\mathrm{spring}| \, s(\dot q)",
     title="Friction that grows with the load",
+    source="Coulomb (1785), Theorie des machines simples",
     applies_to="balances with a spring",
 )
 

@@ -26,7 +26,8 @@ from collections.abc import Callable, Sequence
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
+from bayesoleo.effects.effect import BY_RUN, Effect, Names, free_name
+from bayesoleo.effects.parts import Amplitude
 from bayesoleo.effects.places import is_quantity, substitute
 from bayesoleo.model import Dof, Model
 from bayesoleo.model.expressions import split_derivative, symbol, total_derivative
@@ -191,6 +192,7 @@ PRESSURE_ERROR = Effect(
     amplitudes=(Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),),
     places=_where("initial_pressure", "initial_pressure"),
     change=_replacing("initial_pressure", "initial_pressure_error", factor=True),
+    source="Verbeek (1993), eq. 6.2: theta_5",
     applies_to="gas springs",
 )
 
@@ -206,6 +208,7 @@ PRESSURE_ERROR_BY_RUN = Effect(
     ),
     places=_where("initial_pressure", "initial_pressure"),
     change=_replacing("initial_pressure", "initial_pressure_by_run", factor=True),
+    source=BY_RUN,
     applies_to="gas springs",
 )
 

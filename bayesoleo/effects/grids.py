@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from fractions import Fraction
+
 import numpy as np
 
-from bayesoleo.effects.effect import Grid, Scales
+from bayesoleo.effects.parts import Grid, Scales
 from bayesoleo.effects.places import force_places
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A scan grid that can be listed.
+
+    Parameters
+    ----------
+    of : callable (model, target, scales) -> tuple of float
+        The values.
+    text : str
+        What they are, in words and numbers.
+    """
+
+    of: Grid
+    text: str
+
+    def __call__(self, model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+        """The values for a motion."""
+        return self.of(model, target, scales)
 
 
 def geometric(low: float, high: float, ratio: float = 2.0) -> tuple[float, ...]:
@@ -29,44 +52,56 @@ def stroke_range(model: Model, target: str, scales: Scales) -> float:
     return high - low
 
 
-def velocity_grid(low: float, high: float) -> Grid:
+def velocity_grid(low: float, high: float) -> Scan:
     """Fractions of the largest velocity at the target."""
 
     def grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
         largest = scales.velocity[coordinate_of(model, target)]
         return geometric(low * largest, high * largest)
 
-    return grid
+    return Scan(grid, _between(low, high, "of the largest velocity"))
 
 
-def range_grid(low: float, high: float, power: int = 1) -> Grid:
+def range_grid(low: float, high: float, power: int = 1) -> Scan:
     """Multiples of the stroke's range, or with ``power=-1`` of its reciprocal."""
 
     def grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
         unit = stroke_range(model, target, scales) ** power
         return geometric(low * unit, high * unit)
 
-    return grid
+    what = "of the range of the stroke" if power == 1 else "over the range of the stroke"
+    return Scan(grid, _between(low, high, what))
 
 
-def period_grid(shortest: float, longest: float) -> Grid:
+def period_grid(shortest: float, longest: float) -> Scan:
     """From a multiple of the shortest period to a multiple of the longest."""
 
     def grid(_: Model, __: str, scales: Scales) -> tuple[float, ...]:
         return geometric(shortest * scales.shortest_period, longest * scales.longest_period)
 
-    return grid
+    low, high = _part(shortest), _part(longest)
+    return Scan(grid, f"{low} of the shortest period to {high} times the longest")
 
 
-def velocity_once(fraction: float) -> Grid:
+def velocity_once(fraction: float) -> Scan:
     """One fraction of the largest velocity: not scanned, estimated once the effect is in."""
 
     def grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
         return (fraction * scales.velocity[coordinate_of(model, target)],)
 
-    return grid
+    return Scan(grid, f"{_part(fraction)} of the largest velocity, not scanned")
 
 
-def values(*numbers: float) -> Grid:
+def values(*numbers: float) -> Scan:
     """The same values for every motion."""
-    return lambda model, target, scales: numbers
+    shown = ", ".join(f"{number:g}" for number in numbers)
+    return Scan(lambda model, target, scales: numbers, shown)
+
+
+def _between(low: float, high: float, what: str) -> str:
+    return f"{_part(low)} to {_part(high)} {what}"
+
+
+def _part(number: float) -> str:
+    """A number as the fraction that it is."""
+    return str(Fraction(number).limit_denominator(10_000))

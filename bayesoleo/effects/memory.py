@@ -6,9 +6,9 @@ the null leaves their equations regular.
 
 from __future__ import annotations
 
-from bayesoleo.effects.effect import Amplitude, Shape
 from bayesoleo.effects.force_effect import State, force_effect
 from bayesoleo.effects.grids import range_grid, velocity_once
+from bayesoleo.effects.parts import Amplitude, Shape
 
 _STIFFNESS = Shape(
     "rate",

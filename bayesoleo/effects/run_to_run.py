@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names
+from bayesoleo.effects.effect import BY_RUN, Effect, Names
+from bayesoleo.effects.parts import Amplitude
 from bayesoleo.effects.places import substitute
 from bayesoleo.effects.unnamed import COEFFICIENT
 from bayesoleo.model import Model
@@ -40,6 +41,7 @@ VARIES = Effect(
     ),
     places=_shared,
     change=_vary,
+    source=BY_RUN,
     applies_to="estimated parameters",
     own_name_per_target=True,
 )

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Constant, Effect, Names, Scales, Shape
-from bayesoleo.effects.grids import geometric
+from bayesoleo.effects.effect import Effect, Names
+from bayesoleo.effects.grids import Scan, geometric
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 from bayesoleo.effects.places import substitute
 from bayesoleo.model import Model, possible_drives
 from bayesoleo.model.expressions import (
@@ -25,6 +26,7 @@ from bayesoleo.model.expressions import (
 _DERIVATIVES = 4
 # Where a signal turns sharply within a lag, further terms of a series in the lag make it worse.
 _STEEP = (sp.Abs, sp.sign, sp.Heaviside, sp.Min, sp.Max, sp.atan, sp.tanh)
+VOCABULARY = "JCGM 200:2012, International vocabulary of metrology"
 
 
 def _channels(model: Model) -> Sequence[str]:
@@ -110,6 +112,7 @@ def _sensor(
     latex: str,
     places: Callable[[Model], Sequence[str]],
     change: Callable[[Model, str, Names], Model],
+    term: str,
 ) -> Effect:
     return Effect(
         id=id,
@@ -119,15 +122,32 @@ def _sensor(
         amplitudes=(Amplitude(id, unit, latex, title[0].lower() + title[1:]),),
         places=places,
         change=change,
+        source=f"{VOCABULARY}, {term}",
         applies_to="outputs" if id == "sensor_drift" else "every channel",
         own_name_per_target=True,
     )
 
 
 OFFSET = _sensor(
-    "sensor_offset", "Offset of a sensor", "m = y + b", "channel", "b", _channels, _offset
+    "sensor_offset",
+    "Offset of a sensor",
+    "m = y + b",
+    "channel",
+    "b",
+    _channels,
+    _offset,
+    "4.20: instrumental bias",
 )
-GAIN = _sensor("sensor_gain", "Gain error of a sensor", "m = (1 + g) y", "", "g", _channels, _gain)
+GAIN = _sensor(
+    "sensor_gain",
+    "Gain error of a sensor",
+    "m = (1 + g) y",
+    "",
+    "g",
+    _channels,
+    _gain,
+    "4.12: sensitivity",
+)
 LAG = _sensor(
     "sensor_lag",
     "Lag of a sensor, channels misaligned in time",
@@ -136,6 +156,7 @@ LAG = _sensor(
     r"\tau",
     _laggable,
     _lag,
+    "4.23: step response time",
 )
 DRIFT = _sensor(
     "sensor_drift",
@@ -145,6 +166,7 @@ DRIFT = _sensor(
     "d",
     _driftable,
     _drift,
+    "4.21: instrumental drift",
 )
 
 
@@ -163,6 +185,9 @@ def _depth_grid(model: Model, channel: str, scales: Scales) -> tuple[float, ...]
     """From a level just inside the highest value measured to one a quarter of the range inside."""
     low, high = _range(channel, scales)
     return geometric((high - low) / 256, (high - low) / 4)
+
+
+_DEPTH = Scan(_depth_grid, "1/256 to 1/4 of the range measured")
 
 
 def _saturation(side: str) -> Effect:
@@ -195,8 +220,9 @@ def _saturation(side: str) -> Effect:
         ),
         places=lambda model: tuple(model.outputs),
         change=saturate,
+        source=f"{VOCABULARY}, 4.7: measuring interval",
         shapes=(
-            Shape("depth", "channel", "h", f"distance from the {word} value measured", _depth_grid),
+            Shape("depth", "channel", "h", f"distance from the {word} value measured", _DEPTH),
         ),
         constants=(
             Constant("extreme", "channel", f"{word} value measured", _extreme(1 if upper else 0)),

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from bayesoleo.effects.effect import Amplitude, Effect
+from bayesoleo.effects.effect import Effect
 from bayesoleo.effects.force_effect import force_effect
+from bayesoleo.effects.parts import Amplitude
+
+_SOURCES = {
+    1: "Hooke (1678), De potentia restitutiva",
+    2: "Nayfeh and Mook (1979), Nonlinear Oscillations, section 4.1",
+    3: "Duffing (1918), Erzwungene Schwingungen bei veraenderlicher Eigenfrequenz",
+    5: "Nayfeh and Mook (1979), Nonlinear Oscillations, section 4.1",
+}
 
 
 def _power(order: int, word: str) -> Effect:
@@ -17,7 +25,7 @@ def _power(order: int, word: str) -> Effect:
         {id_: Amplitude(id_, unit, f"k_{order}", f"{word} stiffness")},
         formula=f"k_{order} q{exponent}",
         title=f"{word.capitalize()} stiffness",
-        source="Duffing (1918)" if order == 3 else "",
+        source=_SOURCES[order],
     )
 
 

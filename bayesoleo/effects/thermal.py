@@ -15,9 +15,10 @@ from collections.abc import Sequence
 
 import sympy as sp
 
-from bayesoleo.effects.effect import Amplitude, Constant, Effect, Names, Scales, Shape, free_name
+from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.gas import has_gas, volume_ratio_rate
-from bayesoleo.effects.grids import geometric, period_grid
+from bayesoleo.effects.grids import Scan, geometric, period_grid, values
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 from bayesoleo.effects.places import is_quantity
 from bayesoleo.model import Dof, Model
 from bayesoleo.model.expressions import derivative_symbol, symbol
@@ -62,9 +63,12 @@ def _conduction_grid(model: Model, target: str, scales: Scales) -> tuple[float, 
     return geometric(capacity / slow, capacity / fast)
 
 
-def _swept_grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
-    """From a wall that hardly shrinks to one that shrinks with the gas."""
-    return (0.25, 0.5, 1.0)
+#: Time constants of the gas from a thirtieth of the shortest period to three of the longest.
+_CONDUCTION = Scan(
+    _conduction_grid, "time constants 1/30 of the shortest period to 3 times the longest"
+)
+#: From a wall that hardly shrinks to one that shrinks with the gas.
+_SWEPT = values(0.25, 0.5, 1.0)
 
 
 def _exchange_heat(model: Model, target: str, names: Names) -> Model:
@@ -112,8 +116,8 @@ HEAT_EXCHANGE = Effect(
     places=_polytropic,
     change=_exchange_heat,
     shapes=(
-        Shape("conduction", "W/K", "G", "heat conduction to the ambient", _conduction_grid),
-        Shape("swept", "", "s", "part of the conducting wall that the piston sweeps", _swept_grid),
+        Shape("conduction", "W/K", "G", "heat conduction to the ambient", _CONDUCTION),
+        Shape("swept", "", "s", "part of the conducting wall that the piston sweeps", _SWEPT),
     ),
     constants=(
         Constant(

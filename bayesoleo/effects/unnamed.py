@@ -21,7 +21,8 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from bayesoleo.effects.effect import Amplitude, Effect, Names, free_name
+from bayesoleo.effects.effect import Effect, Names, free_name
+from bayesoleo.effects.parts import Amplitude
 from bayesoleo.effects.places import force_places
 from bayesoleo.effects.units import target_units
 from bayesoleo.model import Coordinate, Model

@@ -50,6 +50,23 @@ def test_families_in_the_catalogue_are_mentioned() -> None:
     assert [family for family in sorted(present) if f"`{family}`" not in text] == []
 
 
+def test_the_table_of_effects_holds_every_one_with_formula_scan_and_source(monkeypatch) -> None:
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    import effect_table
+
+    assert "```{effect-table}" in page("effects.md")
+    rows = [line for line in effect_table.tables() if line.startswith("| `")]
+    assert len(rows) == len(catalogue())
+    for effect, row in zip(catalogue(), rows, strict=True):
+        name, formula, amplitudes, shapes, source = row.strip("| ").split(" | ")
+        assert name.startswith(f"`{effect.id}`: ")
+        assert formula.startswith("$")
+        assert "[" in amplitudes
+        assert shapes.count("$") == 2 * len(effect.shapes)
+        assert source == effect.source
+
+
 def test_every_command_is_described() -> None:
     cli = pytest.importorskip("bayesoleo.cli")
     import typer.main

@@ -30,7 +30,12 @@ def test_ids_are_unique():
 def test_every_effect_is_described_and_its_formulas_render(effect):
     listed = json.loads(json.dumps(describe(effect)))
     assert listed["family"] in FAMILIES
-    assert all(listed[key] for key in ("title", "formula", "applies_to", "parameters"))
+    assert all(listed[key] for key in ("title", "formula", "applies_to", "parameters", "source"))
+    for parameter in listed["parameters"].values():
+        if parameter["kind"].startswith("amplitude"):
+            assert parameter["null"] == 0.0
+        if parameter["kind"] == "shape":
+            assert parameter["scan"], "what is scanned is said"
     parser = MathTextParser("path")
     parser.parse(f"${effect.formula}$")
     for parameter in listed["parameters"].values():

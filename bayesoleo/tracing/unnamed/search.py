@@ -18,7 +18,7 @@ import sympy as sp
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from bayesoleo.effects.effect import Scales
+from bayesoleo.effects import Scales
 from bayesoleo.effects.unnamed import Axis, Spline, balance_places, tensor
 from bayesoleo.errors import ModelError
 from bayesoleo.parallel import thread_map
