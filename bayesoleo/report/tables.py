@@ -39,6 +39,8 @@ BY_PARAMETER = {
 }
 LEADING_CANDIDATES = 10
 LEADING_PARAMETERS = 20
+#: Part of a frequency below which no digits are shown, however well it is known.
+FINEST = 1e-5
 
 
 @dataclass(frozen=True)
@@ -306,10 +308,12 @@ def _constants(constant: xr.Dataset) -> dict[str, list[str]]:
     )
     if any(groups):
         columns["group"] = groups
-    sd = constant.get(schema.FREQUENCY_SD)
+    frequencies = constant[schema.FREQUENCY].values
+    known = constant.get(schema.FREQUENCY_SD)
+    sd = None if known is None else np.maximum(known.values, FINEST * frequencies)
     columns["frequency [Hz]"] = [
-        format_number(float(f), None if sd is None else float(sd.values[i]))
-        for i, f in enumerate(constant[schema.FREQUENCY].values)
+        format_number(float(f), None if sd is None else float(sd[i]))
+        for i, f in enumerate(frequencies)
     ]
     if schema.PERIODS in constant:
         columns["periods"] = [f"{int(n)}" for n in constant[schema.PERIODS].values]

@@ -18,6 +18,7 @@ from bayesoleo.report.tables import (
     diagnostics_by_parameter,
     expected_text,
     format_short,
+    records,
 )
 from bayesoleo.storage import read_tree, write_tree
 
@@ -174,3 +175,14 @@ def test_formulas_are_drawn_or_left_as_text(page):
     assert encode_formula(r"m \ddot{q} + \frac{a}{\left|{b}\right|} = F") is not None
     assert encode_formula(r"\begin{cases} 1 \end{cases}") is None
     assert r"<pre>\begin{cases}" in page
+
+
+def test_a_frequency_shows_no_digits_that_nobody_reads(two_runs):
+    """A record without noise knows its frequency to twelve digits."""
+    tree = two_runs.copy(deep=True)
+    constant = tree[schema.CONSTANT_DATA].to_dataset()
+    exact = xr.full_like(constant[schema.FREQUENCY], 1e-14)
+    tree[schema.CONSTANT_DATA] = xr.DataTree(constant.assign({schema.FREQUENCY_SD: exact}))
+    table = records(tree)
+    column = table.head.index("frequency [Hz]")
+    assert all(len(row[column]) <= 9 for row in table.rows)
