@@ -30,7 +30,7 @@ _READABLE = {
     r"\arg": "arg",
     r"\cos": "cos",
     r"\sin": "sin",
-    r"\sum_{k=1}^{5}": "Σ_k",
+    r"\sum_{k=1}^{3}": "Σ_k",
     r"\varphi": "φ",
     r"\max": "max",
     r"\quad": "  ",

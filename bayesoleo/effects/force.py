@@ -62,8 +62,9 @@ def _heavier(model: Model, target: str, names: Names) -> Model:
     return substitute(model, {symbol(target): symbol(target) + names["gravity_error"]})
 
 
-#: Harmonics of the drive that a periodic force may have.
-HARMONICS = 5
+#: Harmonics of the drive that a periodic force may have. Dry friction that is as large in every run
+#: is a square wave in the drive's phase: with five they could hardly be told apart.
+HARMONICS = 3
 
 
 def _locked(model: Model) -> Sequence[str]:
@@ -99,7 +100,7 @@ PERIODIC = Effect(
     id="periodic_force",
     family="force",
     title="Force that repeats with the drive, the same in every run",
-    formula=r"\sum_{k=1}^{5} a_k \cos k\varphi + b_k \sin k\varphi",
+    formula=r"\sum_{k=1}^{3} a_k \cos k\varphi + b_k \sin k\varphi",
     amplitudes=tuple(
         Amplitude(f"{part}_{k}", "force", f"{letter}_{k}", f"{part} of harmonic {k} of the drive")
         for k in range(1, HARMONICS + 1)

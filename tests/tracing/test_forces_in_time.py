@@ -69,7 +69,7 @@ def test_a_force_at_a_harmonic_of_the_drive_is_named_with_size_and_phase(hum):
     found = values["periodic_force_cosine_3"] - 1j * values["periodic_force_sine_3"]
     expected = THIRD * np.exp(1j * (AHEAD + 1.5 * np.pi))
     assert abs(found - expected) < 0.05 * THIRD
-    for k in (1, 2, 4, 5):
+    for k in (1, 2):
         for part in ("cosine", "sine"):
             name = f"periodic_force_{part}_{k}"
             sd = loop.final.fit.point.sd[loop.final.fit.problem.names.index(name)]
