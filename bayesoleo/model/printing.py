@@ -49,6 +49,14 @@ class _Printer(PythonCodePrinter):
     def _print_Abs(self, expr: sp.Abs) -> str:
         return f"np.abs({self._print(expr.args[0])})"
 
+    # Every quantity is real, but a power of what might be negative is not known to be: the slope of
+    # its absolute value is then written with both parts.
+    def _print_re(self, expr: sp.re) -> str:
+        return str(self._print(expr.args[0]))
+
+    def _print_im(self, expr: sp.im) -> str:
+        return "0.0"
+
     def _print_bspline(self, expr: sp.Expr) -> str:
         far, near, _ = self._reaches(expr)
         return f"(({far}**3 - 4.0*{near}**3)/6.0)"

@@ -249,3 +249,12 @@ def test_numpy_computes_a_shared_subexpression_once():
     sine = np.sin(0.3 * scope["z0"])
     for text, expected in zip(results, [sine + scope["z0"], 2 * sine, scope["z0"]], strict=True):
         np.testing.assert_allclose(eval(text, scope), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_the_slope_of_the_size_of_a_power_is_real(backend):
+    x, p = np.array([0.5, 1.5, 2.5]), np.array([[0.7, -1.3]])
+    _, slope = evaluated(model_of("abs(b*x**a)"), backend, x, x, p)
+    a, b = p[0]
+    np.testing.assert_allclose(slope[0, 0, 0], abs(b) * x**a * np.log(x), rtol=1e-14)
+    np.testing.assert_allclose(slope[0, 0, 1], np.sign(b) * x**a, rtol=1e-14)
