@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import xarray as xr
 
 from bayesoleo.model import Model
+from bayesoleo.tracing.experiments.propose import check_periodic
 from bayesoleo.workflow.closing import run_loop, what_next
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.settings import Settings
@@ -56,6 +57,7 @@ def propose(
     Box and Hill (1967), Technometrics 9, 57-71; Kolchinsky and Tracey (2017), Entropy 19, 361.
     """
     task = prepare(campaign, model, settings)
+    check_periodic(task.reduced.records)  # before anything is estimated for nothing
     loop = run_loop(task, 0, say)
     found = what_next(task, loop, say, rivals=rivals, limits=limits)
     return write_result(task, loop, None, None, say, found)

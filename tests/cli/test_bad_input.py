@@ -39,6 +39,19 @@ def test_bad_records(refused, campaign, model, name):
     assert message in refused("close", campaign, "--model", model)
 
 
+def test_a_transient_to_propose_from_is_refused_before_anything_is_estimated(
+    refused, campaign, model, monkeypatch
+):
+    def estimated(*_):
+        raise AssertionError
+
+    monkeypatch.setattr("bayesoleo.workflow.proposing.run_loop", estimated)
+    for frequency in ("frequency = 1.0", "frequency = 2.0"):
+        change(campaign / "campaign.toml", frequency, 'kind = "transient"')
+    message = "what to measure next is foreseen for periodic runs only"
+    assert message in refused("propose", campaign, "--model", model)
+
+
 BAD_TOML = {
     "no such file": ('file = "slow.csv"', 'file = "slwo.csv"', "slwo.csv, run slow: no such file"),
     "no such column": ('"f_N"', '"F_N"', "column F_N: no such column; did you mean 'f_N'"),

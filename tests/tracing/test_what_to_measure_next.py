@@ -12,6 +12,7 @@ from small_campaigns import damper, damper_campaign, oscillator_campaign
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
 from bayesoleo.model import Output
+from bayesoleo.prediction.simulate import RunPlan, motion, record_of
 from bayesoleo.systems import system
 from bayesoleo.tracing.deciding.rounds import examine
 from bayesoleo.tracing.experiments.foresee import Rival
@@ -195,6 +196,16 @@ def test_one_rival_is_no_question(springs):
     reduced, outcome, rivals = springs
     with pytest.raises(InputError, match="fewer than two rivals"):
         propose_runs(rivals[:1], reduced.records, outcome.before.fit_errors)
+
+
+@pytest.mark.parametrize(
+    ("means", "planned"), [((-1e-2, 3e-2), 0.0), ((1e-4, 3e-4), 0.0), ((0.01, 0.012), 0.011)]
+)
+def test_the_noise_of_a_mean_is_not_asked_of_a_rig(means, planned):
+    record = record_of(system("duffing"), RunPlan("a", 1.0, {"force": motion(0.0, [1.0])}))
+    limits = Limits((1.0, 1.0), (1.0, 1.0), means, (-2.0, 2.0), (0.0, 100.0))
+    (run,) = planned_runs(limits, [record], "force")
+    assert run.mean == pytest.approx(planned)
 
 
 def test_transients_are_refused_by_name(springs):

@@ -211,15 +211,7 @@ def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
     if len(rivals) < 2:
         hint = "name two or more effects that might be what is missing"
         raise ModelError("fewer than two rivals to tell apart", value=len(rivals), hint=hint)
-    transient = [record.label for record in records if not record.periodic]
-    if transient:
-        raise CampaignError(
-            "what to measure next is foreseen for periodic runs only",
-            run=transient[0],
-            key="kind",
-            value="transient",
-            hint="simulate a transient of your choice with each rival, and compare them",
-        )
+    check_periodic(records)
     channels = {
         name for rival in rivals for name in rival.fit.model.inputs if name in records[0].samples
     }
@@ -232,6 +224,25 @@ def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
             hint="with several measured inputs it is not clear what they would be in a new run",
         )
     return driving[0]
+
+
+def check_periodic(records: Sequence[Record]) -> None:
+    """Raise where a run is a transient, whose like is not described by a few numbers.
+
+    Raises
+    ------
+    CampaignError
+        With the first such run.
+    """
+    transient = [record.label for record in records if not record.periodic]
+    if transient:
+        raise CampaignError(
+            "what to measure next is foreseen for periodic runs only",
+            run=transient[0],
+            key="kind",
+            value="transient",
+            hint="simulate a transient of your choice with each rival, and compare them",
+        )
 
 
 def expected_noise(errors: ErrorTable) -> dict[str, float]:

@@ -20,6 +20,8 @@ Range = tuple[float, float]
 POINTS = 256
 #: A mean below this part of the amplitude is none.
 ROUND_OFF = 1e-9
+#: A mean of the runs below this part of the amplitude is not proposed: no rig is set that finely.
+NO_MEAN = 1e-3
 #: Part of a motion's power that its fundamental must hold to be taken as a sine.
 NEARLY_A_SINE = 0.9
 #: Values tried of frequency and amplitude, each a constant factor apart, and of the mean.
@@ -253,6 +255,8 @@ def _factors(limits: Range, count: int) -> Array:
 def _even(limits: Range, count: int, size: float) -> Array:
     """Values an equal step apart; one where the limits are closer than a motion's size matters."""
     low, high = limits
-    return (
-        np.array([(low + high) / 2]) if high - low < 0.05 * size else np.linspace(low, high, count)
-    )
+    if high - low >= 0.05 * size:
+        return np.linspace(low, high, count)
+    # Of a motion about zero the means of the runs are noise, which nobody would ask a rig for.
+    middle = 0.0 if low <= 0.0 <= high else (low + high) / 2
+    return np.array([0.0 if abs(middle) < NO_MEAN * size else middle])
