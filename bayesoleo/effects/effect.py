@@ -33,6 +33,7 @@ FAMILIES = (
     "compliance",
     "sensor",
     "run-to-run",
+    "clock",
     "unnamed",
 )
 
