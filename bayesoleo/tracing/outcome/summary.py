@@ -43,6 +43,7 @@ def summarise(
         "error_before": loop.first.by_role,
         "error_after": final.by_role,
         "verdict": loop.verdict,
+        "certain": loop.certain,
         "hold_out": loop.roles.description,
         "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
         "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
