@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import sympy as sp
 
+from bayesoleo.effects.checks import check_grid
 from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape, always
 from bayesoleo.effects.units import target_units
 from bayesoleo.errors import InputError, ModelError
@@ -206,6 +207,8 @@ class Effect:
         names = {own: _free(name, model) for own, name in self.names(model, target).items()}
         shapes = [shape for shape in self.shapes if shape.needed(model)]
         grids = {shape.name: shape.grid(model, target, scales) for shape in shapes}
+        for name, grid in grids.items():
+            check_grid(grid, name, self.id)
         new = self._parameters(model, target, scales, grids)
         bare = model.with_parameters(**{names[own]: value for own, value in new.items()})
         extended = self.change(bare, target, {own: symbol(names[own]) for own in new})

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ast
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import sympy as sp
 
+from bayesoleo.effects.checks import check_names, check_null, check_states, check_unit
 from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.grids import coordinate_of, velocity_grid
 from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
@@ -21,7 +21,7 @@ from bayesoleo.effects.places import (
 )
 from bayesoleo.errors import InputError
 from bayesoleo.model import Coordinate, Dof, Model
-from bayesoleo.model.expressions import FUNCTIONS, parse, symbol
+from bayesoleo.model.expressions import parse, symbol
 
 #: A model's own friction slope, in s/m: effects that need a smooth sign use it where it exists.
 FRICTION_SLOPE = "friction_slope"
@@ -29,8 +29,6 @@ FRICTION_SLOPE = "friction_slope"
 #: Names under which a model may declare the absolute pressure that seals and glands feel.
 PRESSURES = ("gas_pressure", "pressure")
 
-_OF_THE_PLACE = ("position", "velocity", "acceleration", "direction", "spring_force", "pressure")
-_OF_THE_MOTION = ("largest_velocity", "lowest_position", "highest_position")
 _NEED_VELOCITY = {"velocity", "acceleration", "direction", "largest_velocity"}
 
 
@@ -101,7 +99,8 @@ def force_effect(
     Raises
     ------
     InputError
-        If the expression uses a name that nothing declares.
+        If the expression uses a name that nothing declares, or does not use a parameter; if it is
+        not zero where its amplitudes are, or is not in the unit of a force.
 
     Examples
     --------
@@ -119,7 +118,11 @@ def force_effect(
     texts = [expression, *(state.equation for state in states.values())]
     used = set[str]().union(*(_names_in(text, id) for text in texts))
     own = {item.name for item in amplitudes} | {shape.name for shape in shapes} | set(states)
-    _check_declared(used, own | set(requires), id)
+    check_names(used, own, set(requires), id)
+    check_states(states, used, id)
+    in_force = _names_in(expression, id)
+    check_null(expression, in_force, amplitudes, id)
+    check_unit(expression, in_force, amplitudes, shapes, states, id)
     if "direction" in used:
         shapes = (*shapes, _SMOOTHING)
     return Effect(
@@ -183,14 +186,6 @@ def _names_in(text: str, effect: str) -> set[str]:
     calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
     called = {function.id for function in calls if isinstance(function, ast.Name)}
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)} - called
-
-
-def _check_declared(used: set[str], own: set[str], effect: str) -> None:
-    allowed = own | {*_OF_THE_PLACE, *_OF_THE_MOTION, "pi"}
-    for name in sorted(used - allowed):
-        close = difflib.get_close_matches(name, [*allowed, *FUNCTIONS], 1)
-        hint = f"did you mean {close[0]}?" if close else "list names of the model in requires"
-        raise InputError(f"effect {effect}: unknown name", value=name, hint=hint)
 
 
 def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], tuple[str, ...]]:

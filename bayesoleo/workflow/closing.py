@@ -7,6 +7,7 @@ from pathlib import Path
 
 import xarray as xr
 
+from bayesoleo.effects import catalogue
 from bayesoleo.model import Model
 from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop
 from bayesoleo.tracing.experiments.questions import Question, questions_of
@@ -83,6 +84,10 @@ def close(
 def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
     """Rounds until nothing is missing, or nothing helps; the posterior is not sampled."""
     settings = task.settings
+    for effect in settings.effects or ():
+        base = task.assembly.model() if effect.on_channels else task.assembly.native
+        if effect not in catalogue() and not effect.places(base):
+            say(f"effect {effect.id} has no place in this model: it needs {effect.applies_to}")
     return close_loop(
         task.assembly,
         task.roles,

@@ -11,6 +11,8 @@ from bayesoleo.effects import (
     FAMILIES,
     Amplitude,
     Effect,
+    Shape,
+    State,
     candidates,
     catalogue,
     describe,
@@ -110,11 +112,44 @@ def test_names_do_not_collide(scales):
         (("a drag", "damping", "k*velocity", {"k": ""}), "not an identifier.*a drag"),
         (("drag", "damping", "k*", {"k": ""}), r"not an expression.*k\*"),
         (("drag", "damping", "velocity", {}), "no parameters"),
+        (("drag", "damping", "k*velocity", {"k": "", "d": ""}), "nothing follows 'd'"),
+        (("drag", "damping", "position*velocity", {"position": ""}), "a name that is taken"),
+        (("drag", "damping", "velocity**2 + k*velocity", {"k": ""}), "not zero where its ampl"),
+        (("drag", "damping", "velocity/k", {"k": ""}), "not zero where its amplitudes are"),
+        (
+            ("drag", "damping", "k*velocity**2", {"k": "force/position"}),
+            r"unit of a force, but of .*; state k in force\*position\*\*-2\*s\*\*2",
+        ),
     ],
 )
 def test_bad_effects_are_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         force_effect(*arguments)
+
+
+def test_a_state_without_its_rate_is_refused():
+    with pytest.raises(InputError, match=r"state 'w' has no rate.*dot\(w\)"):
+        force_effect("drag", "friction", "k*w", {"k": "force"}, states={"w": State("velocity - w")})
+
+
+def test_a_scan_that_is_not_positive_is_refused(scales):
+    shape = Shape("w", "position/s", "w", "width", lambda model, target, scales: (0.0, 1.0))
+    effect = force_effect("drag", "damping", "k*exp(-velocity/w)", {"k": "force"}, shapes=(shape,))
+    with pytest.raises(InputError, match="scan of 'w' is not ascending and positive"):
+        effect.extend(system("duffing"), "position", scales)
+
+
+@pytest.mark.parametrize(
+    ("expression", "unit"),
+    [
+        ("k*velocity", "N*s/m"),
+        ("k*tanh(velocity/0.01)", "force"),
+        ("k*velocity*abs(velocity)/largest_velocity**2", "force"),
+        ("k*sign(velocity)*abs(velocity)**1.5", "force/(position/s)**1.5"),
+    ],
+)
+def test_units_that_are_right_or_cannot_be_judged_pass(expression, unit):
+    assert force_effect("drag", "damping", expression, {"k": unit}).amplitudes[0].unit == unit
 
 
 def test_effect_of_ones_own_that_changes_a_definition(scales):
