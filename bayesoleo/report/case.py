@@ -11,6 +11,7 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, whereabouts
+from bayesoleo.effects import catalogue
 from bayesoleo.errors import InputError
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report.proposals import proposal_lines
@@ -46,6 +47,7 @@ def case(
         ("Was anything wrong?", _wrong(summary)),
         ("Where?", _where(tree)),
         ("What is it?", " ".join(_what(summary))),
+        ("What else could it be?", " ".join(_rivals(summary))),
         ("How large?", _large(summary)),
         ("Does it hold on data not used?", _holds(summary, units)),
         ("What is left?", _left(summary)),
@@ -111,22 +113,46 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
         if added["effect"] not in summary["effects"]:
             yield f"{name(added)} was added first, and removed again."
             continue
-        others = [c for c in entry["candidates"] if c is not added]
-        alike = added["indistinguishable_from"]
-        apart = [c for c in others if c["effect"] not in alike and name(c) not in alike]
         p = format_p(added["p_value"])
-        text = f"{name(added)} explains {100 * added['gain']:.0f} % of the excess"
+        text = f"{name(added)}{_in_words(added['effect'])} explains {_share(added)} of the excess"
         text += (
             f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"
             if p
             else ""
         )
+        yield f"{text}."
+
+
+def _in_words(effect: str) -> str:
+    """An effect's title in brackets; one that is not from the catalogue has its id only."""
+    titles = {item.id: item.title for item in catalogue()}
+    return f" ({titles[effect]})" if effect in titles else ""
+
+
+def _share(candidate: Mapping[str, Any]) -> str:
+    return f"{100 * candidate['gain']:.0f} %"
+
+
+def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What these data cannot tell from each effect that was added, or how far the next one fell
+    short."""
+    for entry in summary["rounds"]:
+        added = chosen(entry)
+        if added is None or added["effect"] not in summary["effects"]:
+            continue
+        alike = added["indistinguishable_from"]
+        if alike:
+            yield f"These data cannot tell {name(added)} from {', '.join(alike)}."
+        apart = [
+            c
+            for c in entry["candidates"]
+            if c is not added and c["effect"] not in alike and name(c) not in alike
+        ]
         if apart:
             second = max(apart, key=lambda c: c["gain"])
-            text += f"; the next, {name(second)}, {100 * second['gain']:.0f} %"
-        yield f"{text}."
-        if alike:
-            yield f"These data cannot tell it from {', '.join(alike)}."
+            how = "estimated in its place" if second.get("estimated") else "by its score"
+            of = "the others" if alike else f"the {len(apart)} others instead of {name(added)}"
+            yield f"Of {of} {name(second)} comes nearest: {how} it explains {_share(second)}."
 
 
 def _large(summary: Mapping[str, Any]) -> str:

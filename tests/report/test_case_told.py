@@ -26,7 +26,7 @@ def test_what_it_is_how_large_and_whether_it_holds(answers):
     accepted = summary["rounds"][0]["accepted"]
     assert f"{accepted}" in found["What is it?"]
     assert "corrected for the search of" in found["What is it?"]
-    assert "the next, " in found["What is it?"]
+    assert "comes nearest: " in found["What else could it be?"]
     assert "95 %" in found["How large?"]
     assert "→" in found["Does it hold on data not used?"]
     assert "times its noise" in found["Was anything wrong?"]
