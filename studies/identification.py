@@ -2,9 +2,8 @@
 with one that the catalogue lacks.
 
 Every effect of the catalogue that applies to an oleo is put into six-run campaigns at 1, 3 and 10
-times its detection limit - the size that a score finds significant in half of the campaigns, from
-the noise - and the loop closed on each with a model that lacks it. Rows go to a file as they come,
-so that a run that was stopped goes on, and parts can be run side by side:
+times its detection limit and the loop closed on each with a model that lacks it. Rows go to a file
+as they come, so that a run that was stopped goes on, and parts can be run side by side:
 
     python studies/identification.py results.jsonl --part 1/4
 
@@ -17,67 +16,27 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import identification_rows as rows
 import numpy as np
+from identification_data import DRIVE, RUNS, SYSTEM, simulated
 from identification_rows import FACTORS, NONE
-from scipy import optimize, stats
+from identification_sizes import NUMERICS, effects, limit, signs
 
 import bayesoleo
-from bayesoleo.data import ReducedCampaign, load_campaign, reduce_campaign, write_campaign
-from bayesoleo.effects import Effect, find_effect, force_effect
 from bayesoleo.model import Model, driven_by
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
-from bayesoleo.simulation import to_simulated_run
 from bayesoleo.systems import system
 from bayesoleo.tracing.deciding.loop import close_loop
-from bayesoleo.tracing.deciding.rounds import LEVEL
-from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting.assembly import Assembly, Option
-from bayesoleo.tracing.fitting.fit import Numerics
-from bayesoleo.tracing.fitting.roles import assign
-from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import score_all
-from bayesoleo.tracing.scoring.significance import effective_tests
+from bayesoleo.tracing.fitting import Assembly, assign
 
-SYSTEM, DRIVE = "f16n2d2", "displacement"
 REPLICATIONS, PLAIN = 5, 200
-#: Of the campaigns' order and of the motion that limits come from; each campaign is seeded by name.
+#: Of the campaigns' order; each campaign is seeded by its name.
 SEED = 0
-NOISE = {"displacement": 5e-5, "force": 20.0, "pressure": 5e3}
-CHANNELS = {"displacement": ("x_mm", "mm"), "force": ("F_kN", "kN"), "pressure": ("p_bar", "bar")}
-#: Label, frequency in Hz, mean and amplitude of the stroke in m, role.
-RUNS = (
-    ("a", 0.1, 0.10, 0.050, "fit"),
-    ("b", 0.5, 0.13, 0.035, "fit"),
-    ("c", 1.0, 0.08, 0.025, "fit"),
-    ("d", 2.0, 0.12, 0.020, "fit"),
-    ("e", 0.2, 0.12, 0.040, "hold-out"),
-    ("f", 1.5, 0.10, 0.025, "hold-out"),
-)
-UNITS = {"initial_pressure": "Pa", "ambient_temperature": "K"}
-PERIODS, PER_PERIOD = 4.3, 250.4
-NUMERICS = Numerics(jobs=1, backend="numpy")
-
-#: What the catalogue has no name for.
-STRANGERS = (
-    force_effect("ripple", "unnamed", "ripple*sin(900*position)", {"ripple": "force"}),
-    force_effect(
-        "late_drag", "unnamed", "late_drag*velocity**3/(1 + (40*velocity)**4)",
-        {"late_drag": "force/(position/s)**3"},
-    ),
-    force_effect(
-        "inner_wall", "unnamed", "inner_wall*exp(-((position - 0.11)/0.006)**2)",
-        {"inner_wall": "force"},
-    ),
-)  # fmt: skip
+FITTED = [k for k, run in enumerate(RUNS) if run[-1] == "fit"]
 
 
 @dataclass(frozen=True)
@@ -98,10 +57,7 @@ class Campaign:
 def planned() -> list[Campaign]:
     """All campaigns of the study, in an order that a part of it samples evenly."""
     found = [Campaign(NONE, "", 0.0, k) for k in range(PLAIN)]
-    for option in [*options(), *strangers()]:
-        effect, target = option.key
-        if option.key not in limits():
-            continue  # the model can already do what it would: no data can show it
+    for effect, target in effects():
         found += [
             Campaign(effect, target, factor, k) for factor in FACTORS for k in range(REPLICATIONS)
         ]
@@ -109,135 +65,27 @@ def planned() -> list[Campaign]:
     return [found[k] for k in order]
 
 
-# -- what is simulated -----------------------------------------------------------------
-
-
-def simulated(model: Model, values: dict[str, Any], seed: int) -> ReducedCampaign:
-    """Six runs of a model driven by displacement, as a rig records them."""
-    rng, runs = np.random.default_rng([seed, 1993]), []
-    for k, (label, frequency, mean, amplitude, role) in enumerate(RUNS):
-        stroke = motion(
-            mean, [amplitude, 0.01 * amplitude, 0.005 * amplitude], rng.uniform(0, 6, 3)
-        )
-        pressure = 4.9e5 * (1 + 0.015 * rng.standard_normal())
-        plan = RunPlan(
-            label,
-            frequency * (1 + 0.002 * rng.standard_normal()),
-            {DRIVE: stroke},
-            {"initial_pressure": pressure, "ambient_temperature": 293.0},
-            periods=PERIODS,
-            samples_per_period=PER_PERIOD,
-            role=role,
-        )
-        own = {n: float(v[k]) if np.ndim(v) else float(v) for n, v in values.items()}
-        run = simulate_run(model, plan, own, noise=NOISE, rng=rng, steps=512)
-        runs.append(to_simulated_run(run, UNITS))
-    with tempfile.TemporaryDirectory() as folder:
-        write_campaign(
-            folder, name="study", channels=CHANNELS, runs=runs, controlled=DRIVE, overwrite=True
-        )
-        return reduce_campaign(load_campaign(folder), jobs=1)
-
-
-@cache
-def base() -> State:
-    """The model fitted to a plain campaign: motion and noise that limits are computed from."""
-    plain = simulated(driven_by(system(SYSTEM), DRIVE), {}, SEED)
-    return fit_state(Assembly(system(SYSTEM), DRIVE), assign(plain.records), NUMERICS)
-
-
-@cache
-def freed() -> State:
-    """The same with every constant estimated that is known to a tolerance."""
-    assembly, roles = base().assembly, assign(base().fit.records)
-    declared = assembly.model()
-    loose = {n: replace(declared.parameters[n], fixed=False) for n in declared.uncertain()}
-    return fit_state(assembly.with_parameters(loose), roles, NUMERICS)
-
-
-@cache
-def options() -> tuple[Option, ...]:
-    """Every effect where it applies, each shape in the middle of its grid, of either sign."""
-    return tuple(_middle(option) for option in _of(None))
-
-
-@cache
-def strangers() -> tuple[Option, ...]:
-    """The same of what the catalogue lacks."""
-    return tuple(_middle(option) for option in _of(STRANGERS))
-
-
-def _of(effects: Sequence[Effect] | None) -> list[Option]:
-    state = base()
-    scales = scales_of(state.fit, DRIVE, tuple(state.assembly.native.dofs))
-    return state.assembly.options(scales, effects)
-
-
-def _middle(option: Option) -> Option:
-    shapes = {n: (grid[len(grid) // 2],) for n, grid in option.candidate.shapes.items()}
-    return replace(option, candidate=replace(option.candidate, shapes=shapes, sign={}))
-
-
-@cache
-def limits() -> dict[tuple[str, str], float]:
-    """Detection limit of each effect's amplitude, SI, by effect and target.
-
-    Without what a constant does that is known to a tolerance only: a loop that finds it far off
-    frees it first, and is right to.
-    """
-    wanted = [*options(), *strangers()]
-    seen = {score.option.key for score in score_all(freed().base(), wanted, jobs=1)[0]}
-    scores = score_all(base().base(), [o for o in wanted if o.key in seen], jobs=1)[0]
-    tests = effective_tests(score_all(base().base(), _of(None), jobs=1)[0], 0)
-    local = -np.expm1(np.log1p(-LEVEL) / tests)
-    found = {}
-    for score in scores:
-        needed = stats.chi2.isf(local, score.rank)
-        # The median of a non-central variate is where its power is one half.
-        away = optimize.brentq(
-            lambda x, n=needed, k=score.rank: stats.ncx2.sf(n, k, x) - 0.5, 1e-6, 400.0
-        )
-        variance = float(np.median(score.expected**2))
-        if len(score.names) == 1:
-            information = score.fall / variance
-        else:
-            # Of several runs with unit scores: the median of chi-square is 0.455.
-            information = 0.455 * len(score.names) / variance
-        found[score.option.key] = float(np.sqrt(away / information))
-    return found
-
-
 def truth(campaign: Campaign, rng: np.random.Generator) -> tuple[Model, dict[str, Any]]:
     """The model that makes a campaign's data, and its values."""
     native = system(SYSTEM)
     if campaign.effect == NONE:
         return driven_by(native, DRIVE), {}
-    known = {option.key: option for option in [*options(), *strangers()]}
     key = campaign.effect, campaign.target
-    option, size = known[key], campaign.factor * limits()[key]
-    candidate, model = option.candidate, option.model
+    score, sign = effects()[key], signs().get(key, 0)
+    candidate, model = score.option.candidate, score.option.model
+    first = candidate.parameters[0]
+    if model.parameters[first].by_run:
+        drawn = rng.standard_normal(len(RUNS))
+        size = campaign.factor * limit(key, drawn[FITTED])
+        return model, {**score.shapes, first: size * drawn}
+    if len(candidate.parameters) == 1:
+        direction = np.array([sign or rng.choice([-1.0, 1.0])])
+    else:
+        direction = rng.standard_normal(len(candidate.parameters))
+    amplitudes = campaign.factor * limit(key, direction) * direction
     if campaign.effect == "frame_compliance":
-        # The data show what the frame gives by the force itself, not by the one measured.
-        effect = find_effect("frame_compliance")
-        candidate = effect.extend(native, effect.places(native)[0], _any_scales())
-        model = driven_by(candidate.model, DRIVE)
-    values: dict[str, Any] = {name: grid[0] for name, grid in option.candidate.shapes.items()}
-    (sign,) = _signs().get(key) or {0}
-    for name in candidate.parameters:
-        by_run = model.parameters[name].by_run
-        drawn = rng.standard_normal(len(RUNS)) if by_run else (sign or rng.choice([-1.0, 1.0]))
-        values[name] = size * drawn
-    return model, values
-
-
-@cache
-def _signs() -> dict[tuple[str, str], set[int]]:
-    """Sides of the null that are physical, by effect and target."""
-    return {option.key: set(option.candidate.sign.values()) for option in _of(None)}
-
-
-def _any_scales() -> Any:
-    return scales_of(base().fit, DRIVE, tuple(base().assembly.native.dofs))
+        model = driven_by(native, DRIVE)
+    return model, {**score.shapes, **dict(zip(candidate.parameters, amplitudes, strict=True))}
 
 
 # -- what the loop makes of it ----------------------------------------------------------
@@ -249,7 +97,9 @@ def run(campaign: Campaign) -> dict[str, Any]:
     begin = time.process_time()
     try:
         model, values = truth(campaign, rng)
-        reduced = simulated(model, values, int(rng.integers(2**31)))
+        # A frame is no part of the strut: it shows in what is measured.
+        frame = values.pop("frame_compliance", 0.0)
+        reduced = simulated(model, values, int(rng.integers(2**31)), frame)
     except bayesoleo.BayesoleoError as error:
         return asdict(campaign) | {"failed": str(error).splitlines()[0]}
     assembly = Assembly(system(SYSTEM), DRIVE)
@@ -262,6 +112,7 @@ def run(campaign: Campaign) -> dict[str, Any]:
         "same": list(accepted[0].same) if accepted else [],
         "reason": loop.rounds[-1].reason,
         "verdict": loop.verdict,
+        "certain": loop.certain,
         "place": own[0] + 1 if own else None,
         "p_value": ranking[own[0]].p_value if own else None,
         "ratio": loop.final.worst_ratio,

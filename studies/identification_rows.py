@@ -20,8 +20,8 @@ LARGEST_CLASS = 3
 TABLE = Path(__file__).resolve().parent / "tables" / "identification.json"
 #: What of a row the table keeps.
 COLUMNS = (
-    "effect", "target", "factor", "replication", "added", "same", "verdict", "place", "p_value",
-    "ratio", "seconds",
+    "effect", "target", "factor", "replication", "added", "same", "verdict", "certain", "place",
+    "p_value", "ratio", "seconds",
 )  # fmt: skip
 
 Row = Mapping[str, Any]
@@ -64,8 +64,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         table[f"right_at_{factor:g}x"] = _mean([right(row) for row in named(done, factor)])
     table["false_additions"] = _mean([bool(row["added"]) for row in plain(done)])
     table["mean_class_size"] = _mean([1 + len(r["same"]) for r in named(done) if r["added"]])
-    certain = [row["verdict"] == "effect added" and not row["same"] for row in strange(done)]
-    table["outside_named_as_certain"] = _mean(certain)
+    table["outside_named_as_certain"] = _mean([row["certain"] for row in strange(done)])
+    for factor in FACTORS[1:]:
+        table[f"certain_at_{factor:g}x"] = _mean([row["certain"] for row in named(done, factor)])
     return table
 
 

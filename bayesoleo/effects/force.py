@@ -98,7 +98,7 @@ def _turning(model: Model, target: str, names: Names) -> Model:
 # run, however large the motion. Were they free by run, they would mimic every other effect.
 PERIODIC = Effect(
     id="periodic_force",
-    family="force",
+    family="clock",
     title="Force that repeats with the drive, the same in every run",
     formula=r"\sum_{k=1}^{3} a_k \cos k\varphi + b_k \sin k\varphi",
     amplitudes=tuple(

@@ -141,8 +141,8 @@ def total_derivative(expression: sp.Expr, dynamic: Iterable[str]) -> sp.Expr:
     for item in expression.free_symbols:
         name, order = split_derivative(item)
         if name in varying:
-            result += sp.diff(expression, item) * derivative_symbol(name, order + 1)
-    return without_impulses(result)
+            result += partial(expression, item) * derivative_symbol(name, order + 1)
+    return result
 
 
 def without_impulses(expression: sp.Expr) -> sp.Expr:
@@ -150,9 +150,29 @@ def without_impulses(expression: sp.Expr) -> sp.Expr:
     return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
 
 
+class _RealModulus(sp.Function):
+    """Modulus of what is real, whatever SymPy knows of it."""
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        return _RealSign(self.args[0])
+
+
+class _RealSign(sp.Function):
+    """Sign of what is real, its impulse dropped."""
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        return sp.Integer(0)
+
+
 def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     """Partial derivative with impulses dropped."""
-    return without_impulses(sp.diff(expression, item))
+    if all(kink.args[0].is_extended_real for kink in expression.atoms(sp.Abs, sp.sign)):
+        return without_impulses(sp.diff(expression, item))
+    # A quotient may be infinite, and SymPy then takes it for complex: its derivatives of a modulus
+    # are real and imaginary parts, that of a sign is left undone.
+    real = expression.replace(sp.Abs, _RealModulus).replace(sp.sign, _RealSign)
+    slope = without_impulses(sp.diff(real, item))
+    return slope.replace(_RealModulus, sp.Abs).replace(_RealSign, sp.sign)
 
 
 def parse(

@@ -82,3 +82,24 @@ def test_time_derivative_of_a_product(m, n):
     whole = total_derivative(left * right, ["q"])
     parts = total_derivative(left, ["q"]) * right + left * total_derivative(right, ["q"])
     assert sp.expand(whole - parts) == 0
+
+
+def test_no_derivative_is_left_undone_at_a_kink():
+    # The argument of the modulus may be infinite, so that SymPy does not know it to be real.
+    a, x = symbol("a"), symbol("x")
+    slope = partial(sp.Abs(a / (1 - x)), x)
+    curvature = partial(slope, x)
+    assert not curvature.has(sp.Derivative)
+    at = {a: sp.Rational(3), x: sp.Rational(1, 2)}
+    # Of |3/(1 - x)| where it is positive: 6/(1 - x)**3.
+    assert float(curvature.subs(at)) == pytest.approx(48.0)
+
+
+def test_a_modulus_inside_a_modulus_stays_real():
+    a, x = symbol("a"), symbol("x")
+    inner = sp.Abs(a / (1 - x))
+    slope = partial(partial(sp.Abs(inner - 5 / x), x), x)
+    assert not slope.has(sp.re, sp.im, sp.Derivative)
+    at = {a: sp.Rational(3), x: sp.Rational(1, 2)}
+    # There it is 5/x - 3/(1 - x), whose second derivative is 10/x**3 - 6/(1 - x)**3.
+    assert float(slope.subs(at)) == pytest.approx(80.0 - 48.0)

@@ -27,7 +27,7 @@ def base_of_noise(rng, *, shared, periods, measured=True):
     )
     wave = 1e-3 * np.sin(2 * np.pi * phase)
     empty = np.zeros((0, 0))
-    return Base(None, [run], empty, np.zeros(0), 1.0, 1.0), np.concatenate([wave, wave])
+    return Base(None, [run], empty, np.zeros(0), 1.0, 1.0, 1.0), np.concatenate([wave, wave])
 
 
 def _what_does_not_repeat(signal):

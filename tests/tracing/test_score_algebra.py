@@ -90,13 +90,15 @@ def test_amplitudes_by_run_equal_the_least_squares_refit(tmp_path):
 def test_the_share_is_the_fall_over_the_excess(lacking_cubic):
     base = lacking_cubic.base()
     score = scored(lacking_cubic, "cubic_stiffness")["cubic_stiffness"]
-    excess = floor = 0.0
+    excess = variance = 0.0
     for entry in lacking_cubic.fit_errors.entries:
         samples = entry.average.samples / entry.average.sigma**2
         excess += samples * (entry.repeating**2 - entry.noise**2)
-        floor += samples * entry.noise**2
+        # Of chi-square variates: the residual's squares and, beside it, the noise's.
+        own = samples * entry.noise**2
+        variance += 2 * own**2 * (1 / entry.coefficients + 1 / entry.free)
     assert base.excess == pytest.approx(excess)
-    assert score.share == pytest.approx(score.fall / (excess + np.sqrt(8 * floor)))
+    assert score.share == pytest.approx(score.fall / (excess + 2 * np.sqrt(variance)))
     # The cubic is all that is missing; what noise could feign beside it is small here.
     assert 0.8 < score.share < 1.0
 

@@ -27,7 +27,7 @@ def base_with(J, rng):
         np.zeros(SAMPLES, dtype=np.int64),
     )
     gram, _, gradient = run.products(J)
-    return Base(None, [run], gram, gradient, 1.0, 100.0)
+    return Base(None, [run], gram, gradient, 1.0, 100.0, 1.0)
 
 
 def score_of(base, direction):

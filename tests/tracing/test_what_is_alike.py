@@ -12,7 +12,7 @@ from bayesoleo.model.drive import driven_by
 from bayesoleo.model.kernels import kernels
 from bayesoleo.systems import system
 from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit
-from bayesoleo.tracing.deciding.rounds import Ranked, _only_varies
+from bayesoleo.tracing.deciding.rounds import Ranked, _only_imitates
 
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 NEARLY = np.array([1.0, 0.1])
@@ -71,8 +71,8 @@ def test_what_varies_by_run_is_taken_where_it_is_needed(physics, reached, last):
     other = estimated(physics)
     refits = {id(r.score): r for r in (varies, other)}
     item = Ranked(varies.score, 0.0, 0.5, True, ())
-    assert _only_varies(item, refits) == last
-    assert not _only_varies(Ranked(other.score, 0.0, 0.5, True, ()), refits)
+    assert _only_imitates(item, refits) == last
+    assert not _only_imitates(Ranked(other.score, 0.0, 0.5, True, ()), refits)
 
 
 def test_models_of_the_same_equations_share_their_code():

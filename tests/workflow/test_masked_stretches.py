@@ -72,7 +72,7 @@ def test_values_may_be_missing_where_they_are_masked(tmp_path):
         (tmp_path / "campaign.toml").read_text(encoding="utf-8").replace("mask = ", "# "),
         encoding="utf-8",
     )
-    with pytest.raises(CampaignError, match="5 missing value.*mask the gap"):
+    with pytest.raises(CampaignError, match=r"5 missing value.*mask the gap"):
         load_campaign(tmp_path)
 
 

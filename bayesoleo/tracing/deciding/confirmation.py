@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 
 #: Least part of the present excess that is worth another effect.
 LEAST_SHARE = 0.05
-#: Runs held out that an effect changes by fewer standard deviations of noise than this can neither
-#: confirm nor refute it: if it is real, the error falls by as much as that fall is uncertain.
-SILENT = 2.0
+#: Runs held out that an effect changes by fewer standard deviations of noise than this cannot
+#: judge it alone. If it is real and changes them by ``d``, the error falls by ``d^2`` with standard
+#: error ``2 d``, and so by more than its error in all but the part ``Phi(1 - d/2)`` of cases: one
+#: in forty at six, one in two at two.
+SILENT = 6.0
 
 Say = Callable[[str], None]
 
@@ -59,6 +61,10 @@ def confirmed(
     # too.
     more = sum(_re_estimated(new) - _re_estimated(old) for old, new in pairs)
     error *= float(np.sqrt(item.score.inflation))
+    if not after.at_floor:
+        # What still repeats scatters the fall as noise of its size would (McCullagh and Nelder
+        # 1989, section 4.5): a curve that happens to run along it proves nothing.
+        error *= max(1.0, after.worst_ratio)
     if not fall - item.score.inflation * more > error:
         return None, f"{item.effect} does not lower the error on {where}"
     lowers = f" and lowers the weighted squared error on {where} by {fall:.3g} ± {error:.1g}"

@@ -11,13 +11,14 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
-from bayesoleo.tracing.deciding.rounds import Round, examine
+from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.projection import information_beside, squared_distance
+from bayesoleo.tracing.scoring.significance import SAME
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
@@ -68,6 +69,26 @@ class ClosedLoop:
             return schema.EFFECT_ADDED
         explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
         return schema.EFFECT_ADDED if explained > MOSTLY else schema.UNEXPLAINED
+
+    @property
+    def certain(self) -> bool:
+        """Whether the data leave no doubt of the one effect that was added.
+
+        It explains everything by itself - at the floor, nothing else significant - the data can
+        tell it from all others of the catalogue, and it is large enough that one which merely
+        resembles it would have left a significant remainder.
+        """
+        accepted = [item.accepted for item in self.rounds if item.accepted]
+        if len(accepted) != 1 or not self.effects or not self.final.at_floor:
+            return False
+        (found,), last = accepted, self.rounds[-1]
+        if found.same or found.effect not in self.effects or found.refit is None:
+            return False
+        if any(item.p_value < LEVEL for item in last.ranking):
+            return False
+        local = -np.expm1(np.log1p(-LEVEL) / last.tests)
+        fall = found.refit.fall / found.refit.inflation
+        return bool((1.0 - SAME) * fall > stats.chi2.isf(local, 1))
 
 
 def _excess(state: State) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.masked import weights
 from bayesoleo.tracing.scoring.base import Base, replicate
+from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import squared_distance
 from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME
@@ -164,12 +165,15 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         share=base.fit.predictor,
         check_mesh=False,
     )
-    share, contribution = compare(base, fit)
+    share, changes = compare(base, fit)
+    contribution = np.concatenate(
+        [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]
+    )
     if not np.isfinite(share):
         share = -np.inf  # what cannot be solved at its estimate explains nothing
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
-    inflation, freedom = _inflation(fit, score)
+    inflation, freedom = _inflation(base, fit, score, changes)
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
     price = float(np.log(sum(run.residual.size for run in base.runs)))
@@ -178,17 +182,20 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     )
 
 
-def _inflation(fit: Fit, score: Score) -> tuple[float, int]:
-    """Variance of the new amplitudes between stretches of the runs over white noise's, and its
-    degrees of freedom.
+def _inflation(base: Base, fit: Fit, score: Score, changes: Sequence[Array]) -> tuple[float, int]:
+    """Variance of the new amplitudes over white noise's, and its degrees of freedom.
 
-    Periodic runs: as scored. What a model leaves of a transient is seldom white, and at the null,
-    where effects are scored, it is mostly the effect itself; so it is measured on what the estimate
-    leaves. An unknown moves by the sum of its influence times the residual (Huber 1967): its
-    variance is that of the stretches' sums.
+    Periodic runs: as for a score, along what the estimate changes. An effect that a step from the
+    null describes badly, like a lag where friction switches, leaves a remainder there that is no
+    noise; its estimate does not. What a model leaves of a transient is seldom white, and at the
+    null, where effects are scored, it is mostly the effect itself; so it is measured on what the
+    estimate leaves. An unknown moves by the sum of its influence times the residual (Huber 1967):
+    its variance is that of the stretches' sums.
     """
     if all(record.periodic for record in fit.records):
-        return score.inflation, 0
+        if not all(np.isfinite(change).all() for change in changes):
+            return score.inflation, score.freedom
+        return inflation_of(base, changes)
     free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
     own = [k for k, name in enumerate(fit.problem.names) if name in score.names]
     parts = [
@@ -278,13 +285,14 @@ def _start(base: Base, score: Score, model: Model) -> Array:
     return start
 
 
-def compare(base: Base, fit: Fit) -> tuple[float, Array]:
-    """Part of the excess that a refitted model takes away, and how it changes the prediction."""
+def compare(base: Base, fit: Fit) -> tuple[float, list[Array]]:
+    """Part of the excess that a refitted model takes away, and how it changes the prediction of
+    each run, in noise units."""
     before = after = 0.0
     changes = []
     for r, run in enumerate(base.runs):
         residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
         before += float(run.residual @ run.residual)
         after += float(residual @ residual)
-        changes.append((run.residual - residual)[run.chosen])
-    return (before - after) / base.fall_back, np.concatenate(changes)
+        changes.append(run.residual - residual)
+    return (before - after) / base.fall_back, changes

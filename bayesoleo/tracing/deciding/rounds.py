@@ -4,7 +4,7 @@ not used."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,12 +14,18 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.deciding.confirmation import confirmed
 from bayesoleo.tracing.deciding.refit import Refit, refit
 from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.fitting.assembly import Option
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score, score_all
-from bayesoleo.tracing.scoring.significance import classes, corrected_p, effective_tests
+from bayesoleo.tracing.scoring.significance import (
+    classes,
+    corrected_p,
+    effective_tests,
+    without_twins,
+)
 from bayesoleo.tracing.unnamed.search import Search
 
 #: The search ends at the floor if no candidate explains this part of the excess.
@@ -29,14 +35,18 @@ LEVEL = 0.01
 #: Candidates estimated before one is chosen, and how far behind the best a score may lie to be
 #: among them.
 MOST_REFITS, NEAR = 6, 0.25
-#: The same of what merely varies from run to run.
-MOST_VARYING = 3
+#: The same of what only its estimate can show to be significant.
+MOST_HIDDEN = 2
+#: The same of what takes up a part of whatever is missing.
+MOST_IMITATING = 3
 #: Effects after estimation within this share of the best are as good; the simplest of them is
 #: taken.
 AS_GOOD = 0.02
 
-#: Family of effects that let a parameter vary from run to run.
-RUN_TO_RUN = "run-to-run"
+INSIGNIFICANT = "no effect is significant after the correction for the search"
+#: Families of effects that take up a part of whatever is missing: what varies from run to run, and
+#: what repeats with the drive.
+IMITATORS = frozenset({"run-to-run", "clock"})
 
 Say = Callable[[str], None]
 
@@ -81,9 +91,9 @@ class Ranked:
         return self.score.option.candidate.target
 
     @property
-    def varies(self) -> bool:
-        """Whether it merely lets something vary from run to run."""
-        return self.score.option.candidate.family == RUN_TO_RUN
+    def imitates(self) -> bool:
+        """Whether it takes up a part of whatever is missing, and names no cause."""
+        return self.score.option.candidate.family in IMITATORS
 
 
 @dataclass(frozen=True)
@@ -155,16 +165,26 @@ def examine(
     options = state.assembly.options(scales, None if effects is None else tuple(effects))
     say(f"score {len(options)} candidates")
     base = state.base()
-    scores, failed = score_all(base, options, numerics.jobs)
+    scores, failed = _scored(base, options, numerics)
     tests = effective_tests(scores, seed)
     ranking = _rank(scores, tests, {})
-    stop = _stopping_reason(state, ranking)
+    stop = _stopping_reason(state, ranking, tests)
     if stop is not None or limit:
         return Round(state, ranking, failed, None, None, stop or limit, tests)
-    refits = _refit_best(base, ranking, numerics, say)
+    refits = _refit_best(base, ranking, tests, numerics, say)
     ranking = _rank(scores, tests, refits)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, say)
     return Round(state, ranking, failed, accepted, after, reason, tests)
+
+
+def _scored(
+    base: Base, options: Sequence[Option], numerics: Numerics
+) -> tuple[list[Score], dict[str, str]]:
+    """Scores by falling share, each effect once, and why there is none for others."""
+    scores, failed = score_all(base, options, numerics.jobs)
+    order = {option.key: k for k, option in enumerate(options)}
+    kept, twins = without_twins(sorted(scores, key=lambda score: order[score.option.key]))
+    return sorted(kept, key=lambda score: -score.share), failed | twins
 
 
 def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tuple[Ranked, ...]:
@@ -177,10 +197,15 @@ def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tu
             fitted = None  # an estimate that failed says no more than the score
         # The excess is known up to noise: what explains all of it must not seem to explain more.
         gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
-        p = corrected_p(score, tests)
+        p = corrected_p(score if fitted is None else _estimated(score, fitted), tests)
         ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted))
     # What was estimated is known better than what was only scored, and comes first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
+
+
+def _estimated(score: Score, fitted: Refit) -> Score:
+    """A score with what was found by estimation in place of what was expected at the null."""
+    return replace(score, fall=fitted.fall, inflation=fitted.inflation, freedom=fitted.freedom)
 
 
 def _same(
@@ -203,7 +228,7 @@ def _same(
     return tuple(dict.fromkeys(found))
 
 
-def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
+def _stopping_reason(state: State, ranking: Sequence[Ranked], tests: float) -> str | None:
     worst = state.worst_ratio
     best = max((item.gain for item in ranking), default=0.0)
     if state.at_floor and best < FLOOR_SHARE:
@@ -211,22 +236,47 @@ def _stopping_reason(state: State, ranking: Sequence[Ranked]) -> str | None:
             f"nothing is missing: the residual is {worst:.2f} times its noise at most"
             f" and no effect explains more than {100 * best:.0f} % of the excess"
         )
-    if not any(item.p_value < LEVEL for item in ranking):
-        return "no effect is significant after the correction for the search"
+    if not any(_may_be_significant(item, tests) for item in ranking):
+        return INSIGNIFICANT
     return None
 
 
 def _refit_best(
-    base: Base, ranking: Sequence[Ranked], numerics: Numerics, say: Say
+    base: Base, ranking: Sequence[Ranked], tests: float, numerics: Numerics, say: Say
 ) -> dict[int, Refit]:
-    """Estimate the best few effects of physics, and what merely varies from run to run where that
-    may explain more than they do."""
+    """Estimate the best few effects of physics, and what takes up anything where that may explain
+    more than they do."""
     significant = [item for item in ranking if item.p_value < LEVEL and item.gain > 0]
-    named = [item for item in significant if not item.varies]
+    named = [item for item in significant if not item.imitates]
     found = _refit_few(base, named, MOST_REFITS, numerics, say)
+    hidden = _hidden(ranking, named, tests)
+    found |= _refit_few(base, hidden, MOST_HIDDEN, numerics, say)
     explained = max((result.share for result in found.values()), default=0.0)
-    varying = [item for item in significant if item.varies and item.gain > explained]
-    return found | _refit_few(base, varying, MOST_VARYING, numerics, say)
+    able = [item for item in ranking if item.imitates and _may_be_significant(item, tests)]
+    able = [item for item in able if item.gain > explained]
+    return found | _refit_few(base, able, MOST_IMITATING, numerics, say)
+
+
+def _may_be_significant(item: Ranked, tests: float) -> bool:
+    """Whether a score would be significant in white noise, which is what an estimate may find.
+
+    Where a step from the null describes an effect badly its score seems to scatter with what the
+    step leaves; only its estimate tells whether it does.
+    """
+    return corrected_p(replace(item.score, inflation=1.0), tests) < LEVEL
+
+
+def _hidden(ranking: Sequence[Ranked], named: Sequence[Ranked], tests: float) -> list[Ranked]:
+    """Effects that explain as much as the significant ones do, of which the null says nothing."""
+    enough = named[0].gain if named else 0.0
+    return [
+        item
+        for item in ranking
+        if not item.imitates
+        and item.p_value >= LEVEL
+        and item.gain > NEAR * enough
+        and _may_be_significant(item, tests)
+    ]
 
 
 def _refit_few(
@@ -241,17 +291,18 @@ def _refit_few(
     return {id(score): result for score, result in zip(chosen, results, strict=True)}
 
 
-def _only_varies(item: Ranked, refits: dict[int, Refit]) -> bool:
-    """Whether an effect merely lets something vary from run to run, without need.
+def _only_imitates(item: Ranked, refits: dict[int, Refit]) -> bool:
+    """Whether an effect merely takes up what another does, without need.
 
     Much that physics does differs between runs, so a parameter of each run's own takes a part of it
-    up, whatever is missing. It is needed where it explains all that is left and no effect of
-    physics does, by more than its additional unknowns are worth (Schwarz 1978).
+    up, whatever is missing; and where runs are alike, so does what repeats with the drive. It is
+    needed where it explains all that is left and no effect of physics does, by more than its
+    additional unknowns are worth (Schwarz 1978).
     """
-    if not item.varies:
+    if not item.imitates:
         return False
     own = refits[id(item.score)]
-    physics = [r for r in refits.values() if r.score.option.candidate.family != RUN_TO_RUN]
+    physics = [r for r in refits.values() if r.score.option.candidate.family not in IMITATORS]
     return not (own.reached and own.worth > max((r.worth for r in physics), default=0.0))
 
 
@@ -276,9 +327,10 @@ def _choose(
     say: Say,
 ) -> tuple[Ranked | None, State | None, str]:
     """The best effect that the runs not used confirm."""
-    last = {id(r): _only_varies(r, refits) for r in ranking if r.refitted}
+    last = {id(r): _only_imitates(r, refits) for r in ranking if r.refitted}
     tried = sorted(
-        (item for item in ranking if item.refitted), key=lambda item: (last[id(item)], -item.gain)
+        (item for item in ranking if item.refitted and item.p_value < LEVEL),
+        key=lambda item: (last[id(item)], -item.gain),
     )
     reasons = []
     while tried:
@@ -288,4 +340,7 @@ def _choose(
         if after is not None:
             return item, after, reason
         reasons.append(reason)
-    return None, None, "; ".join(reasons) or "no candidate could be estimated"
+    if not reasons:
+        estimated = any(np.isfinite(one.share) for one in refits.values())
+        reasons = [INSIGNIFICANT if estimated else "no candidate could be estimated"]
+    return None, None, "; ".join(reasons)

@@ -126,6 +126,9 @@ class Base:
         Expected sum of squares of the averaged residual, had only noise remained.
     excess : float
         Sum of squares of the averaged residual beyond that.
+    doubt : float
+        Standard deviation of the excess where nothing is missing: the residual's own scatter, and
+        that of the noise, which is measured too.
     """
 
     fit: Fit
@@ -134,6 +137,7 @@ class Base:
     gradient: Array
     noise: float
     excess: float
+    doubt: float
 
     @property
     def fall_back(self) -> float:
@@ -142,8 +146,8 @@ class Base:
 
     @property
     def feigned(self) -> float:
-        """Excess that noise alone exceeds once in fifty times."""
-        return 2.0 * float(np.sqrt(2.0 * self.noise))
+        """Excess that noise alone exceeds once in forty times."""
+        return 2.0 * self.doubt
 
 
 def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
@@ -158,7 +162,7 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
     """
     tolerances = _tolerance_columns(fit)
     gram, gradient = _prior_terms(fit)
-    runs, noise, excess = [], 0.0, 0.0
+    runs, noise, excess, variance = [], 0.0, 0.0, 0.0
     for r, record in enumerate(fit.records):
         entries = [errors[record.label, output] for output in fit.predictor.outputs]
         measured = fit.predictor.runs[r].measured
@@ -167,10 +171,12 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
         for entry, value in zip(entries, sigma, strict=True):
-            noise += counted(record) * (entry.noise / value) ** 2
+            own = counted(record) * (entry.noise / value) ** 2
+            noise += own
+            variance += 2.0 * own**2 * (1.0 / entry.coefficients + 1.0 / max(entry.free, 1.0))
             excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(run)
-    return Base(fit, runs, gram, gradient, noise, excess)
+    return Base(fit, runs, gram, gradient, noise, excess, float(np.sqrt(variance)))
 
 
 def _prior_terms(fit: Fit) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ the null leaves undefined are scanned.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -65,6 +65,8 @@ class Score:
         Directions that the new unknowns can move the outputs in, beside the present ones.
     freedom : int
         Degrees of freedom that the inflation was measured with; zero where none was.
+    information : ndarray, shape (k, k)
+        ``C_perp' W C_perp`` of the new unknowns, SI, at the shapes that score best.
     """
 
     option: Option
@@ -79,6 +81,7 @@ class Score:
     z: float
     rank: int = 1
     freedom: int = 0
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def size(self) -> int:
@@ -189,6 +192,7 @@ def _evaluate(
         contribution=expected @ thin,
         z=root * float(np.sign(expected[0])) if k == 1 else root,
         rank=int(rank),
+        information=information,
     )
 
 

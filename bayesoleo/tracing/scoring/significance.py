@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 #: Effects whose contributions agree to this squared cosine are one class.
 SAME = 0.95
+#: Effects of one family and place that agree to this squared cosine are one effect written in
+#: several ways: what is left of the difference is the tolerance of a constant.
+TWINS = 1.0 - 1e-6
 DRAWS = 4000
 
 
@@ -48,6 +51,45 @@ def corrected_p(score: Score, tests: float) -> float:
     one_sided = score.rank == 1 and any(score.option.candidate.sign.values())
     local = local / 2 if one_sided and score.fall > 0 else local
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
+
+
+def without_twins(scores: Sequence[Score]) -> tuple[list[Score], dict[str, str]]:
+    """Scores without effects that are another one in other words, and which those are.
+
+    Where damping is a parameter of the model, more of it in extension is less of it in compression:
+    beside the model's own terms both do the same, whatever the data. Effects of different causes
+    that do the same are no twins, but a class.
+
+    Parameters
+    ----------
+    scores : sequence of Score
+        In the catalogue's order, which says what twins are called.
+
+    Returns
+    -------
+    kept : list of Score
+    twins : dict of str to str
+        Reason by effect.
+    """
+    kept: list[Score] = []
+    twins: dict[str, str] = {}
+    for score in scores:
+        effect, target = score.option.key
+        like = next((other for other in kept if _are_twins(score, other)), None)
+        if like is None:
+            kept.append(score)
+        else:
+            twins[f"{effect} at {target}"] = f"the same as {like.option.key[0]} in other words"
+    return kept, twins
+
+
+def _are_twins(one: Score, other: Score) -> bool:
+    here, there = one.option.candidate, other.option.candidate
+    if (here.family, here.target) != (there.family, there.target):
+        return False
+    if len(one.columns) != 1 or len(other.columns) != 1:
+        return False  # effects with shapes, or with several unknowns
+    return float(one.columns[0] @ other.columns[0]) ** 2 > TWINS
 
 
 def classes(scores: Sequence[Score]) -> list[list[int]]:
