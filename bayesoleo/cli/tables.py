@@ -21,16 +21,22 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], words: int = 1) ->
     rows : sequence of sequence
         Cells; numbers get four digits, ``None`` and NaN a dash.
     words : int
-        How many columns from the left hold words and are aligned on the left.
+        How many columns from the left hold words and are aligned on the left, as are those in which
+        no cell begins with a number.
     """
     made = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
     for column, title in enumerate(head):
         # What does not fit goes on in the next line: an ellipsis would take digits away.
-        on_left = column < words
+        on_left = column < words or not any(_is_number(row[column]) for row in rows)
         made.add_column(Text(title), justify="left" if on_left else "right", overflow="fold")
     for row in rows:
         made.add_row(*(Text(cell_text(cell)) for cell in row))
     return made
+
+
+def _is_number(cell: Any) -> bool:
+    text = cell_text(cell).lstrip("−-<± ")
+    return text[:1].isdigit() or text == ""
 
 
 def cell_text(value: Any) -> str:

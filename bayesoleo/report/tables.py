@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -150,12 +150,12 @@ def candidates(entry: Mapping[str, Any]) -> Table:
             candidate["family"],
             f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
             format_p(candidate["p_value"]).removeprefix("p ").removeprefix("= "),
-            expected_text(candidate["expected"]),
+            expected_text(candidate["expected"], candidate.get("expected_units")),
             ", ".join(candidate["indistinguishable_from"]),
         ]
         for candidate in ranked
     ]
-    head = ["effect", "family", "share", "p", "expected (SI)", "not distinguishable from"]
+    head = ["effect", "family", "share", "p", "expected", "not distinguishable from"]
     accepted = chosen(entry)
     marked = frozenset(i for i, c in enumerate(ranked) if c is accepted)
     if not any(row[-1] for row in rows):
@@ -169,21 +169,36 @@ def failed(entry: Mapping[str, Any]) -> Table | None:
     return Table(["effect", "why it has no score"], sorted(rows), 2) if rows else None
 
 
-def expected_text(expected: Mapping[str, float | None]) -> str:
-    """Expected values with their names; those of a parameter of every run as a range."""
+def expected_text(
+    expected: Mapping[str, float | None], units: Mapping[str, str] | None = None
+) -> str:
+    """Expected values with their names and units; those of a parameter of every run as a range.
+
+    Results that were stored without units have SI's, unnamed.
+    """
+    known = {} if units is None else units
     runs: dict[str, list[float]] = {}
+    unit: dict[str, str] = {}
     for label, value in expected.items():
-        values = runs.setdefault(label.split("[", 1)[0], [])
+        owner = label.split("[", 1)[0]
+        values = runs.setdefault(owner, [])
+        unit[owner] = known.get(label, "")
         if value is not None:
             values.append(value)
-    texts = []
-    for label, values in runs.items():
-        text = format_number(values[0] if values else None)
-        if len(values) > 1:
-            text = f"{format_number(min(values))} … {format_number(max(values))}"
-            text += f" ({len(values)} runs)"
-        texts.append(f"{_together(f'{label} =')} {_together(text)}")
-    return ", ".join(texts)
+    return ", ".join(
+        f"{_together(f'{label} =')} {_together(_size(values, unit[label]))}"
+        for label, values in runs.items()
+    )
+
+
+def _size(values: Sequence[float], unit: str) -> str:
+    """One value, or the range of several, with its unit."""
+    if not values:
+        return format_number(None)
+    scale = engineering(unit, max(map(abs, values))) if unit else Scale(1.0, "")
+    ends = [format_number(scale.factor * end) for end in (min(values), max(values))]
+    text = f"{' … '.join(ends if len(values) > 1 else ends[:1])} {scale.unit}".rstrip()
+    return text + (f" ({len(values)} runs)" if len(values) > 1 else "")
 
 
 def _together(text: str) -> str:

@@ -186,3 +186,11 @@ def test_a_frequency_shows_no_digits_that_nobody_reads(two_runs):
     table = records(tree)
     column = table.head.index("frequency [Hz]")
     assert all(len(row[column]) <= 9 for row in table.rows)
+
+
+def test_sizes_that_are_expected_have_units():
+    units = {"k": "N/m**3", "offset[a]": "m", "offset[b]": "m", "ratio": ""}
+    values = {"k": -3e7, "offset[a]": 2e-3, "offset[b]": -1e-3, "ratio": 0.5}
+    assert expected_text(values, units).replace("\N{NO-BREAK SPACE}", " ") == (
+        "k = −30.00 MN/m³, offset = −1.000 … 2.000 mm (2 runs), ratio = 0.5000"
+    )

@@ -79,6 +79,8 @@ def _round(item: Round) -> dict[str, Any]:
 def _candidate(ranked: Ranked) -> dict[str, Any]:
     score, candidate = ranked.score, ranked.score.option.candidate
     expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    expected |= {name: float(value) for name, value in score.shapes.items()}
+    declared = score.option.model.parameters
     near = [{"effect": effect, "cosine": cosine} for effect, cosine in ranked.closest]
     return {
         "effect": candidate.effect,
@@ -86,7 +88,8 @@ def _candidate(ranked: Ranked) -> dict[str, Any]:
         "family": candidate.family,
         "gain": ranked.gain,
         "p_value": ranked.p_value,
-        "expected": expected | {name: float(value) for name, value in score.shapes.items()},
+        "expected": expected,
+        "expected_units": {name: declared[name.split("[")[0]].unit for name in expected},
         "estimated": ranked.refitted,
         "indistinguishable_from": list(ranked.same),
     } | ({"closest": near} if near else {})
