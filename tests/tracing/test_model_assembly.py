@@ -102,6 +102,15 @@ def test_without_an_effect_the_rest_stays_with_its_values(oscillator, removed):
         assert kept[name].value == values[name]
 
 
+def test_what_acts_on_an_effect_leaves_with_it(oscillator):
+    """A stiffness that varies by run is nothing without the stiffness."""
+    grown = add(oscillator, "cubic_stiffness")
+    grown = add(grown, "varies_by_run", "cubic_stiffness")
+    grown = add(add(grown, "sensor_offset", "force"), "varies_by_run", "damping")
+    less = grown.without(grown.steps[0])
+    assert less.added == (("sensor_offset", "force"), ("varies_by_run", "damping"))
+
+
 def test_without_its_only_effect_the_model_is_the_declared_one(oscillator):
     grown = add(oscillator, "coulomb_friction")
     assert grown.without(grown.steps[0]).model().digest() == oscillator.model().digest()

@@ -130,11 +130,11 @@ class Assembly:
         )
 
     def without(self, step: Step) -> Assembly:
-        """The same assembly with one effect left out."""
+        """The same assembly with one effect left out, and those that act on what it brought."""
         declared = self.declared or self.native
         base = Assembly(declared, self.drive, nuisance=self.nuisance, starts=self.starts)
         for other in self.steps:
-            if other is not step:
+            if other is not step and other.target in other.effect.places(base._base(other.effect)):
                 base = base.option(other.effect, other.target, other.scales).assembly
         present = self.model().parameters
         kept = {name: item for name, item in present.items() if name in base.model().parameters}
