@@ -15,6 +15,7 @@ transient. The loop names what a polytropic gas lacks.
 import json
 
 import matplotlib.pyplot as plt
+from before_after import print_before_after
 from rich.console import Console
 from stored import HERE, Study
 
@@ -50,7 +51,7 @@ ranking = study.figure("ranking", lambda: plots.ranking(tree, most=8))
 
 
 def errors():
-    """Errors of three models on both halves, and the new parameters."""
+    """Errors of three models on both halves."""
     constant = model.with_parameters(gas_exponent=Parameter(1.0, fixed=True))
     isothermal = closed(constant, max_effects=0)[1]
     stages = {
@@ -62,12 +63,14 @@ def errors():
     for name, table in stages.items():
         fit, held = (table[role]["pressure"]["rms"] / PSI for role in ("fit", "hold-out"))
         print(f"{name:28}{fit:8.2f}{held:10.2f}")
-    print("\nposterior                        mean        sd")
-    for name, entry in summary["parameters"].items():
-        print(f"{name:28}{entry['mean']:9.4g}{entry['sd']:10.2g} {entry['unit']}")
 
 
 study.text("errors", errors)
+
+# %%
+# The last two in full, and the posterior of the heat exchange.
+
+study.text("before_after", lambda: print_before_after(summary, "psi", 1.0 / PSI))
 
 # %%
 # The intervals count noise of the gauge only, which is 0.01 psi, and what is left is far above it:

@@ -14,6 +14,7 @@ import json
 
 import matplotlib.pyplot as plt
 import numpy as np
+from before_after import print_before_after
 from rich.console import Console
 from stored import HERE, Study
 
@@ -51,6 +52,11 @@ def rounds():
 
 
 study.text("rounds", rounds)
+
+# %%
+# Before and after, all runs of a role together, and the posterior of everything that was added.
+
+study.text("before_after", lambda: print_before_after(summary, "N", 1.0))
 
 # %%
 # It is not the whole truth: what repeats is still several times its noise, as the summary says, and

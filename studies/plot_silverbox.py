@@ -15,6 +15,7 @@ import json
 
 import matplotlib.pyplot as plt
 import numpy as np
+from before_after import print_before_after
 from rich.console import Console
 from stored import HERE, Study
 
@@ -51,6 +52,11 @@ def rounds():
 
 
 study.text("rounds", rounds)
+
+# %%
+# Before and after on both blocks, and the posterior of everything that was added.
+
+study.text("before_after", lambda: print_before_after(summary, "mV", 1e3))
 
 # %%
 # The verdict is not that nothing is missing: the ratio to the noise stays well above 1. The rounds
