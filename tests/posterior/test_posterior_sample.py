@@ -61,6 +61,16 @@ def test_a_curved_density_that_no_mixture_fits():
     within_error(samples, np.zeros(4), np.sqrt([1, 1.5, 1.5, 1.5]))
 
 
+def test_a_first_look_ends_after_so_many_evaluations_and_says_so(monkeypatch):
+    monkeypatch.setattr("bayesoleo.posterior.sampling.sample.QUICK_EVALUATIONS", 4_000)
+    monkeypatch.setattr("bayesoleo.posterior.sampling.sample.QUICK_STEPS", 1)
+    target = BentRidge()
+    samples = sample(target, normal_mixture(target.sd), seed=1, quick=True, progress=False)
+    assert not samples.reached
+    assert samples.evaluations <= 4_000
+    assert "stopped before 4000 evaluations; " in samples.warning
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("quick", [True, False])
 def test_no_walker_is_left_at_the_tip_of_a_bent_ridge(quick):

@@ -29,6 +29,10 @@ from bayesoleo.posterior.sampling.stopping import Quality, Schedule
 
 Array = NDArray[np.float64]
 
+#: Evaluations of the log density at which a first look ends, good or not, but not before so many
+#: steps of each walker: minutes, where a motion takes milliseconds.
+QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+
 
 def sample(
     log_density: Density,
@@ -80,7 +84,8 @@ def sample(
     segment : int
         Draws of the longest checkpointed segment.
     quick : bool
-        Shorter warm-up and an effective size of at most 200, for a first look.
+        Shorter warm-up, an effective size of at most 200 and not more than
+        :data:`QUICK_EVALUATIONS`, for a first look.
     scheduler : str, optional
         Other processes or machines that evaluate the density: ``local:4``, or the address of a Dask
         scheduler; see :func:`bayesoleo.machines.connected`. The draws are the same.
@@ -115,6 +120,8 @@ def sample(
     group = Ensembles(
         log_density, ensembles, walkers or default_walkers(dimension), weights or MoveWeights()
     )
+    if quick:
+        max_evaluations = min(max_evaluations, max(QUICK_EVALUATIONS, QUICK_STEPS * group.chains))
     schedule = _schedule(effective_size, max_evaluations, segment, quick)
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule)
     place = None if out is None else Path(out)
