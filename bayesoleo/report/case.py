@@ -48,6 +48,7 @@ def case(
         ("Where?", _where(tree)),
         ("What is it?", " ".join(_what(summary))),
         ("What else could it be?", " ".join(_rivals(summary))),
+        ("How sure is its name?", _sure(summary)),
         ("How large?", _large(summary)),
         ("Does it hold on data not used?", _holds(summary, units)),
         ("What is left?", _left(summary)),
@@ -123,6 +124,23 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"{text}."
 
 
+def _sure(summary: Mapping[str, Any]) -> str:
+    """Whether the effect's name is certain, probable, or one of several; results that were stored
+    without an answer have none."""
+    if "certain" not in summary or not summary["effects"]:
+        return ""
+    if summary["certain"]:
+        return (
+            "Certain: it was added alone, nothing else is significant beside it, no other effect"
+            " explains as much, and what is left is noise."
+        )
+    added = (chosen(entry) for entry in summary["rounds"])
+    alike = any(one["indistinguishable_from"] for one in added if one is not None)
+    if alike:
+        return "One of a class: these data cannot tell it from the effects named below."
+    return "Probable: it explains the data best of what was tried, which is not all there is."
+
+
 def _in_words(effect: str) -> str:
     """An effect's title in brackets; one that is not from the catalogue has its id only."""
     titles = {item.id: item.title for item in catalogue()}
@@ -130,7 +148,9 @@ def _in_words(effect: str) -> str:
 
 
 def _share(candidate: Mapping[str, Any]) -> str:
-    return f"{100 * candidate['gain']:.0f} %"
+    """Part of the excess; of nearly all of it a digit more, for there rivals differ by it."""
+    digits = 1 if 0.95 <= candidate["gain"] < 0.9995 else 0
+    return f"{100 * candidate['gain']:.{digits}f} %"
 
 
 def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:

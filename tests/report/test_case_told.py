@@ -33,6 +33,25 @@ def test_what_it_is_how_large_and_whether_it_holds(answers):
     assert "best remaining candidate" in found["What is left?"]
 
 
+def test_how_sure_a_name_is(answers, oleo):
+    summary = json.loads(json.dumps(answers[1]))
+    question = "How sure is its name?"
+    sure = dict(case(summary | {"certain": True}, {}, oleo))[question]
+    assert sure.startswith("Certain: ")
+    for entry in summary["rounds"]:
+        for candidate in entry["candidates"]:
+            candidate["indistinguishable_from"] = []
+    alone = dict(case(summary | {"certain": False}, {}, oleo))[question]
+    assert alone.startswith("Probable: ")
+    summary["rounds"][0]["candidates"][0]["indistinguishable_from"] = ["another"]
+    summary["rounds"][0]["accepted"] = summary["rounds"][0]["candidates"][0]["effect"]
+    summary["rounds"][0]["accepted_target"] = summary["rounds"][0]["candidates"][0]["target"]
+    classed = dict(case(summary | {"certain": False}, {}, oleo))[question]
+    assert classed.startswith("One of a class: ")
+    summary.pop("certain", None)
+    assert question not in dict(case(summary, {}, oleo))
+
+
 def test_what_was_removed_again_is_not_said_to_be_it(answers, oleo):
     removed = json.loads(json.dumps(answers[1]))
     removed["effects"] = []
