@@ -4,9 +4,10 @@ How often is the right effect named?
 
 Data are made with an effect that the model lacks, and the loop is asked what is missing. Each
 effect of the catalogue that an oleo can show is put into six-run campaigns - four to fit, two held
-out, strokes between 20 and 50 mm at 0.1 to 2 Hz - at 1, 3 and 10 times its detection limit, the
-size that a score finds significant in half of all campaigns. Two hundred campaigns lack nothing;
-in others something acts that the catalogue has no name for.
+out, from a creep of 15 mm at 0.02 Hz over 110 mm at 0.1 Hz to 30 mm at 3 Hz - at 1, 3 and 10 times
+its detection limit, the size that a score finds significant in half of all campaigns. Two hundred
+campaigns lack nothing; in others something acts that the catalogue has no name for, and the loop
+may take a name that is like it, but must not call it certain.
 """
 
 # %%

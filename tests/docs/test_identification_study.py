@@ -9,13 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 STUDIES = Path(__file__).resolve().parents[2] / "studies"
-NAMES = ("identification", "identification_rows", "identification_figures")
+NAMES = tuple(f"identification{part}" for part in ("", "_data", "_sizes", "_rows", "_figures"))
 ROW: dict[str, Any] = {
     "effect": "play", "target": "stroke", "factor": 3.0, "replication": 0,
-    "verdict": "effect added",
+    "verdict": "effect added", "certain": True,
     "added": ["play at stroke"], "same": [], "place": 1, "p_value": 1e-9, "ratio": 1.02,
     "seconds": 1.0,
 }  # fmt: skip
@@ -53,15 +54,16 @@ def test_the_table_keeps_what_the_figures_need(load, tmp_path, monkeypatch):
     assert rows.stored() is None
     plain = {**ROW, "effect": "none", "target": "", "factor": 0.0, "added": [], "p_value": None}
     strange = {**ROW, "effect": "ripple", "added": ["play at stroke"]}
-    found = [ROW, {**ROW, "replication": 1, "added": []}, plain, strange, {"failed": "no"}]
+    likely = {**strange, "certain": False, "replication": 1}
+    found = [ROW, {**ROW, "replication": 1, "added": []}, plain, strange, likely, {"failed": "no"}]
     rows.store(found, 10, "command", 0)
     table = rows.stored()
     assert (table["planned"], table["failed"], table["seed"]) == (10, 1, 0)
     kept = [*rows.plain(table["rows"]), *rows.named(table["rows"]), *rows.strange(table["rows"])]
-    assert kept == [plain, ROW, found[1], strange]
+    assert kept == [plain, ROW, found[1], strange, likely]
     said = rows.summarise(table["rows"])
     assert (said["right_at_3x"], said["false_additions"]) == (0.5, 0.0)
-    assert said["outside_named_as_certain"] == 1.0
+    assert said["outside_named_as_certain"] == 0.5
     assert said["right_at_10x"] is None
 
 
@@ -76,3 +78,23 @@ def test_a_hundredth_of_the_campaigns(load):
     assert said["false_additions"] == 0
     assert said["right_at_10x"] == 1
     assert not said["outside_named_as_certain"]
+
+
+@pytest.mark.slow
+def test_limits_and_shapes_of_the_effects_that_are_put_in(load):
+    """A law's limit is met by its own score; nothing is put in twice, or larger than it can be."""
+    sizes = load("identification_sizes")
+    found = sizes.effects()
+    assert ("direction_dependent_damping", "stroke") in found
+    assert ("compression_damping", "stroke") not in found  # the same beside the model's damping
+    assert found["power_law_damping", "stroke"].shapes["power_law_damping_exponent"] != 1.0
+    for key, score in found.items():
+        direction = np.ones(len(score.names))
+        direction[::2] = -1.0  # the same in all runs would be no variation
+        limit = sizes.limit(key, direction)
+        assert 0 < limit < np.inf
+        # Half of the campaigns: the median of chi-square beyond the critical value.
+        away = limit**2 * float(direction @ score.information @ direction)
+        assert 5.0 < away < 50.0
+    most = max(sizes.FACTORS) * sizes.limit(("sensor_saturation_upper", "force"), np.ones(1))
+    assert most <= 1.0
