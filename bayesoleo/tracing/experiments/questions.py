@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, ModelError
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
@@ -103,6 +103,8 @@ def _answer(
         drive_of([Rival("", item.before.fit)] * 2, records)
         rivals, failed = rivals_of(item, chosen, numerics)
         note = "; ".join(f"{name} could not be estimated: {why}" for name, why in failed.items())
+        if len(rivals) < 2 and failed:
+            raise ModelError(f"fewer than two rivals are left: {note}", hint="name others")
         drive = drive_of(rivals, records)
         limits = Limits.of(records, drive, rivals[0].fit.predictor.outputs).given(rig)
         errors = _left(item, rivals[0], numerics)
