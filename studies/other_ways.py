@@ -1,10 +1,11 @@
 """Other ways to find what a model lacks, on the same data: what remains on runs not used.
 
 Every way gets the same fitted model, and the residual of the fitted runs with what a rig knows of
-each sample: position, velocity and the measured pressure. It learns the residual as a function of
-these, and predicts that of the runs held out. What is to be chosen - degree, threshold, whether
-the velocity is squeezed about its zero - is chosen on the fitted runs alone: each predicted from
-the others, or by marginal likelihood.
+each sample: position, velocity and the pressure where it was measured. It learns the residual as a
+function of these, and predicts that of the runs held out. What is to be chosen - degree, threshold,
+whether the velocity is squeezed about its zero - is chosen on the fitted runs alone: each predicted
+from the others, or by marginal likelihood. Where the model gives every run an offset of its own,
+that of a run held out is estimated anew on what each way leaves, alike for all.
 """
 
 from __future__ import annotations
@@ -44,8 +45,15 @@ class RunResidual:
 
     label: str
     residual: np.ndarray
-    coordinates: np.ndarray  # (N, 3): position, velocity, pressure
+    coordinates: np.ndarray  # (N, 2 or 3): position, velocity, pressure if it was measured
     period: np.ndarray
+    offset: bool = False  # estimated in this run alone
+    noise: float = 1.0  # of a sample, SI
+
+    def left_by(self, predict: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """What a learned function leaves."""
+        rest = self.residual - predict(self.coordinates)
+        return rest - rest.mean() if self.offset else rest
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class Found:
     repeating: float
     seconds: float
     says: str
+    newton: float = float("nan")  # the rms in N
 
 
 Learner = Callable[[Sequence[RunResidual]], Callable[[np.ndarray], np.ndarray]]
@@ -73,15 +82,22 @@ def residuals(state: State) -> tuple[list[RunResidual], list[RunResidual]]:
         noise = state.errors.at(OUTPUT, record.label).average.sigma
         residual = (record.samples[OUTPUT] - prediction.y[place]) / noise
         period = np.floor(record.phase + 1e-9).astype(int)
-        found.append(RunResidual(record.label, residual, coordinates / scale, period))
+        offset = prediction.re_estimated > 0
+        found.append(
+            RunResidual(record.label, residual, coordinates / scale, period, offset, noise)
+        )
     return found[: len(state.fitted)], found[len(state.fitted) :]
 
 
 def _motion(record) -> np.ndarray:
     """Position and velocity by the harmonics, without noise; pressure likewise."""
-    x = record.harmonics["displacement"]
-    p = record.harmonics["pressure"].evaluate(record.phase, record.frequency)
-    return np.stack([*(x.evaluate(record.phase, record.frequency, n) for n in (0, 1)), p], axis=1)
+    wanted = [("displacement", 0), ("displacement", 1), ("pressure", 0)]
+    columns = [
+        record.harmonics[name].evaluate(record.phase, record.frequency, order)
+        for name, order in wanted
+        if name in record.harmonics
+    ]
+    return np.stack(columns, axis=1)
 
 
 def judge(
@@ -90,15 +106,16 @@ def judge(
     """Pool over runs what a way leaves: raw, and averaged over periods, each over its noise."""
     from bayesoleo.data import periodic_average
 
-    squares, ratios = [], []
+    squares, ratios, newton = [], [], []
     for run, rest in left:
         cycles = run.period.max() + 1
         average = periodic_average(rest, 1.0 / (rest.size / cycles), 1.0)
         squares.append(np.mean(rest**2))
         ratios.append(average.ratio**2)
-    return Found(
-        way, float(np.sqrt(np.mean(squares))), float(np.sqrt(np.mean(ratios))), seconds, says
-    )
+        newton.append(np.mean((run.noise * rest) ** 2))
+    sizes = (float(np.sqrt(np.mean(part))) for part in (squares, ratios, newton))
+    rms, repeating, force = sizes
+    return Found(way, rms, repeating, seconds, says, force)
 
 
 def across(runs: Sequence[RunResidual], learn: Learner) -> float:
@@ -106,7 +123,7 @@ def across(runs: Sequence[RunResidual], learn: Learner) -> float:
     errors = []
     for out in runs:
         predict = learn([run for run in runs if run is not out])
-        errors.append(np.mean((out.residual - predict(out.coordinates)) ** 2))
+        errors.append(np.mean(out.left_by(predict) ** 2))
     return float(np.mean(errors))
 
 
@@ -115,7 +132,7 @@ def learned(
 ) -> Found:
     """Learn from all fitted runs, judge on those held out."""
     predict = learn(fitted)
-    left = [(run, run.residual - predict(run.coordinates)) for run in held_out]
+    left = [(run, run.left_by(predict)) for run in held_out]
     return judge(way, left, time.process_time() - start, says())
 
 
@@ -170,10 +187,11 @@ def sindy(threshold: float, keep: dict) -> Learner:
     """Sequentially thresholded least squares on polynomials and on smooth signs of the velocity."""
     import pysindy
 
-    def library():
+    def library(pressure: bool):
         # pysindy counts a function's arguments, so that a width has to be closed over.
-        pairs = [_sign(width) for width in WIDTHS] + [_sign(width, "p") for width in WIDTHS]
-        pairs.append((lambda x, v, p: v * np.abs(v), lambda x, v, p: f"{v}|{v}|"))
+        pairs = [_sign(width, pressure) for width in WIDTHS]
+        pairs += [_sign(width, pressure, "p") for width in WIDTHS if pressure]
+        pairs.append(_quadratic(pressure))
         functions, names = (list(part) for part in zip(*pairs, strict=True))
         own = pysindy.CustomLibrary(library_functions=functions, function_names=names)
         return pysindy.GeneralizedLibrary([pysindy.PolynomialLibrary(degree=3), own])
@@ -181,15 +199,15 @@ def sindy(threshold: float, keep: dict) -> Learner:
     def learn(runs: Sequence[RunResidual]):
         model = pysindy.SINDy(
             optimizer=pysindy.STLSQ(threshold=threshold, alpha=1e-6, normalize_columns=True),
-            feature_library=library(),
+            feature_library=library(runs[0].coordinates.shape[1] == 3),
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             model.fit(
                 [run.coordinates for run in runs],
                 t=1.0,
-                x_dot=[np.column_stack([run.residual] * 3) for run in runs],
-                feature_names=["x", "v", "p"],
+                x_dot=[np.tile(run.residual[:, None], run.coordinates.shape[1]) for run in runs],
+                feature_names=["x", "v", "p"][: runs[0].coordinates.shape[1]],
             )
         keep["model"] = model
         return lambda coordinates: np.asarray(model.predict(coordinates))[:, 0]
@@ -197,14 +215,23 @@ def sindy(threshold: float, keep: dict) -> Learner:
     return learn
 
 
-def _sign(width: float, factor: str = ""):
+def _sign(width: float, pressure: bool, factor: str = ""):
     """A smooth sign of the velocity, times the pressure if asked for, and its name."""
     if factor:
         return (
             lambda x, v, p: p * np.tanh(v / width),
             lambda x, v, p: f"{p} tanh({v}/{width:g})",
         )
-    return lambda x, v, p: np.tanh(v / width), lambda x, v, p: f"tanh({v}/{width:g})"
+    if pressure:
+        return lambda x, v, p: np.tanh(v / width), lambda x, v, p: f"tanh({v}/{width:g})"
+    return lambda x, v: np.tanh(v / width), lambda x, v: f"tanh({v}/{width:g})"
+
+
+def _quadratic(pressure: bool):
+    """Signed square of the velocity, and its name."""
+    if pressure:
+        return lambda x, v, p: v * np.abs(v), lambda x, v, p: f"{v}|{v}|"
+    return lambda x, v: v * np.abs(v), lambda x, v: f"{v}|{v}|"
 
 
 def with_sindy(fitted, held_out) -> Found:
@@ -300,10 +327,11 @@ def _value(fit, name: str) -> str:
     return f"{name} = {format_number(fit.values[name], sd)} ± {sd:.2g} {unit}".strip()
 
 
-def measure(campaign: Path, model: str) -> list[Found]:
+def measure(campaign: Path, model: bayesoleo.model.Model | str) -> list[Found]:
     """All ways on one campaign."""
     settings = bayesoleo.Settings(jobs=1)
-    task = workflow.prepare(campaign, bayesoleo.system(model), settings)
+    model = bayesoleo.system(model) if isinstance(model, str) else model
+    task = workflow.prepare(campaign, model, settings)
     state = fit_state(task.assembly, task.roles, settings.numerics)
     fitted, held_out = residuals(state)
     left = [(run, run.residual) for run in held_out]
@@ -314,12 +342,19 @@ def measure(campaign: Path, model: str) -> list[Found]:
     return [*found, with_close(task, state)]
 
 
+def measured_damper() -> tuple[Path, bayesoleo.model.Model]:
+    """The measured damper's campaign and its viscous model."""
+    folder = Path(__file__).resolve().parent / "measured" / "mr_damper"
+    return folder, bayesoleo.load_model(f"{folder / 'model.py'}:model")
+
+
 def print_table(name: str, found: Sequence[Found]) -> None:
     """One line each, what it says below."""
-    print(f"{name}: {OUTPUT} on runs not used, over the noise")
-    print(f"{'':26}{'rms':>8}{'repeating':>11}{'CPU s':>8}")
+    print(f"{name}: {OUTPUT} on runs not used, in N and over the noise")
+    print(f"{'':26}{'rms in N':>9}{'rms':>8}{'repeating':>11}{'CPU s':>8}")
     for one in found:
-        print(f"{one.way:26}{one.rms:8.3f}{one.repeating:11.2f}{one.seconds:8.1f}")
+        sizes = f"{one.newton:9.2f}{one.rms:8.3f}{one.repeating:11.2f}"
+        print(f"{one.way:26}{sizes}{one.seconds:8.1f}")
     print()
     for one in found:
         if one.says:
@@ -331,7 +366,8 @@ def draw(results: dict[str, Sequence[Found]]) -> Figure:
     """What each way leaves that repeats, over the noise, one panel for each campaign."""
     figure = style.blank(style.WIDTH, 2.6)
     for k, (name, found) in enumerate(results.items()):
-        axes = figure.add_axes((0.2 + 0.41 * k, 0.22, 0.36, 0.62))
+        width = 0.76 / len(results)
+        axes = figure.add_axes((0.21 + (width + 0.015) * k, 0.22, width - 0.03, 0.62))
         style.dress(axes)
         colours = [style.BEFORE, *[style.NEUTRAL] * (len(found) - 2), style.AFTER]
         axes.barh(range(len(found)), [one.repeating for one in found], 0.7, color=colours)
@@ -339,7 +375,10 @@ def draw(results: dict[str, Sequence[Found]]) -> Figure:
         axes.set_yticks(range(len(found)), [one.way for one in found] if k == 0 else [])
         axes.invert_yaxis()
         axes.set_title(name, loc="left", fontsize=style.TEXT, fontweight="bold")
-        axes.set_xlabel("what repeats on runs not used, over its noise", fontsize=style.TEXT)
+    figure.text(
+        0.58, 0.03, "what repeats on runs not used, over its noise", fontsize=style.TEXT,
+        ha="center", color=style.INK,
+    )  # fmt: skip
     return figure
 
 
@@ -347,16 +386,20 @@ def main() -> None:
     """Measure, and print a table or JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("campaigns", nargs="*", default=["shaker-breakaway", "shaker-wall"])
+    parser.add_argument(
+        "campaigns", nargs="*", default=["shaker-breakaway", "shaker-wall", "mr_damper"]
+    )
     options = parser.parse_args()
     root, flat = Path(os.environ["BAYESOLEO_DATA"]) / "campaigns", {}
     for name in options.campaigns:
         with contextlib.redirect_stdout(io.StringIO()):
-            found = measure(root / name, "f16n2d2")
+            measured = name == "mr_damper"
+            found = measure(*(measured_damper() if measured else (root / name, "f16n2d2")))
         for one in found:
             key = f"{name}_{one.way}".replace(" ", "_").replace("-", "_").lower()
             flat |= {
                 f"{key}_rms": one.rms,
+                f"{key}_rms_n": one.newton,
                 f"{key}_repeating": one.repeating,
                 f"{key}_cpu_s": one.seconds,
             }
