@@ -57,6 +57,9 @@ class _Printer(PythonCodePrinter):
     def _print_im(self, expr: sp.im) -> str:
         return "0.0"
 
+    def _print_conjugate(self, expr: sp.conjugate) -> str:
+        return str(self._print(expr.args[0]))
+
     def _print_bspline(self, expr: sp.Expr) -> str:
         far, near, _ = self._reaches(expr)
         return f"(({far}**3 - 4.0*{near}**3)/6.0)"

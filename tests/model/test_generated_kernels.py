@@ -258,3 +258,14 @@ def test_the_slope_of_the_size_of_a_power_is_real(backend):
     a, b = p[0]
     np.testing.assert_allclose(slope[0, 0, 0], abs(b) * x**a * np.log(x), rtol=1e-14)
     np.testing.assert_allclose(slope[0, 0, 1], np.sign(b) * x**a, rtol=1e-14)
+
+
+def test_a_conjugate_of_what_is_real_is_itself():
+    """Computer algebra writes one where it does not see that a power is real."""
+    a, q = symbol("a"), symbol("q")
+    kept = sp.conjugate(q**a)
+    assert kept.has(sp.conjugate)
+    _, lines, (result,) = statements([kept], {a: "p0", q: "z0"})
+    scope = {"np": np, "p0": 1.5, "z0": np.array([1.0, 2.0])}
+    exec("\n".join(lines), scope)
+    np.testing.assert_allclose(eval(result, scope), [1.0, 2.0**1.5], rtol=1e-15)
