@@ -11,6 +11,7 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.review import reviewed
 from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
@@ -22,8 +23,9 @@ from bayesoleo.tracing.scoring.significance import SAME
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
-#: Part of the excess that added effects must explain for the loop to call the model's lack found.
-MOSTLY = 0.5
+#: Part of the excess that added effects must explain for the loop to call the model's lack found:
+#: what is left is then less than a third of what there was, in size.
+MOSTLY = 0.9
 
 Say = Callable[[str], None]
 
@@ -159,7 +161,9 @@ def close_loop(
             "intervals count independent noise only: while an error remains that repeats, they are"
             " too narrow"
         )
-    return ClosedLoop(tuple(rounds), first, state, roles, tuple(notes))
+    return ClosedLoop(
+        reviewed(rounds, state, roles, numerics, say), first, state, roles, tuple(notes)
+    )
 
 
 def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:

@@ -1,0 +1,47 @@
+"""Classes of effects are looked at again with everything else in the model."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from bayesoleo.tracing.deciding import review
+from bayesoleo.tracing.deciding.rounds import Ranked, Round
+
+
+def accepted(effect, same):
+    candidate = SimpleNamespace(effect=effect, target="stroke", family="friction")
+    score = SimpleNamespace(option=SimpleNamespace(candidate=candidate, key=(effect, "stroke")))
+    return Ranked(score, 1e-6, 0.9, True, same)
+
+
+def loop_of(*found):
+    """Rounds that accepted these, one that accepted none, and the final model."""
+    rounds = [Round(None, (item,), {}, item, None, "", 60.0) for item in found]
+    steps = [
+        SimpleNamespace(effect=SimpleNamespace(id=item.effect), target=item.target)
+        for item in found
+    ]
+    last = Round(None, (), {}, None, None, "nothing is missing", 60.0)
+    return [*rounds, last], SimpleNamespace(assembly=SimpleNamespace(steps=steps))
+
+
+def test_what_was_found_before_the_last_effect_keeps_its_true_rivals_only(monkeypatch):
+    first = accepted("cubic_stiffness", ("quintic_stiffness", "play"))
+    second = accepted("coulomb_friction", ("dahl_friction",))
+    rounds, final = loop_of(first, second)
+    monkeypatch.setattr(review, "_still_alike", lambda item, step, *_: ("play",))
+    told = review.reviewed(rounds, final, None, None, lambda _: None)
+    assert told[0].accepted.same == ("play",)
+    assert told[0].ranking == (told[0].accepted,)
+    # It was judged with everything else in: there is nothing to look at again.
+    assert told[1] is rounds[1]
+    assert told[2] is rounds[2]
+
+
+@pytest.mark.parametrize("same", [(), ("play",)])
+def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
+    rounds, final = loop_of(accepted("cubic_stiffness", same))
+    monkeypatch.setattr(review, "_still_alike", lambda *_: pytest.fail("asked again"))
+    assert review.reviewed(rounds, final, None, None, lambda _: None) == tuple(rounds)
