@@ -115,8 +115,13 @@ def test_tables_of_records_fit_a_terminal(run, campaign, tmp_path, monkeypatch):
     """Three channels and times of many digits, in eighty columns: no word broken, no digit lost."""
     toml = campaign / "campaign.toml"
     text = toml.read_text(encoding="utf-8")
-    more = '[channels.pressure]\ncolumn = "f_N"\nunit = "Pa"\n\n[channels.force]'
+    more = '[channels.pressure]\ncolumn = "p_Pa"\nunit = "Pa"\n\n[channels.force]'
     toml.write_text(text.replace("[channels.force]", more), encoding="utf-8")
+    for file in campaign.glob("*.csv"):
+        header, *rows = file.read_text(encoding="utf-8").splitlines()
+        force = header.split(",").index("f_N")
+        wider = [f"{header},p_Pa", *(f"{row},{row.split(',')[force]}" for row in rows)]
+        file.write_text("\n".join(wider), encoding="utf-8")
     narrow = Console(width=80, highlight=False, soft_wrap=False)
     monkeypatch.setattr(shell, "console", lambda: narrow)
     text = run("reduce", campaign, "--quiet").stdout
