@@ -59,12 +59,7 @@ def case(
 
 
 def _wrong(summary: Mapping[str, Any]) -> str:
-    runs = [
-        (entry["ratio_to_noise"], output, run)
-        for output, by_run in summary["rounds"][0]["error"].items()
-        for run, entry in by_run.items()
-        if entry["ratio_to_noise"] is not None
-    ]
+    runs = _ratios(summary["rounds"][0])
     if not runs:
         return "No run repeats, so that there is no noise to hold the error against."
     worst, output, run = max(runs)
@@ -76,6 +71,16 @@ def _wrong(summary: Mapping[str, Any]) -> str:
     if not above:
         return f"No: no error that repeats is above {FLOOR} times its noise; {what}."
     return f"In {of} an error repeats that is more than {FLOOR} times its noise; {what}."
+
+
+def _ratios(entry: Mapping[str, Any]) -> list[tuple[float, str, str]]:
+    """Ratio to the noise, output and run, of those that have one."""
+    return [
+        (error["ratio_to_noise"], output, run)
+        for output, runs in entry["error"].items()
+        for run, error in runs.items()
+        if error["ratio_to_noise"] is not None
+    ]
 
 
 def _where(tree: xr.DataTree) -> str:
@@ -137,7 +142,9 @@ def _sure(summary: Mapping[str, Any]) -> str:
     added = (chosen(entry) for entry in summary["rounds"])
     alike = any(one["indistinguishable_from"] for one in added if one is not None)
     if alike:
-        return "One of a class: these data cannot tell it from the effects named below."
+        return "One of a class: these data cannot tell it from the effects named above."
+    if any(ratio > FLOOR for ratio, *_ in _ratios(summary["rounds"][-1])):
+        return "Open: more than noise is left, so that something else acts as well, or instead."
     return "Probable: it explains the data best of what was tried, which is not all there is."
 
 
@@ -215,13 +222,7 @@ def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
 
 def _left(summary: Mapping[str, Any]) -> str:
     last = summary["rounds"][-1]
-    ratios = [
-        (entry["ratio_to_noise"], output, run)
-        for output, runs in last["error"].items()
-        for run, entry in runs.items()
-        if entry["ratio_to_noise"] is not None
-    ]
-    text = ""
+    ratios, text = _ratios(last), ""
     if ratios:
         worst, output, run = max(ratios)
         text = f"At most {format_short(worst)} times the noise, of {output} in run {run}"

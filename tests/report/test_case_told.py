@@ -41,6 +41,12 @@ def test_how_sure_a_name_is(answers, oleo):
     for entry in summary["rounds"]:
         for candidate in entry["candidates"]:
             candidate["indistinguishable_from"] = []
+    last = [entry for runs in summary["rounds"][-1]["error"].values() for entry in runs.values()]
+    last[0]["ratio_to_noise"] = 2.0
+    more = dict(case(summary | {"certain": False}, {}, oleo))[question]
+    assert more.startswith("Open: ")
+    for entry in last:
+        entry["ratio_to_noise"] = 1.0
     alone = dict(case(summary | {"certain": False}, {}, oleo))[question]
     assert alone.startswith("Probable: ")
     summary["rounds"][0]["candidates"][0]["indistinguishable_from"] = ["another"]
