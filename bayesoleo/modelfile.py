@@ -16,6 +16,7 @@ from types import ModuleType
 
 from bayesoleo import model as declarations
 from bayesoleo.effects import Effect, catalogue
+from bayesoleo.effects.places import LOOKED_FOR
 from bayesoleo.errors import InputError, ModelError, ModelWarning
 from bayesoleo.model import Model
 from bayesoleo.model.unused import unused
@@ -47,7 +48,7 @@ def load_model(text: str) -> Model:
     Warns
     -----
     ModelWarning
-        If a model from a file declares what nothing in it uses.
+        If a model from a file declares what nothing in it uses, and no effect looks for by name.
 
     Examples
     --------
@@ -69,6 +70,8 @@ def load_model(text: str) -> Model:
         problem = f"{name} is not a Model but {type(model).__name__}"
         raise ModelError(problem, file=path, hint=_models_in(found, path))
     for idle, kind in unused(model).items():
+        if idle in LOOKED_FOR:
+            continue
         warnings.warn(
             f"file {path}: {kind} {idle} of model {model.name!r} stands in no equation and no "
             "output; nothing depends on it unless an effect does",

@@ -103,6 +103,12 @@ def spring_force(model: Model, place: Coordinate) -> sp.Expr:
     return total
 
 
+#: Constants that effects look for by name, whether or not a model's own equations hold them.
+LOOKED_FOR = frozenset(
+    {"ambient_temperature", "ambient_pressure", "initial_volume", "initial_pressure", "gravity"}
+)
+
+
 def is_quantity(model: Model, *names: str) -> bool:
     """Whether all names are declared in the model."""
     known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}

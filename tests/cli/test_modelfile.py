@@ -59,6 +59,14 @@ def test_what_nothing_uses_is_named(model):
         load_model(str(model))
 
 
+def test_what_effects_look_for_by_name_may_wait_for_them(model):
+    ambient = 'parameters={\n        "ambient_temperature": Parameter(293.0, "K", fixed=True),'
+    text = MODEL.replace("parameters={", ambient)
+    assert text != MODEL
+    model.write_text(text)
+    assert "ambient_temperature" in load_model(str(model)).parameters
+
+
 def test_folder_cannot_be_a_model(tmp_path):
     (tmp_path / "a.py").mkdir()
     with pytest.raises(ModelError, match=r"a.py: cannot be read: Is a directory"):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
+from bayesoleo.data.averaging import check_length
 from bayesoleo.errors import CampaignError
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.fitting.roles import assign, halves
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,23 @@ def test_halves_of_a_lone_run_are_predicted_as_the_whole_is(tmp_path, periods):
     ]
     together = np.concatenate(predicted[1:], axis=1)
     assert together == pytest.approx(predicted[0], rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("per_period", [100.0, 100.3, 100.51, 99.76])
+def test_either_half_of_a_record_a_sample_short_holds_its_periods(records, per_period):
+    size = int(np.ceil(4 * per_period)) - 1
+    short = replace(
+        records[0],
+        time=np.arange(size) * 1.0,
+        samples={name: np.zeros(size) for name in records[0].samples},
+        frequency=1 / per_period,
+        periods=4,
+        kept=None,
+    )
+    parts = halves(short)
+    assert sum(part.time.size for part in parts) == size
+    for part in parts:
+        check_length(part.time.size, 1 / per_period)  # raises where two periods are not there
 
 
 def test_a_lone_short_run_cannot_be_split(tmp_path):

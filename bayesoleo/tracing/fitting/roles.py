@@ -87,10 +87,19 @@ def halves(record: Record) -> tuple[Record, Record]:
     """The first and the second half of a periodic record's periods, as records of their own."""
     half = record.periods // 2
     middle = int(np.searchsorted(record.phase, half - 1e-9))
+    if record.phase.size - middle + 1 < _samples(record, record.periods - half):
+        # A record may be a sample short of whole periods; so may its first half instead.
+        middle -= 1
     return (
         _part(record, slice(0, middle), half, "first half", "fit"),
         _part(record, slice(middle, None), record.periods - half, "second half", "hold-out"),
     )
+
+
+def _samples(record: Record, periods: int) -> float:
+    """Number of samples that so many periods take."""
+    step = (record.time[-1] - record.time[0]) / (record.time.size - 1)
+    return float(periods / (step * record.frequency))
 
 
 def _part(record: Record, samples: slice, periods: int, name: str, role: str) -> Record:
