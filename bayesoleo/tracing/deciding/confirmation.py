@@ -60,12 +60,13 @@ def confirmed(
     # the sum by one on average, and by more where noise is coloured, which scatters the sum more
     # too.
     more = sum(_re_estimated(new) - _re_estimated(old) for old, new in pairs)
-    error *= float(np.sqrt(item.score.inflation))
-    if not after.at_floor:
+    error *= float(np.sqrt(result.inflation))
+    if not after.at_floor and all(record.periodic for record in roles.fitted):
         # What still repeats scatters the fall as noise of its size would (McCullagh and Nelder
-        # 1989, section 4.5): a curve that happens to run along it proves nothing.
+        # 1989, section 4.5): a curve that happens to run along it proves nothing. Of transients the
+        # inflation is measured on all that is left.
         error *= max(1.0, after.worst_ratio)
-    if not fall - item.score.inflation * more > error:
+    if not fall - result.inflation * more > error:
         return None, f"{item.effect} does not lower the error on {where}"
     lowers = f" and lowers the weighted squared error on {where} by {fall:.3g} ± {error:.1g}"
     return after, _explains(item) + lowers
