@@ -78,6 +78,7 @@ def test_what_a_user_wrote_is_text(synthetic):
     assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 14 * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [

@@ -39,6 +39,7 @@ model = Model(
 """
 
 
+@pytest.mark.slow
 def test_an_effect_and_a_model_in_files_of_a_few_lines(tmp_path):
     """Damping that grows with displacement, as van der Pol's: no effect of the catalogue."""
     for name, text in (("mine.py", MINE), ("model.py", MODEL)):

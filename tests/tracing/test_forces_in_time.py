@@ -79,6 +79,7 @@ def test_a_force_at_a_harmonic_of_the_drive_is_named_with_size_and_phase(hum):
     assert summary["rounds"][0]["accepted"] == "periodic_force"
 
 
+@pytest.mark.slow
 def test_its_phase_is_that_of_the_drive_and_not_of_the_clock(hum):
     """The same records cut a third of a period later tell the same force."""
     later = [
