@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from fitted_states import NUMERICS
 from small_campaigns import DRAG, HARDENING, SPRING, oscillator_campaign
 

@@ -83,7 +83,8 @@ def swept(folder):
 def test_transients_show_a_bump_along_the_stroke_with_its_shape(tmp_path):
     loop = closed(swept(tmp_path))
     assert loop.effects == ("unnamed_displacement",)
-    (accepted,) = [entry.accepted for entry in loop.rounds if entry.accepted]
+    # A name that helped at first may have been removed again.
+    *_, accepted = [entry.accepted for entry in loop.rounds if entry.accepted]
     assert accepted.closest
     (shape,) = shapes(loop.final)
     x = shape.places[0]
