@@ -111,7 +111,7 @@ def power_figure(rows: Sequence[Row]) -> Figure:
     for row in study.named(rows):
         families.setdefault(find_effect(row["effect"]).family, []).append(row)
     present = [family for family in FAMILIES if family in families]
-    columns = 5
+    columns = 6
     figure, grid = plt.subplots(
         -(-len(present) // columns), columns, figsize=(10, 4.2), sharex=True, sharey=True,
         layout="constrained", squeeze=False,
@@ -126,6 +126,8 @@ def power_figure(rows: Sequence[Row]) -> Figure:
         axes.set_xticks(study.FACTORS, [f"{f:g}" for f in study.FACTORS])
         axes.minorticks_off()
         axes.axhline(0.9, color=INK, linewidth=0.6, linestyle=":")
+    for axes in grid.flat[max(len(present) - columns, 0) : len(present)]:
+        axes.tick_params(labelbottom=True)  # with nothing beneath, where a row is not full
     figure.supxlabel("size in detection limits", fontsize=9)
     figure.supylabel("part of campaigns", fontsize=9)
     grid[0, 0].legend(frameon=False, fontsize=7, loc="lower right")
@@ -164,8 +166,9 @@ def print_table(table: Mapping[str, object]) -> None:
         print(f"right at {factor:>2g} times the limit      {_fraction(found)}")
     false = [bool(row["added"]) for row in study.plain(rows)]
     print(f"false additions, nothing lacks  {_fraction(false)}")
-    certain = [r["verdict"] == "effect added" and not r["same"] for r in study.strange(rows)]
-    print(f"named with certainty, outside   {_fraction(certain)}")
+    strange = study.strange(rows)
+    print(f"called certain, outside         {_fraction([row['certain'] for row in strange])}")
+    print(f"given a likely name, outside    {_fraction([bool(row['added']) for row in strange])}")
 
 
 def _fraction(values: Sequence[bool]) -> str:
