@@ -8,6 +8,7 @@ import pytest
 
 from bayesoleo.tracing.deciding import review
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.unnamed_round import with_unnamed
 
 
 def accepted(effect, same):
@@ -45,3 +46,17 @@ def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
     rounds, final = loop_of(accepted("cubic_stiffness", same))
     monkeypatch.setattr(review, "_still_alike", lambda *_: pytest.fail("asked again"))
     assert review.reviewed(rounds, final, None, None, lambda _: None) == tuple(rounds)
+
+
+def test_no_function_is_looked_for_where_noise_alone_is_left():
+    """A name that explained the excess by itself led to the floor: nothing is left to explain."""
+    opening = Round(
+        SimpleNamespace(assembly=SimpleNamespace(steps=())),
+        (), {}, accepted("stribeck_friction", ()), None, "", 60.0,
+    )  # fmt: skip
+    step = SimpleNamespace(effect=SimpleNamespace(family="friction"))
+    state = SimpleNamespace(at_floor=True, assembly=SimpleNamespace(steps=(step,)))
+    last = Round(state, (), {}, None, None, "nothing is missing", 60.0)
+    told: list[str] = []
+    assert with_unnamed(last, opening, None, None, say=told.append) is last
+    assert not told

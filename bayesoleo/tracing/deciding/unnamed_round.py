@@ -90,20 +90,22 @@ def with_unnamed(
         return outcome
     if not room and len(steps) < FEWEST_REPLACED:
         return outcome  # named ones had no chance to come together
+    # At the floor nothing is left that a function could explain but noise.
+    beside, instead = room and not state.at_floor, named and not _stands_by_itself(first)
+    if not (beside or instead):
+        return outcome
     say("look for an effect without a name")
     base = state.base()
     found = search(base, state.assembly, numerics.jobs)
     outcome = replace(outcome, unnamed=found)
     if found.p_value >= LEVEL:
         return outcome
-    chances = [_Chance(state, base, found, outcome, False)] if room else []
-    if named and not _stands_by_itself(first):
+    chances = [_Chance(state, base, found, outcome, False)] if beside else []
+    if instead:
         origin = first.before
         reference = origin.base()
         again = search(reference, origin.assembly, numerics.jobs)
         chances.append(_Chance(origin, reference, again, first, True))
-    if not chances:
-        return outcome
     reasons, common = [outcome.reason], chances[-1].base
     # What was found so far competes too: a function that explains less does not replace it.
     present = _worth(state.fit, common)
