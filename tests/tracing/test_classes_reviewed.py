@@ -33,7 +33,7 @@ def test_what_was_found_before_the_last_effect_keeps_its_true_rivals_only(monkey
     second = accepted("coulomb_friction", ("dahl_friction",))
     rounds, final = loop_of(first, second)
     monkeypatch.setattr(review, "_still_alike", lambda item, step, *_: ("play",))
-    told = review.reviewed(rounds, final, None, None, lambda _: None)
+    told = review.reviewed(rounds, final, None, None, None, lambda _: None)
     assert told[0].accepted.same == ("play",)
     assert told[0].ranking == (told[0].accepted,)
     # It was judged with everything else in: there is nothing to look at again.
@@ -45,7 +45,7 @@ def test_what_was_found_before_the_last_effect_keeps_its_true_rivals_only(monkey
 def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
     rounds, final = loop_of(accepted("cubic_stiffness", same))
     monkeypatch.setattr(review, "_still_alike", lambda *_: pytest.fail("asked again"))
-    assert review.reviewed(rounds, final, None, None, lambda _: None) == tuple(rounds)
+    assert review.reviewed(rounds, final, None, None, None, lambda _: None) == tuple(rounds)
 
 
 def test_no_function_is_looked_for_where_noise_alone_is_left():

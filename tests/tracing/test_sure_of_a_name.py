@@ -63,10 +63,12 @@ def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
     assert not _may_be_significant(noise, TESTS)
 
 
-def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1):
+def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact"):
     """A loop that added effects, the first explaining so much."""
     refit = SimpleNamespace(fall=fall, inflation=1.0)
-    accepted = SimpleNamespace(effect="play", same=same, refit=refit)
+    option = SimpleNamespace(candidate=SimpleNamespace(family=family))
+    score = SimpleNamespace(option=option)
+    accepted = SimpleNamespace(effect="play", same=same, refit=refit, score=score)
     after = SimpleNamespace(accepted=None, ranking=[SimpleNamespace(p_value=left)], tests=TESTS)
     added = [SimpleNamespace(accepted=accepted, ranking=[], tests=TESTS)] * effects
     final = SimpleNamespace(
@@ -84,6 +86,7 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1):
         ({"left": LEVEL / 2}, False),
         ({"effects": 2}, False),
         ({"effects": 0}, False),
+        ({"family": "unnamed"}, False),
         # One in twenty of it would have to be found if a mere likeness had been named.
         ({"fall": 0.9 * 14.2 / (1 - SAME)}, False),
         ({"fall": 1.1 * 14.2 / (1 - SAME)}, True),

@@ -86,6 +86,8 @@ class ClosedLoop:
         (found,), last = accepted, self.rounds[-1]
         if found.same or found.effect not in self.effects or found.refit is None:
             return False
+        if found.score.option.candidate.family == FAMILY:
+            return False  # a function without a name has none to be certain of
         if any(item.p_value < LEVEL for item in last.ranking):
             return False
         local = -np.expm1(np.log1p(-LEVEL) / last.tests)
@@ -162,7 +164,7 @@ def close_loop(
             " too narrow"
         )
     return ClosedLoop(
-        reviewed(rounds, state, roles, numerics, say), first, state, roles, tuple(notes)
+        reviewed(rounds, state, roles, numerics, effects, say), first, state, roles, tuple(notes)
     )
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesoleo.effects import Effect, catalogue
 from bayesoleo.tracing.deciding.refit import Refit, refit
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State, fit_state
@@ -23,7 +24,12 @@ Say = Callable[[str], None]
 
 
 def reviewed(
-    rounds: Sequence[Round], final: State, roles: Roles, numerics: Numerics, say: Say
+    rounds: Sequence[Round],
+    final: State,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect] | None,
+    say: Say,
 ) -> tuple[Round, ...]:
     """Rounds whose accepted effects keep only those rivals that still look like them.
 
@@ -35,9 +41,12 @@ def reviewed(
         With all effects in.
     roles : Roles
     numerics : Numerics
+    effects : sequence of Effect or None
+        Instead of the catalogue.
     say : callable
         Told what is being done.
     """
+    pool = catalogue() if effects is None else effects
     steps = {(step.effect.id, step.target): step for step in final.assembly.steps[:-1]}
     found = []
     for item in rounds:
@@ -47,17 +56,24 @@ def reviewed(
             found.append(item)
             continue
         say(f"look again at what was like {accepted.effect}")
-        same = _still_alike(accepted, step, final, roles, numerics)
+        ids = {accepted.effect, *(name.split(" @ ")[0] for name in accepted.same)}
+        alike = [effect for effect in pool if effect.id in ids]
+        same = _still_alike(accepted, step, final, roles, numerics, alike)
         found.append(_with_class(item, accepted, replace(accepted, same=same)))
     return tuple(found)
 
 
 def _still_alike(
-    accepted: Ranked, step: Step, final: State, roles: Roles, numerics: Numerics
+    accepted: Ranked,
+    step: Step,
+    final: State,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect],
 ) -> tuple[str, ...]:
     """Of an effect's class those that explain as well what is left without it."""
     without = fit_state(final.assembly.without(step), roles, numerics)
-    options = without.assembly.options(step.scales)
+    options = without.assembly.options(step.scales, effects)
     wanted = [o for o in options if _called(o, accepted) in {"", *accepted.same}]
     base = without.base()
     refits = [refit(base, score, numerics) for score in score_all(base, wanted, numerics.jobs)[0]]

@@ -41,7 +41,7 @@ def standing(item: Round, most: int = MOST_RIVALS) -> tuple[Ranked, ...]:
             for other in item.ranking
             if other.p_value < LEVEL
             and other.gain >= LEAST_SHARE
-            and other.score.option.candidate.family != "run-to-run"
+            and not other.imitates
         ]
     return tuple(chosen[:most]) if len(chosen) > 1 else ()
 
