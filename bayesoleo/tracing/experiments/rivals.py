@@ -39,9 +39,7 @@ def standing(item: Round, most: int = MOST_RIVALS) -> tuple[Ranked, ...]:
         chosen = [
             other
             for other in item.ranking
-            if other.p_value < LEVEL
-            and other.gain >= LEAST_SHARE
-            and not other.imitates
+            if other.p_value < LEVEL and other.gain >= LEAST_SHARE and not other.imitates
         ]
     return tuple(chosen[:most]) if len(chosen) > 1 else ()
 
