@@ -10,10 +10,16 @@ from typing import Any
 
 import pytest
 
-#: Modules that need the integrator of shooting, the longest to compile: one worker runs them all.
-INTEGRATOR = ("test_initial_value.py", "test_orbits.py", "test_shooting_orbits.py")
-#: Folders whose tests hardly need the compiled solvers. They come first: with an empty cache one
-#: worker compiles meanwhile what the others would compile as well, were they to need it at once.
+#: Modules that take turns over the compiled solvers, the integrator of shooting and the collocation
+#: of periodic motions. One worker runs them all, and first: a minute of compilation is done once,
+#: where workers that begin with an empty cache would each do it at the same time.
+COMPILING = (
+    "test_solver_benchmark.py",
+    "test_orbits.py",
+    "test_initial_value.py",
+    "test_shooting_orbits.py",
+)
+#: Folders whose tests hardly need these; they are what the others run meanwhile.
 UNCOMPILED = ("data", "docs", "effects", "model", "plots", "posterior", "storage")
 
 
@@ -22,7 +28,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     root = Path(__file__).parent
 
     def turn(item: pytest.Item) -> int:
-        if item.path.name in INTEGRATOR:
+        if item.path.name in COMPILING:
             return 0
         return 1 if item.path.relative_to(root).parts[0] in UNCOMPILED else 2
 
@@ -45,7 +51,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class ByModule(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
             module = super()._split_scope(nodeid)
-            return "integrator" if module.rpartition("/")[2] in INTEGRATOR else module
+            return "compiling" if module.rpartition("/")[2] in COMPILING else module
 
     config.option.loadscopereorder = False  # as sorted above, not the most numerous first
     return ByModule(config, log)
