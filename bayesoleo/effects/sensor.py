@@ -20,6 +20,7 @@ from bayesoleo.model.expressions import (
     TIME,
     WITHIN,
     derivative_symbol,
+    partial,
     split_derivative,
     total_derivative,
 )
@@ -78,7 +79,7 @@ def _before(model: Model, expression: sp.Expr, lag: sp.Expr) -> sp.Expr:
     What it depends on is taken back along its series, not the expression along its own: a motion is
     smooth where the dry friction that follows it switches within the lag.
     """
-    moving = {*model.dofs, *model.inputs}
+    moving = _moving(model)
     earlier = {TIME: TIME - lag}
     for item in expression.free_symbols:
         name, order = split_derivative(item)
@@ -87,7 +88,25 @@ def _before(model: Model, expression: sp.Expr, lag: sp.Expr) -> sp.Expr:
             highest = model.order(name) if name in model.dofs else _DERIVATIVES
             known = max(highest - order, 1)
             earlier[item] = _later(name, order, -lag, known)
+            if highest == 1 and order == 0:
+                earlier[item] += lag**2 / 2 * _acceleration(model, name)
     return expression.xreplace(earlier)
+
+
+def _acceleration(model: Model, dof: str) -> sp.Expr:
+    """Second derivative of a dof of first order, by its equation; zero where that does not say."""
+    balance = model.expand(sp.Add(*model.equations[dof].values()))
+    rate = derivative_symbol(dof, 1)
+    storage = partial(balance, rate)
+    if storage == 0 or storage.has(rate):
+        return sp.Integer(0)
+    held = sp.Dummy("rate", real=True)
+    change = total_derivative(balance.xreplace({rate: held}), _moving(model)).xreplace({held: rate})
+    return -change / storage if _exists(model, change) else sp.Integer(0)
+
+
+def _moving(model: Model) -> tuple[str, ...]:
+    return (*model.dofs, *model.inputs)
 
 
 def _later(name: str, order: int, ahead: sp.Expr, known: int) -> sp.Expr:
@@ -99,7 +118,7 @@ def _later(name: str, order: int, ahead: sp.Expr, known: int) -> sp.Expr:
 
 
 def _rate(model: Model, channel: str) -> sp.Expr:
-    return total_derivative(model.output(channel), (*model.dofs, *model.inputs))
+    return total_derivative(model.output(channel), _moving(model))
 
 
 def _exists(model: Model, rate: sp.Expr) -> bool:

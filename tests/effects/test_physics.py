@@ -196,3 +196,29 @@ def test_a_channel_that_lags_shows_what_was(scales):
     assert left[smooth].max() == pytest.approx(lag**4 / 24, rel=0.1)
     old = np.sin(phase) + 0.5 * np.arctan(100 * np.cos(phase))
     assert np.allclose(law(*rates, 1.0, 0.0), old, rtol=1e-12, atol=1e-12)
+
+
+def test_a_lag_takes_a_temperature_back_by_its_balance(scales):
+    """Of a first-order state that answers a sine the third order in the lag is left."""
+    model = Model(
+        "heated",
+        inputs={"power": "W"},
+        dofs={"warmth": "K"},
+        parameters={"loss": Parameter(0.5, "W/K", sd=1.0)},
+        equations={"warmth": "2*dot(warmth) + loss*warmth - power"},
+        outputs={"temperature": "warmth"},
+    )
+    output = find_effect("sensor_lag").extend(model, "temperature", scales).model
+    lag, phase = 0.1, np.linspace(0.0, 2 * np.pi, 50)
+    answer = 1 / (2j + 0.5) * np.exp(1j * phase)  # to a unit cosine at one radian per second
+    values = {
+        symbol("warmth"): answer.real,
+        derivative_symbol("warmth", 1): (1j * answer).real,
+        symbol("power"): np.cos(phase),
+        derivative_symbol("power", 1): -np.sin(phase),
+        symbol("loss"): 0.5,
+        symbol("sensor_lag_temperature"): lag,
+    }
+    law = sp.lambdify(list(values), output.output("temperature"), "numpy")
+    left = np.abs(law(*values.values()) - (answer * np.exp(-1j * lag)).real)
+    assert left.max() == pytest.approx(lag**3 / 6 * abs(answer[0]), rel=0.05)
