@@ -16,6 +16,7 @@ from types import ModuleType
 
 from bayesoleo import model as declarations
 from bayesoleo.effects import Effect, catalogue
+from bayesoleo.effects.gas_names import undeclared
 from bayesoleo.effects.places import LOOKED_FOR
 from bayesoleo.errors import InputError, ModelError, ModelWarning
 from bayesoleo.model import Model
@@ -75,6 +76,15 @@ def load_model(text: str) -> Model:
         warnings.warn(
             f"file {path}: {kind} {idle} of model {model.name!r} stands in no equation and no "
             "output; nothing depends on it unless an effect does",
+            ModelWarning,
+            stacklevel=2,
+        )
+    if missing := undeclared(model):
+        names = dict.fromkeys(name for lacking in missing.values() for name in lacking)
+        warnings.warn(
+            f"file {path}: model {model.name!r} has a gas, but {', '.join(missing)} cannot be "
+            f"tried because it declares no {', no '.join(names)}; what they stand for is said "
+            "under 'Names of a gas spring' in the documentation of effects",
             ModelWarning,
             stacklevel=2,
         )

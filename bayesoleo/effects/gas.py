@@ -13,7 +13,9 @@ A model has a gas spring that these effects know if it declares, under these nam
 ``ambient_pressure``      parameter or condition, Pa (for the thermal effects; optional)
 ========================= ============================================================
 
-as the oleos of :mod:`bayesoleo.systems.oleo` do, each definition in terms of those before it.
+as the oleos of :mod:`bayesoleo.systems.oleo` do, each definition in terms of those before it. An
+effect asks for those that it changes or needs; ``volume_ratio`` and ``gas_pressure`` make the
+second and the third where they are not declared (:func:`as_gas_spring`).
 
 References
 ----------
@@ -32,7 +34,9 @@ from bayesoleo.effects.places import is_quantity, substitute
 from bayesoleo.model import Dof, Model
 from bayesoleo.model.expressions import split_derivative, symbol, total_derivative
 
-_ROLES = ("volume_ratio", "free_volume_ratio", "temperature_ratio", "gas_pressure")
+_ROLES = ("volume_ratio", "gas_pressure")
+
+Change = Callable[[Model, str, Names], Model]
 
 
 def has_gas(model: Model, *more: str) -> bool:
@@ -40,8 +44,37 @@ def has_gas(model: Model, *more: str) -> bool:
     return all(name in model.definitions for name in _ROLES) and is_quantity(model, *more)
 
 
+def as_gas_spring(model: Model) -> Model:
+    """The same model with those names of a gas spring that follow from what it declares.
+
+    The free volume is the volume if the pressure follows that; the temperature is the ambient's if
+    nothing is one.
+    """
+    if not has_gas(model):
+        return model
+    volume, free, ratio = map(symbol, ("volume_ratio", "free_volume_ratio", "temperature_ratio"))
+    pressure = model.definitions["gas_pressure"]
+    if not is_quantity(model, free.name) and pressure.has(volume):
+        pressure = pressure.xreplace({volume: free})
+        model = model.with_definition(free.name, volume)
+    if not is_quantity(model, ratio.name) and not is_quantity(model, "temperature"):
+        pressure = ratio * pressure
+        model = model.with_definition(ratio.name, sp.Integer(1))
+    return model.with_definition("gas_pressure", pressure)
+
+
+def of_gas(change: Change) -> Change:
+    """A change of a gas spring, with the names that it lacks."""
+    return lambda model, target, names: change(as_gas_spring(model), target, names)
+
+
 def _where(target: str, *more: str) -> Callable[[Model], Sequence[str]]:
-    return lambda model: (target,) if has_gas(model, *more) else ()
+    return lambda model: (target,) if has_gas(as_gas_spring(model), *more) else ()
+
+
+def _quantity(name: str) -> Callable[[Model], Sequence[str]]:
+    """Whatever the model: what is stated may be wrong."""
+    return lambda model: (name,) if is_quantity(model, name) else ()
 
 
 # -- solubility ------------------------------------------------------------------------------------
@@ -49,7 +82,8 @@ def _where(target: str, *more: str) -> Callable[[Model], Sequence[str]]:
 
 def _undissolved(model: Model) -> Sequence[str]:
     """Models whose free volume is the whole volume."""
-    if not has_gas(model):
+    model = as_gas_spring(model)
+    if not has_gas(model, "free_volume_ratio", "temperature_ratio"):
         return ()
     whole = model.expand(symbol("free_volume_ratio")) == model.expand(symbol("volume_ratio"))
     return ("free_volume_ratio",) if whole else ()
@@ -75,7 +109,7 @@ SOLUBILITY = Effect(
         Amplitude("gas_solubility", "", r"\sigma", "dissolved over free gas, by pressure", 1),
     ),
     places=_undissolved,
-    change=_dissolve,
+    change=of_gas(_dissolve),
     source="Verbeek (1993), eq. 6.4",
     applies_to="gas springs without solubility",
 )
@@ -108,7 +142,7 @@ def _compliant(
     formula: str,
     latex: str,
     description: str,
-    weight: Callable[[], sp.Expr],
+    weight: Callable[[Model], sp.Expr],
 ) -> Effect:
     """Gas volume that grows with pressure.
 
@@ -119,7 +153,7 @@ def _compliant(
     def change(model: Model, target: str, names: Names) -> Model:
         dof = free_name(f"{id}_ratio", model)
         added = symbol(dof)
-        compliance = names[id] * weight()
+        compliance = names[id] * weight(model)
         pressure = symbol("gas_pressure") - symbol("initial_pressure")
         wider = model.definitions[target] + added
         unit = Dof("", 0.0, "added gas volume over initial volume")
@@ -134,10 +168,16 @@ def _compliant(
         formula=formula,
         amplitudes=(Amplitude(id, "m**3/Pa", latex, description, 1),),
         places=_where("volume_ratio", "initial_volume", "initial_pressure"),
-        change=change,
+        change=of_gas(change),
         source="Verbeek (1993), section 7.3",
         applies_to="gas springs",
     )
+
+
+def _volume(model: Model) -> sp.Expr:
+    """What the gas law follows: the free volume, or the volume where that has no name."""
+    free = "free_volume_ratio"
+    return symbol(free if is_quantity(model, free) else "volume_ratio")
 
 
 OIL_COMPRESSIBILITY = _compliant(
@@ -146,7 +186,7 @@ OIL_COMPRESSIBILITY = _compliant(
     r"v = 1 - \frac{A_p q - c_o (p - p_0)}{V_0}",
     "c_o",
     "oil volume lost a pressure",
-    lambda: sp.Integer(1),
+    lambda model: sp.Integer(1),
 )
 
 CYLINDER_EXPANSION = _compliant(
@@ -155,7 +195,7 @@ CYLINDER_EXPANSION = _compliant(
     r"v = (1 - A_p q / V_0) \left(1 + c_c \frac{p - p_0}{V_0}\right)",
     "c_c",
     "volume of the whole gas space gained a pressure",
-    lambda: symbol("free_volume_ratio"),
+    _volume,
 )
 
 
@@ -178,7 +218,7 @@ EXTRA_VOLUME = Effect(
     title="More gas volume than stated (gauge, lines)",
     formula=r"V_0 + V_e",
     amplitudes=(Amplitude("extra_volume", "m**3", "V_e", "volume beyond the initial volume"),),
-    places=_where("initial_volume", "initial_volume"),
+    places=_quantity("initial_volume"),
     change=_replacing("initial_volume", "extra_volume", factor=False),
     source="Verbeek (1993), section 7.3",
     applies_to="gas springs",
@@ -190,7 +230,7 @@ PRESSURE_ERROR = Effect(
     title="Error of the initial pressure, the same in all runs",
     formula=r"p_0 (1 + \epsilon)",
     amplitudes=(Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),),
-    places=_where("initial_pressure", "initial_pressure"),
+    places=_quantity("initial_pressure"),
     change=_replacing("initial_pressure", "initial_pressure_error", factor=True),
     source="Verbeek (1993), eq. 6.2: theta_5",
     applies_to="gas springs",
@@ -206,7 +246,7 @@ PRESSURE_ERROR_BY_RUN = Effect(
             "initial_pressure_by_run", "", r"\epsilon_r", "relative error of p_0", by_run=True
         ),
     ),
-    places=_where("initial_pressure", "initial_pressure"),
+    places=_quantity("initial_pressure"),
     change=_replacing("initial_pressure", "initial_pressure_by_run", factor=True),
     source=BY_RUN,
     applies_to="gas springs",
@@ -214,7 +254,7 @@ PRESSURE_ERROR_BY_RUN = Effect(
 
 
 def _steepen(model: Model, target: str, names: Names) -> Model:
-    factor = symbol("free_volume_ratio") ** (-names["gas_exponent_error"])
+    factor = _volume(model) ** (-names["gas_exponent_error"])
     return model.with_definition(target, model.definitions[target] * factor)
 
 
@@ -227,7 +267,7 @@ EXPONENT = Effect(
         Amplitude("gas_exponent_error", "", r"\delta n", "exponent beyond that of the model"),
     ),
     places=_where("gas_pressure"),
-    change=_steepen,
+    change=of_gas(_steepen),
     source="Verbeek (1993), eq. 6.2",
     applies_to="gas springs",
 )

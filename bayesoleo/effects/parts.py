@@ -29,6 +29,8 @@ class Scales:
         Of the runs: ``periodic``, ``transient`` or both.
     hum : float, optional
         Frequency of a line in what transients leave that no input has, Hz.
+    conditions : mapping of str to float
+        Mean over the runs, SI.
     """
 
     position: Mapping[str, tuple[float, float]]
@@ -39,6 +41,7 @@ class Scales:
     output_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     kinds: frozenset[str] = frozenset({"periodic"})
     hum: float | None = None
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import sympy as sp
 
 from bayesoleo.effects.effect import Effect, Names, free_name
-from bayesoleo.effects.gas import has_gas, volume_ratio_rate
+from bayesoleo.effects.gas import as_gas_spring, has_gas, of_gas, volume_ratio_rate
 from bayesoleo.effects.grids import Scan, geometric, period_grid, values
 from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
 from bayesoleo.effects.places import is_quantity
@@ -26,6 +26,8 @@ from bayesoleo.model.expressions import derivative_symbol, symbol
 SPECIFIC_HEAT_NITROGEN = 743.0  # J/(kg K), at constant volume
 GAS_CONSTANT_NITROGEN = 296.8  # J/(kg K)
 
+# Where neither model nor runs put a number to what is an expression: a gas spring of a litre.
+_STANDARD = {"initial_pressure": 1e6, "initial_volume": 1e-3, "ambient_temperature": 293.15}
 _THERMAL = ("temperature", "heat_loss", "gas_power", "heat_capacity")
 
 
@@ -39,26 +41,27 @@ def _power(model: Model, pressure: sp.Expr) -> sp.Expr:
 
 def _polytropic(model: Model) -> Sequence[str]:
     needed = ("initial_volume", "initial_pressure", "ambient_temperature")
-    if not has_gas(model, *needed) or any(is_quantity(model, name) for name in _THERMAL):
+    model = as_gas_spring(model)
+    if not has_gas(model, "temperature_ratio", *needed) or any(
+        is_quantity(model, name) for name in _THERMAL
+    ):
         return ()
     isothermal = model.expand(symbol("temperature_ratio")) == 1
-    return ("temperature_ratio",) if isothermal and _nominal_capacity(model) else ()
+    return ("temperature_ratio",) if isothermal else ()
 
 
-def _nominal_capacity(model: Model) -> float | None:
-    """Heat capacity of the gas at nominal values, J/K; ``None`` where a condition has none."""
-    names = ("initial_pressure", "initial_volume", "ambient_temperature")
-    numbers = [model.nominal().get(symbol(name)) for name in names]
-    if any(number is None for number in numbers):
-        return None
-    pressure, volume, temperature = (float(number) for number in numbers if number is not None)
-    return pressure * volume / temperature * SPECIFIC_HEAT_NITROGEN / GAS_CONSTANT_NITROGEN
+def _nominal_capacity(model: Model, scales: Scales) -> float:
+    """Heat capacity of the gas at nominal values, J/K; of a condition without one, what the runs
+    state."""
+    nominal = {item.name: value for item, value in model.nominal().items()}
+    stated = {**_STANDARD, **scales.conditions, **nominal}
+    gas = stated["initial_pressure"] * stated["initial_volume"] / stated["ambient_temperature"]
+    return gas * SPECIFIC_HEAT_NITROGEN / GAS_CONSTANT_NITROGEN
 
 
 def _conduction_grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
     """Conductions whose time constants span what the runs can show."""
-    capacity = _nominal_capacity(model)
-    assert capacity is not None  # else there is no place
+    capacity = _nominal_capacity(model, scales)
     slow, fast = 3 * scales.longest_period, scales.shortest_period / 30
     return geometric(capacity / slow, capacity / fast)
 
@@ -114,7 +117,7 @@ HEAT_EXCHANGE = Effect(
         Amplitude("heat_exchange", "", r"\kappa", "fraction of the work that heats the gas", 1),
     ),
     places=_polytropic,
-    change=_exchange_heat,
+    change=of_gas(_exchange_heat),
     shapes=(
         Shape("conduction", "W/K", "G", "heat conduction to the ambient", _CONDUCTION),
         Shape("swept", "", "s", "part of the conducting wall that the piston sweeps", _SWEPT),

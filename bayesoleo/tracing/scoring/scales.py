@@ -55,7 +55,10 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
     }
     kinds = frozenset(record.kind for record in fit.records)
     times = min(periods), max(periods)
-    return Scales(position, velocity, outputs, *times, ranges, kinds, hum_of(fit))
+    stated = [record.conditions for record in fit.records]
+    shared = set.intersection(*map(set, stated))
+    conditions = {name: float(np.mean([run[name] for run in stated])) for name in shared}
+    return Scales(position, velocity, outputs, *times, ranges, kinds, hum_of(fit), conditions)
 
 
 def _places(record: Record) -> np.ndarray:
