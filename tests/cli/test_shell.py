@@ -77,7 +77,11 @@ def test_interrupt_says_what_is_kept(run, monkeypatch, campaign, model, tmp_path
 def test_interrupt_of_a_process(tmp_path):
     # The model file waits, so that the signal comes while a command is at work.
     file = tmp_path / "slow.py"
-    file.write_text("import time\nprint('waiting', flush=True)\ntime.sleep(60)\n")
+    # Tests that run in the background ignore the signal, and what they start does as well.
+    file.write_text(
+        "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "print('waiting', flush=True)\ntime.sleep(60)\n"
+    )
     command = [sys.executable, "-m", "bayesoleo", "systems", str(file)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

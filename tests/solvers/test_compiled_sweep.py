@@ -21,7 +21,18 @@ from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.status import Status
 
 FORCE = harmonics(h0=0.3, h1=1.0, h3=0.2j)
-MODELS = [duffing(quadratic=0.4), relaxation(), coupled(), friction_oscillator()]
+#: The longest to compile; the model goes through the default schemes, and others through these.
+LONG = [("coupled", "radau2"), ("coupled", "gauss3")]
+CASES = [
+    pytest.param(
+        model,
+        name,
+        id=f"{model.name}-{name}",
+        marks=[pytest.mark.slow] if (model.name, name) in LONG else [],
+    )
+    for model in (duffing(quadratic=0.4), relaxation(), coupled(), friction_oscillator())
+    for name in ("radau2", "radau3", "gauss3", "thesis")
+]
 
 
 def both(model, name, n, force=FORCE, start=0.0, **options):
@@ -36,8 +47,7 @@ def both(model, name, n, force=FORCE, start=0.0, **options):
 
 # One step more or less than whole chunks, a whole block and one more: every way to fill the rest.
 @pytest.mark.parametrize("n", [8, 13, 64, 65, 100, 257])
-@pytest.mark.parametrize("name", ["radau2", "radau3", "gauss3", "thesis"])
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize(("model", "name"), CASES)
 def test_orbits_agree(model, name, n):
     compiled, general = both(model, name, n)
     assert general.status[0] == Status.CONVERGED.value
@@ -80,8 +90,7 @@ def test_long_systems_and_few_steps_are_left_to_the_general_iteration():
     assert boundary.arranged is None
 
 
-@pytest.mark.parametrize("name", ["radau2", "radau3", "gauss3", "thesis"])
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+@pytest.mark.parametrize(("model", "name"), CASES)
 def test_steps_with_old_derivatives_end_at_the_same_orbit(model, name):
     boundary, p = discretised(model, FORCE, 0.2, name, 100, backend="numba")
     settled = periodic.solve_periodic(boundary, p, rest(boundary, 100))
