@@ -35,6 +35,9 @@ Lanes = NDArray[np.int64]
 #: Newton iterations on the whole time at once, before it is walked through piece by piece.
 MAXIMUM_ITERATIONS = 12
 MAXIMUM_HALVINGS = 8
+#: The same on a piece. Its steps count as solved where one more of Newton's would move them by no
+#: more than this part of their size: it is taken, and leaves round-off.
+PIECE_ITERATIONS, SETTLED = 16, 1e-6
 
 
 def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
@@ -69,13 +72,19 @@ def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
 
 
 def newton(
-    problem: Boundary, p: Array, start: Array, max_iterations: int = MAXIMUM_ITERATIONS
+    problem: Boundary,
+    p: Array,
+    start: Array,
+    max_iterations: int = MAXIMUM_ITERATIONS,
+    *,
+    to_end: bool = False,
 ) -> Solution:
     """Newton's method on all steps at once, halved where a step leaves the admissible region.
 
-    Parameters are those of :func:`solve_transient`.
+    Parameters are those of :func:`solve_transient`; `to_end` asks that the state at the end of the
+    time rests as well, which is where a next piece begins.
     """
-    state = _State(problem, p, start.copy())
+    state = _State(problem, p, start.copy(), to_end)
     lanes = np.arange(start.shape[0])
     lanes = state.keep(lanes, state.trial.evaluate(lanes))
     last = np.full(start.shape[0], np.inf)
@@ -95,8 +104,8 @@ def newton(
 class _State:
     """State of one batched iteration."""
 
-    def __init__(self, problem: Boundary, p: Array, x: Array):
-        self.trial = Trial(problem, p, x)
+    def __init__(self, problem: Boundary, p: Array, x: Array, to_end: bool):
+        self.trial, self.to_end = Trial(problem, p, x), to_end
         self.status = np.full(x.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(x.shape[0], dtype=np.int64)
 
@@ -116,6 +125,13 @@ class _State:
         # Over the largest value: a piece of a transient may hardly move.
         states, moved = trial.problem.scheme.state_size, np.empty(self.status.size)
         measures.step_size(trial.x, dx, lanes, states, moved, size)
+        if self.to_end:
+            change = np.abs(end_state(trial.problem, dx[..., 0]))
+            largest = np.abs(trial.x[:, :, :states]).max(axis=1)
+            largest = np.maximum(largest, np.abs(end_state(trial.problem, trial.x)))
+            with np.errstate(invalid="ignore"):
+                part = np.where(change > 0.0, change / np.maximum(largest, change), 0.0)
+            size[lanes] = np.maximum(size, part.max(axis=1))[lanes]
         size[~ok] = np.inf
         return dx, size
 
@@ -140,31 +156,64 @@ class _State:
 
 
 def _walk(problem: Boundary, p: Array, x: Array) -> tuple[Array, int, int]:
-    """Solve one lane piece by piece; pieces that fail are halved, down to one step."""
+    """Solve one lane piece by piece.
+
+    What a step is depends on those before it alone: where a piece does not converge, its steps up
+    to the first that still moves do, and the next piece begins there. Where not one does, pieces
+    are made shorter, down to one step.
+    """
     n, first, size, iterations = x.shape[1], 0, max(x.shape[1] // 8, 1), 0
+    states = problem.scheme.state_size
     while first < n:
-        last = min(first + size, n)
-        piece = _piece(problem, first, last)
-        trial = x[:, first:last].copy()
-        found = newton(piece, p, trial, 40)
-        if found.status[0] != Status.CONVERGED.value:
-            found = newton(piece, p, _constant(trial, problem.scheme.state_size), 40)
-        iterations += int(found.iterations[0])
-        if found.status[0] != Status.CONVERGED.value:
+        piece = slice(first, min(first + size, n))
+        found, count, more = _solved(problem, p, piece, x[:, piece])
+        iterations += more
+        if count == 0:
+            found, count, more = _solved(problem, p, piece, _constant(x[:, piece], states))
+            iterations += more
+        if count == 0:
             if size == 1:
                 return x, int(found.status[0]), iterations
             size = max(size // 4, 1)
             continue
+        last = first + count
         x[:, first:last] = found.x
         if last < n:
-            x[:, last, : problem.scheme.state_size] = end_state(piece, found.x)
-        first, size = last, 2 * size
+            x[:, last, :states] = end_state(_piece(problem, first, last), found.x)
+        first, size = last, 2 * size if last == piece.stop else max(count, size // 4)
     return x, Status.CONVERGED.value, iterations
+
+
+def _solved(problem: Boundary, p: Array, piece: slice, start: Array) -> tuple[Solution, int, int]:
+    """Solution of a piece's first steps, up to one that Newton's method still moves.
+
+    With their number, none where they do not stand by themselves either, and all iterations.
+    """
+    part, lane = _piece(problem, piece.start, piece.stop), np.zeros(1, dtype=np.int64)
+    found = newton(part, p, start, PIECE_ITERATIONS, to_end=True)
+    if found.status[0] == Status.CONVERGED.value:
+        return found, found.x.shape[1], int(found.iterations[0])
+    trial = Trial(part, p, found.x.copy())
+    trial.evaluate(lane)
+    dx, _ = trial.newton_step(lane, initial=True)
+    states = problem.scheme.state_size
+    with np.errstate(all="ignore"):
+        size = np.maximum.accumulate(np.abs(found.x[0, :, :states]), axis=0)
+        moves = ~(np.abs(dx[0, :, :states, 0]) <= SETTLED * size).all(axis=1)
+    # A step is solved where the state that it leads to rests.
+    count = max(int(np.argmax(moves)) - 1, 0) if moves.any() else moves.size - 1
+    if count == 0:
+        return found, 0, int(found.iterations[0])
+    settled = np.ascontiguousarray(found.x[:, :count])
+    part = _piece(problem, piece.start, piece.start + count)
+    again = newton(part, p, settled, PIECE_ITERATIONS, to_end=True)
+    done = count if again.status[0] == Status.CONVERGED.value else 0
+    return again, done, int(found.iterations[0] + again.iterations[0])
 
 
 def _constant(x: Array, state_size: int) -> Array:
     """A start that stays where it begins: of no use but for being close in short pieces."""
-    still = np.zeros_like(x)
+    still = np.zeros(x.shape)
     still[:, :, :state_size] = x[:, :1, :state_size]
     return still
 

@@ -1,0 +1,50 @@
+"""A transient that Newton's method does not solve at once is walked through, and quickly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from periodic_problems import friction_oscillator
+
+from bayesoleo.model.kernels import kernels
+from bayesoleo.solvers.periodic.solve import Boundary
+from bayesoleo.solvers.schemes.collocation import Collocation
+from bayesoleo.solvers.schemes.mesh import equidistant
+from bayesoleo.solvers.schemes.tableau import tableau
+from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.transient.solve import newton, solve_transient
+
+STEPS, TIME = 1024, 40.0
+
+
+@pytest.fixture(scope="module")
+def problem():
+    model = friction_oscillator().with_values({"slope": 300.0, "amplitude": 1.0})
+    equations = kernels(model, backend="numpy")
+    derived = equations.derived
+    scheme = Collocation(tableau("radau3"), derived.orders, equidistant(STEPS))
+    time = TIME * scheme.phases(STEPS)
+    force = [1.5 * np.cos(1.7 * time + 0.5 * order * np.pi) * 1.7**order for order in range(3)]
+    inputs = np.array([force[order] for _, order in derived.inputs])
+    boundary = Boundary(equations, scheme, TIME, inputs, 0, len(derived.active))
+    nominal = {str(item): value for item, value in model.nominal().items()}
+    return boundary, np.array([[nominal[name] for name in derived.constants]])
+
+
+def test_a_bad_start_leads_to_the_same_motion(problem):
+    boundary, p = problem
+    width = boundary.scheme.width
+    rng = np.random.default_rng(2)
+    rest = np.zeros((1, STEPS, width))
+    wild = 30.0 * rng.standard_normal((1, STEPS, width))
+    wild[:, 0, : boundary.scheme.state_size] = 0.0
+    solved = solve_transient(boundary, p, rest)
+    assert solved.status[0] == Status.CONVERGED.value
+    again = newton(boundary, p, solved.x)
+    np.testing.assert_allclose(again.x, solved.x, atol=1e-10)
+    assert newton(boundary, p, wild).status[0] != Status.CONVERGED.value  # so that it is walked
+    walked = solve_transient(boundary, p, wild)
+    assert walked.status[0] == Status.CONVERGED.value
+    np.testing.assert_allclose(walked.x, solved.x, atol=1e-8 * np.abs(solved.x).max())
+    # What is solved of a piece is kept, and not solved again with the next, shorter one.
+    assert walked.iterations[0] < 8 * STEPS
