@@ -18,6 +18,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from functools import cached_property
+from math import prod
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -149,9 +150,10 @@ def _numbers_at(address: int, count: int) -> Array:
 
 def _flat(result: Array) -> Array:
     """All rows of a result in one dimension, as a view."""
-    rows = int(np.prod(result.shape[1:-1]))
+    rows = prod(result.shape[1:-1])
     flat = result.reshape(result.shape[0], rows, result.shape[-1])
-    if not np.shares_memory(flat, result) and flat.size:
+    contiguous = result.flags.c_contiguous
+    if not contiguous and not np.shares_memory(flat, result) and flat.size:
         raise ValueError("results must be contiguous")
     return flat
 

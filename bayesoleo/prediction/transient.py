@@ -85,7 +85,12 @@ class TransientRun(RunPredictor):
         self.initial = InitialState(model, kernels, record)
         self._input_names = derived.inputs
         self.space = StateSpace(
-            kernels, derived.orders, self._inputs, len(derived.active), len(derived.admissible)
+            kernels,
+            derived.orders,
+            self._inputs,
+            len(derived.active),
+            len(derived.admissible),
+            affine=derived.affine,
         )
         #: The mesh as chosen, before it is cut finer; none yet where nobody chose one.
         self.chosen: Mesh | None = None if like is None else like.chosen

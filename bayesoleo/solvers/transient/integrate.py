@@ -150,19 +150,33 @@ def _right_side(space: StateSpace, p: Array) -> Callable[[float, Array], Array]:
         for _ in range(30):
             space.equations.jacobian(z, u, constants, lanes, g, gz)
             try:
-                step = np.linalg.solve(gz[0, :, highest, 0].T, -g[0, :, 0])
+                step = _solve(gz[0, :, highest, 0].T, -g[0, :, 0])
             except np.linalg.LinAlgError:
                 break
             z[0, highest, 0] += step
-            size = np.abs(z[0, highest, 0]).max()
-            # Terms that cancel to a derivative of zero leave the round-off of their own size.
-            terms = np.abs(gz[0, :, :, 0] * z[0, :, 0]).sum(axis=1)
-            slope = np.abs(gz[0, :, highest, 0]).max(axis=0)
-            if not np.abs(step).max() > SMALL_STEP * (size + (terms / slope).max()):
+            if space.affine or _is_last(step, z[0, :, 0], gz[0, :, :, 0], highest):
                 return z[0, rows + 1, 0].copy()
         return np.full(s.size, np.nan)
 
     return f
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solution of a few equations; of one without what a library does before it divides."""
+    if right.size > 1:
+        return np.linalg.solve(matrix, right)
+    if matrix[0, 0] == 0.0:
+        raise np.linalg.LinAlgError
+    return right / matrix[0]
+
+
+def _is_last(step: Array, z: Array, gz: Array, highest: NDArray[np.int64]) -> bool:
+    """Whether a Newton step for the highest derivatives leaves round-off only."""
+    # Terms that cancel to a derivative of zero leave the round-off of their own size.
+    terms = np.abs(gz * z).sum(axis=1)
+    slope = np.abs(gz[:, highest]).max(axis=1)
+    size = np.abs(z[highest]).max() + (terms / slope).max()
+    return not np.abs(step).max() > SMALL_STEP * size
 
 
 def _inside(space: StateSpace, p: Array, t: Array, s: Array, otherwise: Status) -> Status:

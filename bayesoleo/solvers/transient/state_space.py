@@ -75,6 +75,9 @@ class StateSpace:
         Number of parameters with derivatives.
     conditions : int
         Number of conditions on the admissible region.
+    affine : bool
+        Whether the equations are known to be linear in the highest derivatives: one step of
+        Newton's method then solves them, and an integrator need not make sure.
     """
 
     equations: ImplicitEquations
@@ -82,6 +85,7 @@ class StateSpace:
     inputs: Inputs
     active: int
     conditions: int = 0
+    affine: bool = False
 
     @property
     def size(self) -> int:
