@@ -283,3 +283,19 @@ def test_slow_steps_that_gain_nothing_are_convergence(method):
     strict = estimate(problem, method, tolerance=1e-9, max_iterations=200)
     assert strict.status is Status.CONVERGED
     np.testing.assert_allclose(strict.theta, best, atol=1e-6)
+
+
+def test_a_step_is_not_shortened_below_what_is_to_be_resolved():
+    # Towards the jump the likelihood falls however short a step is, and its slope says it rises.
+    def jump(x, t):
+        return t[0] * x - (5.0 if t[0] > 1.0 else 0.0)
+
+    problem = FunctionProblem(
+        jump, TIME, 3.0 * TIME + 0.01 * np.sin(9 * TIME), [Normal(1.0, 5.0)],
+        jacobian=lambda x, t: x[:, None],
+    )  # fmt: skip
+    patient = estimate(problem, "be", start=[1.0])
+    resolved = estimate(problem, "be", start=[1.0], resolution=1e-3)
+    assert resolved.theta == pytest.approx(patient.theta)
+    assert not resolved.status.ok
+    assert resolved.evaluations < patient.evaluations / 2

@@ -183,7 +183,7 @@ class _Loop:
             part = self.part_of(proposal, pace, equations)
             small = self.is_small(max(part, 1.0) * proposal, equations, tolerance, resolution)
             before = self.point
-            trial, halvings, taken = self.shorten(part * proposal, equations, variance)
+            trial, halvings, taken = self.shorten(part * proposal, equations, variance, resolution)
             if halvings >= _MANY_HALVINGS:
                 gain = 0.5 * float(proposal @ equations.gradient)
                 small = small or gain <= _NEGLIGIBLE_GAIN
@@ -213,12 +213,13 @@ class _Loop:
         return pace.wanted
 
     def shorten(
-        self, proposal: Array, equations: Equations, variance: Array
+        self, proposal: Array, equations: Equations, variance: Array, resolution: float
     ) -> tuple[_Point, int, Array]:
         """First point along ever shorter steps that is not worse than the current one.
 
-        With the number of halvings and the step that led there. If there is none: the last point
-        that failed, or the current one.
+        With the number of halvings and the step that led there. If there is none, or none before
+        steps are shorter than what is to be resolved: the last point that failed, or the current
+        one.
         """
         merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
         trial = self.point
@@ -226,6 +227,8 @@ class _Loop:
             trial = self.look(self.scale.moved(self.point.theta, proposal))
             if trial.status.ok and self.merit(trial, variance) >= merit:
                 return trial, halvings, proposal
+            if np.linalg.norm(equations.jacobian @ proposal) < resolution:
+                break  # where a law has a jump no step helps, however short
             softer = self.step.refuse(self.state, proposal)
             if softer is None:
                 proposal = proposal / 2
