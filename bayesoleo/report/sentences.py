@@ -26,7 +26,7 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 
 def headline(summary: Mapping[str, Any]) -> str:
     """The verdict as a sentence."""
-    names = [_called(effect) for effect in summary["effects"]]
+    names = _told_apart(summary)
     found = " and ".join([part for part in (", ".join(names[:-1]), *names[-1:]) if part])
     lacked = "an effect" if len(summary["effects"]) == 1 else "effects"
     if summary["verdict"] == schema.NOTHING_MISSING:
@@ -37,6 +37,18 @@ def headline(summary: Mapping[str, Any]) -> str:
     if found:
         return f"The model lacked {lacked}: {found} added, but an error remains{rest}."
     return f"Something is missing{rest}."
+
+
+def _told_apart(summary: Mapping[str, Any]) -> list[str]:
+    """What was added, by name; one that was added at several places with each of them."""
+    effects, names = list(summary["effects"]), list[str]()
+    for k, effect in enumerate(effects):
+        rounds = [item for item in summary["rounds"] if item.get("accepted") == effect]
+        # Of one that was taken out again at one place it is not known here which.
+        several = len(rounds) == effects.count(effect) > 1
+        place = f" @ {rounds[effects[:k].count(effect)]['accepted_target']}" if several else ""
+        names.append(_called(effect) + place)
+    return names
 
 
 def _called(effect: str) -> str:
