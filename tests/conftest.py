@@ -1,12 +1,43 @@
-"""Fixtures of more than one folder; being here, it lets tests import helpers from ``tests``."""
+"""Fixtures of more than one folder, and which worker runs what; being here, it lets tests import
+helpers from ``tests``."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+#: Folders whose tests hardly need the compiled solvers. They come first: with an empty cache one
+#: worker compiles meanwhile what the others would compile as well, were they to need it at once.
+UNCOMPILED = ("data", "docs", "effects", "model", "plots", "posterior", "storage")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of a group first, which compile the most, then what needs nothing compiled."""
+    root = Path(__file__).parent
+
+    def turn(item: pytest.Item) -> int:
+        if item.get_closest_marker("xdist_group"):
+            return 0
+        return 1 if item.path.relative_to(root).parts[0] in UNCOMPILED else 2
+
+    items.sort(key=turn)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """A module's tests go to one worker, or its fixtures would be set up by each."""
+    from xdist.scheduler import LoadGroupScheduling
+
+    class ByModule(LoadGroupScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return super()._split_scope(nodeid).split("::")[0]
+
+    config.option.loadscopereorder = False  # as sorted above, not the most numerous first
+    return ByModule(config, log)
 
 
 @pytest.fixture(scope="session")

@@ -135,11 +135,16 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
     for channel, step in coarse_steps(record).items():
         stays = repeating_rounding(step, record.signal_noise[channel])
         unit = _unit(units, channel)
+        what = (
+            f"where samples fall on the same phases in every period an error of "
+            f"{stays:.2g}{unit} of rounding repeats itself"
+            if record.periodic
+            else "rounding counts as noise, which is none where the channel rests"
+        )
         found.append(
             f"{where}{channel} goes in steps of {step:.3g}{unit}, "
             f"{step / max(record.signal_noise[channel], 1e-300):.2g} times the noise of a sample; "
-            f"where samples fall on the same phases in every period an error of "
-            f"{stays:.2g}{unit} of rounding repeats itself"
+            f"{what}"
         )
     return found
 

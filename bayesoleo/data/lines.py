@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 FALSE_ALARM = 1e-3
 #: Least amplitude, in standard deviations of a single sample, that is worth a word.
 LEAST_AMPLITUDE = 0.2
+#: And in ranges of the channel: what no converter resolves is rounding of a signal without noise.
+LEAST_SHARE = 2.0**-24
 #: Lines on either side from whose median the level of the noise is taken, and periods over the
 #: record below which a line may be drift.
 _BESIDE, _FEWEST = 50, 3
@@ -110,4 +112,5 @@ def foreign_lines(record: Record) -> tuple[Line, ...]:
         if line is not None
         and line.p_value * len(record.samples) < FALSE_ALARM
         and line.amplitude > LEAST_AMPLITUDE * line.noise
+        and line.amplitude > LEAST_SHARE * np.ptp(record.samples[line.channel])
     )

@@ -30,6 +30,10 @@ _VALUES, _ON, _MOST_OFF = 6, 0.02, 0.01
 #: in all as have any other within a tenth of the range of it: of a sinusoid that is rounded, at
 #: most 2.4 times as many samples have the extreme value as the next.
 _IN_A_ROW, _TIMES = 4, 5.0
+#: A signal that jumps to its extreme value by more than this part of its range, and by so many
+#: times what it changed by just before, is switched there and not cut off: steps, random binary
+#: signals.
+_JUMP, _SWITCHED = 0.1, 3.0
 #: Phases at which the rate of a signal is looked at.
 _PHASES = 512
 
@@ -169,6 +173,22 @@ def _cut_off(values: Array) -> float:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(np.int8), [0]])))
     if (edges[1::2] - edges[::2]).max() < _IN_A_ROW:
         return 0.0
+    if _is_switched(values, edges[::2], edges[1::2]):
+        return 0.0
     near = values[(values > highest - 0.1 * span) & ~at]
     counts = np.unique(near, return_counts=True)[1] if near.size else np.array([1])
     return float(at.mean()) if at.sum() > _TIMES * counts.max() else 0.0
+
+
+def _is_switched(values: Array, first: NDArray[np.intp], end: NDArray[np.intp]) -> bool:
+    """Whether a signal jumps to its highest value, which it has from `first` to before `end`."""
+    if np.unique(values).size < _VALUES:
+        return True
+    first, end = first[first > 1], end[end < values.size - 1]
+    step = np.abs(np.diff(values))
+    jump = np.concatenate([step[first - 1], step[end - 1]])
+    beside = np.concatenate([step[first - 2], step[end]])
+    if not jump.size:
+        return False
+    least = max(_JUMP * float(np.ptp(values)), _SWITCHED * float(np.median(beside)))
+    return float(np.median(jump)) > least

@@ -54,7 +54,11 @@ _EXPECTED = {
 _COMMON = (
     *("mm", "N", "kN", "Pa", "kPa", "MPa", "bar", "mbar", "psi", "rad", "deg", "rpm"),
     *("Hz", "kHz", "V", "mV", "A", "mA", "W", "kW", "kg", "K", "degC"),
+    *("psia", "psig", "bara", "barg"),
 )
+
+#: Absolute and gauge pressure as rigs write them besides: bar(a), psi (g), bar abs.
+_PRESSURE = re.compile(r"(bar|psi)\s*(?:\(\s*([ag])\s*\)|\s(a)bs|\s(g)auge)\.?", re.IGNORECASE)
 
 _lock = threading.Lock()
 
@@ -93,6 +97,7 @@ def _registry() -> Any:
     for pressure in ("psi", "bar"):
         registry.define(f"{pressure}a = {pressure}")
         registry.define(f"{pressure}g = {pressure}")
+    registry.define("rev = revolution")
     return registry
 
 
@@ -118,15 +123,11 @@ def parse_unit(name: str) -> Unit:
     with _lock:  # pint fills its caches on reading; threads must not do so together
         try:
             registry = _registry()
-            unit = registry.Unit("dimensionless" if name.strip() in ("", "1", "-") else name)
+            unit = registry.Unit(_as_pint_writes(name))
             zero = registry.Quantity(0.0, unit).to_base_units()
             one = registry.Quantity(1.0, unit).to_base_units()
         except Exception as error:  # pint raises half a dozen unrelated types on bad input
-            raise CampaignError(
-                "unknown unit",
-                value=name,
-                hint=_suggestion(name) + "one that pint reads, such as mm, kN, N*m, m/s**2, psig",
-            ) from error
+            raise _unknown(name) from error
     base = str(one.units)
     shift = float(zero.magnitude)
     # kN is 1000 N exactly; pint's base units go through grams and may miss it by one rounding.
@@ -137,14 +138,36 @@ def parse_unit(name: str) -> Unit:
     return Unit(name, si_name, factor, shift)
 
 
+def _as_pint_writes(name: str) -> str:
+    if name.strip() in ("", "1", "-"):
+        return "dimensionless"
+    pressure = _PRESSURE.fullmatch(name.strip())
+    if pressure:  # pint would take bar(a) for a bar times a year
+        return "".join(part for part in pressure.groups() if part).lower()
+    return name
+
+
+def _unknown(name: str) -> CampaignError:
+    """The error for what pint does not read as a unit, with what to write instead."""
+    try:
+        quantity = _registry().Quantity(name)
+        factor, unit = float(quantity.magnitude), f"{quantity.units:~C}" or "1"
+    except Exception:  # as above
+        hint = _suggestion(name) + "one that pint reads, such as mm, kN, N*m, m/s**2, psig"
+        return CampaignError("unknown unit", value=name, hint=hint)
+    hint = f"write scale = {factor:g} and unit = {unit!r}"
+    return CampaignError("a unit has no factor", value=name, hint=hint)
+
+
 def _suggestion(wrong: str) -> str:
     """What an unknown unit was meant to be: another case, powers without ``**``, products without
     ``*``."""
     case = next((unit for unit in _COMMON if unit.lower() == wrong.lower()), wrong)
+    wrong = re.sub(r"^ms(?=\^?-\d)", "m*s", wrong)  # no test rig counts per millisecond squared
     powers = re.sub(r"(?<=[A-Za-z])\^?(-?\d)", r"**\1", wrong)
     words = re.split(r"([A-Za-zµ]+)", powers)
     split = "".join(_split_product(word) for word in words)
-    for trial in (case, powers, split):
+    for trial in (case, powers, split, wrong.lower()):
         if trial != wrong and _is_known(trial):
             return f"did you mean {trial}? or write "
     return "write "

@@ -10,7 +10,8 @@ import pytest
 from small_campaigns import damper_campaign, spring_damper_force
 
 from bayesoleo.data import findings, foreign_line, repeating_rounding, step_of
-from bayesoleo.data.resolution import rounding_that_repeats
+from bayesoleo.data.lines import foreign_lines
+from bayesoleo.data.resolution import clipped, rounding_that_repeats
 
 FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
 
@@ -96,3 +97,28 @@ def test_findings_name_what_is_wrong_with_a_channel(tmp_path):
     hum = replace(record, samples={**record.samples, "force": force + np.sin(2 * np.pi * 17.3 * t)})
     (text,) = findings([hum], units)
     assert re.search(r"force has a line at 17\.3\d* Hz with the amplitude \S+ N, ", text)
+
+
+@pytest.mark.parametrize("held", [1, 5, 40])
+def test_a_signal_that_is_switched_is_not_cut_off(tmp_path, held):
+    record = damper_campaign(tmp_path, spring_damper_force).records[0]
+    rng = np.random.default_rng(4)
+    for levels in ([-1.0, 1.0], [0.0, 1.0, 2.0, 3.0]):
+        values = np.repeat(rng.choice(levels, record.time.size), held)[: record.time.size]
+        if held == 1:  # the random binary signal of a converter: four in a row do occur
+            assert np.any(np.convolve(np.abs(np.diff(values)), np.ones(3), "valid") == 0.0)
+        assert clipped(replace(record, samples={"force": values})) == ()
+    # A rounded signal that creeps up to where it is cut off does not jump there.
+    slow = np.round(50 * np.sin(np.linspace(0.0, 12.0, record.time.size)))
+    (found,) = clipped(replace(record, samples={"force": np.minimum(slow, 40.0)}))
+    assert found.end == "highest"
+
+
+def test_rounding_of_a_signal_without_noise_has_no_line(tmp_path):
+    record = damper_campaign(tmp_path, spring_damper_force, periods=16).records[0]
+    clean = 30.0 * np.sin(2 * np.pi * record.frequency * record.time)
+    line = 1e-11 * np.sin(2 * np.pi * 17.3 * record.time)
+    noise = {**record.signal_noise, "force": 1e-12}
+    assert foreign_lines(replace(record, samples={"force": clean + line}, signal_noise=noise)) == ()
+    loud = replace(record, samples={"force": clean + 1e6 * line}, signal_noise=noise)
+    assert len(foreign_lines(loud)) == 1

@@ -50,6 +50,10 @@ UNITS = [
         ("Hz", 3.0, 3.0, "Hz"),
         ("1", 3.0, 3.0, "1"),
         ("W/K", 1.0, 1.0, "kg*m**2/K/s**3"),
+        ("rev/min", 60.0, 2 * np.pi, "rad/s"),
+        ("bar(a)", 2.0, 2e5, "Pa"),
+        ("psi (g)", 100.0, 689475.729, "Pa"),
+        ("bar abs", 2.0, 2e5, "Pa"),
     ],
 )
 def test_to_si(name, value, si, si_name):
@@ -81,12 +85,26 @@ def test_unknown_unit():
         ("KN", "kN"),
         ("MPA", "MPa"),
         ("Bar", "bar"),
+        ("barA", "bara"),
+        ("Kelvin", "kelvin"),
+        ("ms-2", "m*s**-2"),
+        ("m s-2", "m s**-2"),
     ],
 )
 def test_an_unknown_unit_gets_a_suggestion_that_is_known(wrong, meant):
     with pytest.raises(CampaignError, match=re.escape(f"did you mean {meant}?")):
         parse_unit(wrong)
     assert parse_unit(meant).factor > 0
+
+
+@pytest.mark.parametrize(
+    ("written", "factor", "unit"),
+    [("1e-6", "1e-06", "1"), ("10 mm", "10", "mm"), ("0.1 bar", "0.1", "bar")],
+)
+def test_a_factor_in_a_unit_belongs_in_scale(written, factor, unit):
+    hint = re.escape(f"write scale = {factor} and unit = '{unit}'")
+    with pytest.raises(CampaignError, match=rf"a unit has no factor.*{hint}"):
+        parse_unit(written)
 
 
 def test_kind():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -32,9 +33,13 @@ def test_every_group_of_a_result_is_described(name: str) -> None:
 def test_every_key_of_the_summary_is_described() -> None:
     text = page("results.md")
     whole = schema.summary_schema()
-    keys = [*whole["required"], *whole["$defs"]["round"]["required"]]
-    keys += whole["$defs"]["candidate"]["required"] + whole["$defs"]["run_error"]["required"]
-    assert [key for key in keys if key not in text] == []
+    parts = ("round", "candidate", "run_error", "proposal", "trial")
+    tables = [whole, *(whole["$defs"][part] for part in parts)]
+    keys = {key for table in tables for key in table["properties"]}
+    # In words of code within the text, alone or in braces that stand for an object.
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    described = set(re.findall(r"\w+", " ".join(re.findall(r"`([^`]+)`", prose))))
+    assert keys - described == set()
     assert [verdict for verdict in schema.VERDICTS if f"`{verdict}`" not in text] == []
 
 

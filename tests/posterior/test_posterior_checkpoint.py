@@ -47,12 +47,12 @@ def killed_run_is_the_same(folder: Path, kills: int, seed: int) -> None:
     same(run(Gaussian(np.ones(2)), folder), run(Gaussian(np.ones(2)), None))
 
 
-def test_a_run_killed_three_times_ends_with_the_same_draws(tmp_path):
-    killed_run_is_the_same(tmp_path, 3, seed=0)
+def test_a_killed_run_ends_with_the_same_draws(tmp_path):
+    killed_run_is_the_same(tmp_path, 1, seed=0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_run_killed_five_times_ends_with_the_same_draws(tmp_path, seed):
     killed_run_is_the_same(tmp_path, 5, seed)
 

@@ -104,7 +104,10 @@ def test_moves_leave_a_skewed_density_as_it_is(kind, scale):
         assert stats.kstest(column / scale, "gumbel_r").pvalue > 1e-3 / 27
 
 
-@pytest.mark.parametrize("dimension", [2, 4, 9])
+@pytest.mark.parametrize(
+    "dimension",
+    [2, pytest.param(4, marks=pytest.mark.slow), pytest.param(9, marks=pytest.mark.slow)],
+)
 def test_the_snooker_of_emcee_has_another_target(dimension):
     groups = 360 // dimension  # the bias is smallest in two dimensions, 0.11
     move = make("emcee's snooker", dimension, 1.0, groups)

@@ -71,9 +71,9 @@ def dense(model, eta, output):
 def test_runs_given_those_before_are_conditional_normals(even):
     model = error_model(WORD, Runs(even))
     assert model._kernel is (_diagonal if even else _dense)
-    eta, residuals = drawn(model, 4)
+    eta, residuals = drawn(model, 2)
     found, ends = model.of_runs(residuals, eta), np.cumsum(model.frame.counts[:, 0])
-    for lane in range(4):
+    for lane in range(2):
         up_to = np.zeros(len(ends))
         for b, output in enumerate(model.frame.outputs):
             matrix = dense(model, eta[lane], output)

@@ -58,7 +58,10 @@ def records():
 
 
 @pytest.mark.parametrize("scheme", ["radau3", "thesis"])
-@pytest.mark.parametrize("steps", [256, pytest.param(400, marks=pytest.mark.slow), 800])
+@pytest.mark.parametrize(
+    "steps",
+    [256, pytest.param(400, marks=pytest.mark.slow), pytest.param(800, marks=pytest.mark.slow)],
+)
 def test_all_runs_converge_to_one_motion_from_both_guesses(records, scheme, steps):
     model = thermomechanical_oleo(1)
     compiled = kernels(model)

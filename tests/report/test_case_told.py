@@ -7,7 +7,6 @@ import json
 import pytest
 
 from bayesoleo import schema
-from bayesoleo.report import render_report
 from bayesoleo.report.case import case
 from bayesoleo.report.tables import failed, output_units
 
@@ -87,8 +86,3 @@ def test_nothing_wrong_is_said_so(answers, two_runs):
     assert found["Was anything wrong?"].startswith("No: no error that repeats is above 1.15")
     assert "What is it?" not in found
     assert "Does it hold on data not used?" not in found
-
-
-def test_page_begins_with_the_case(oleo):
-    page = render_report(oleo)
-    assert page.index("Was anything wrong?") < page.index("Data and noise floor")

@@ -10,8 +10,8 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.errors import ResultsError
-from bayesoleo.report import render_report, write_report
-from bayesoleo.report.images import encode_formula
+from bayesoleo.report import render_report, sections, write_report
+from bayesoleo.report.images import Image, encode_formula
 from bayesoleo.report.sentences import headline, reason
 from bayesoleo.report.tables import (
     diagnostics,
@@ -23,9 +23,16 @@ from bayesoleo.report.tables import (
 from bayesoleo.storage import read_tree, write_tree
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def page(oleo):
     return render_report(oleo)
+
+
+@pytest.fixture
+def unpainted(monkeypatch):
+    """Figures are made, but not painted: that takes most of a page's time and is none of its
+    text."""
+    monkeypatch.setattr(sections, "encode_figure", lambda figure: Image("data:,", 1.0, 1.0))
 
 
 def without(tree, *names):
@@ -53,6 +60,10 @@ def test_the_page_makes_its_case(page):
         assert text in page, text
 
 
+def test_the_page_begins_with_the_case(page):
+    assert page.index("Was anything wrong?") < page.index("Data and noise floor")
+
+
 def test_the_page_needs_no_other_file_and_is_not_too_large(page):
     assert len(page) < 6_000_000
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
@@ -70,6 +81,7 @@ def test_no_value_is_left_out_by_accident(page):
     assert not re.search(r"\b(nan|None|inf|undefined)\b", visible)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_what_a_user_wrote_is_text(synthetic):
     evil = "<script>alert(1)</script>"
     tree = synthetic.oleo_tree(label=f"{evil}&\"'", description=f"rig {evil}\nsecond line")
@@ -94,6 +106,7 @@ def test_absent_groups_are_left_out(oleo, names):
     assert ("The posterior was not sampled" in page) == ("posterior" in names)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_two_runs_nothing_added(two_runs):
     page = render_report(two_runs)
     assert "Nothing is missing: the model explains" in page
@@ -108,6 +121,7 @@ def test_the_page_of_a_stored_result_is_the_same(two_runs, tmp_path):
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == render_report(two_runs)
 
 
+@pytest.mark.usefixtures("unpainted")
 @pytest.mark.parametrize(
     ("effects", "text"),
     [

@@ -297,7 +297,6 @@ def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
 
 
 def _key(item: Ranked) -> str:
-
     return f"{item.effect} at {item.score.option.candidate.target}"
 
 

@@ -16,7 +16,7 @@ from functools import cache, partial
 import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import stats
 
 from bayesoleo.effects import Scales
 from bayesoleo.effects.unnamed import Axis, Spline, balance_places, tensor
@@ -28,6 +28,7 @@ from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import coefficients
 from bayesoleo.tracing.scoring.score import Score
+from bayesoleo.tracing.unnamed.directions import Known, known_beside
 from bayesoleo.tracing.unnamed.forcing import Forced
 from bayesoleo.tracing.unnamed.quantities import Motions, quantities_of
 
@@ -36,11 +37,6 @@ Array = NDArray[np.float64]
 #: Pieces of the range of one quantity, and of each of two; each number divides the last, so that
 #: the splines of all are sums of the finest.
 PIECES, PIECES_OF_TWO = (2, 4, 8, 16, 32, 64), (2, 4)
-#: A direction of which the present parameters can do all but this part is theirs.
-OWN = 0.03
-#: A spline that moves the outputs by less than this part of what the strongest does is not visible;
-#: combinations of visible ones that move them by less, squared, are no directions of their own.
-VISIBLE, DISTINCT = 0.03, 1e-4
 #: Probability with which noise alone may ask for finer pieces.
 FINER = 0.01
 #: How many of the best single quantities are paired with every other.
@@ -193,6 +189,11 @@ def search(
         Threads.
     also : mapping of str to Axis, optional
         By name: ranges of quantities to be covered besides those of the present model's motion.
+
+    Returns
+    -------
+    Search
+        Empty where no quantity moves, or no balance can be solved with a term added.
     """
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
     axes = motions.axes(also or {})
@@ -251,7 +252,7 @@ def _tried(
     cross, own, score = (sum(parts) for parts in zip(*products, strict=True))
     for count in pieces:
         coarse = _coarser(len(axes), count, finest)
-        found = _reduced(base, coarse.T @ own @ coarse, cross @ coarse, coarse.T @ score)
+        found = known_beside(base, coarse.T @ own @ coarse, cross @ coarse, coarse.T @ score)
         if found is not None:
             yield _judged(base, target, axes, count, columns, coarse, found)
 
@@ -274,65 +275,6 @@ def _coarser(quantities: int, pieces: int, finest: int) -> Array:
     return found
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """What of a function the data know beside the present parameters."""
-
-    weights: Array
-    expected: Array
-    coefficients: Array
-    fall: float
-
-
-def _reduced(base: Base, own: Array, cross: Array, score: Array) -> _Reduced | None:
-    """Take out what is not visible, and what the present parameters can do.
-
-    In coordinates in which ``C' W C`` is one, the eigenvalues of ``C_perp' W C_perp`` are the parts
-    of each direction that the present parameters cannot do.
-    """
-    project = coefficients(base.gram, cross)
-    information = own - cross.T @ project
-    rest = score - project.T @ base.gradient
-    size = np.sqrt(np.clip(np.diag(own), 0.0, None))
-    seen = size > VISIBLE * size.max(initial=0.0)
-    if not seen.any() or not np.isfinite(information).all():
-        return None
-    scaled = own[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
-    values, vectors = np.linalg.eigh(scaled)
-    clear = values > DISTINCT * values.max()
-    unit = (vectors[:, clear] / np.sqrt(values[clear])) / size[seen][:, None]
-    inner = unit.T @ information[np.ix_(seen, seen)] @ unit
-    parts, turned = np.linalg.eigh(0.5 * (inner + inner.T))
-    free = parts > OWN
-    if not free.any():
-        return None
-    directions = unit @ turned[:, free]
-    pull = directions.T @ rest[seen]
-    own_seen = own[np.ix_(seen, seen)]
-    found = directions @ (pull / parts[free])
-    weights, chosen = _weights(directions, own_seen)
-    full = np.zeros((own.shape[0], weights.shape[1]))
-    full[seen] = weights
-    all_coefficients = np.zeros(own.shape[0])
-    all_coefficients[seen] = found
-    return _Reduced(full, found[chosen], all_coefficients, float(pull @ (pull / parts[free])))
-
-
-def _weights(directions: Array, own: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Coefficients from as many of themselves as there are directions, and which these are.
-
-    All combinations of ``directions (K, r)``: the splines that the others depend on are chosen by
-    pivoting, so that none of the weights is large.
-    """
-    size = np.sqrt(np.diag(own))
-    _, _, order = linalg.qr((directions * size[:, None]).T, mode="economic", pivoting=True)
-    chosen = np.sort(order[: directions.shape[1]])
-    weights = directions @ np.linalg.inv(directions[chosen])
-    weights[chosen] = np.eye(chosen.size)
-    weights[np.abs(weights) < 1e-12] = 0.0
-    return weights, chosen
-
-
 def _judged(
     base: Base,
     target: str,
@@ -340,7 +282,7 @@ def _judged(
     pieces: int,
     columns: Sequence[Array],
     coarse: Array,
-    found: _Reduced,
+    found: Known,
 ) -> Tried:
     """How likely noise alone would explain as much."""
     fine = coarse @ found.coefficients
@@ -377,6 +319,11 @@ def closest(
         Of the named ones, against the same base.
     most : int
         How many at most.
+
+    Returns
+    -------
+    tuple of (str, float)
+        ``effect @ target`` and the cosine, the most alike first.
     """
     found = []
     for score in scores:
