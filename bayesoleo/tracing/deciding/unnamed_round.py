@@ -42,6 +42,8 @@ DECISIVE = 10.0
 #: Part of the excess that a name explained by itself, from which on it is not taken for the nearest
 #: to something else: a function of the same quantities repeats what it says, and adds freedom.
 OWN_RIGHT = 0.9
+#: Finer pieces are tried as long as they make up this part of what a function is worse by.
+CLOSER = 0.25
 #: Functions estimated before one is chosen.
 MOST_TRIED = 3
 
@@ -165,11 +167,11 @@ class _Chance:
         chosen = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
         found: list[_Answer] = []
         for item in chosen:
-            for one in self.search.coarser(item) if self.instead else (item,):
+            for one in self.search.finenesses(item) if self.instead else (item,):
                 answer = self._estimated(one, merit, numerics)
-                if found and answer.merit <= found[0].merit and found[0].merit > 0:
+                if found and answer.merit - found[0].merit <= CLOSER * max(-found[0].merit, 0.0):
                     break
-                found = sorted([answer, *found], key=lambda each: -each.merit)[:1]
+                found = [answer]
         return found
 
     def _estimated(self, item: Tried, merit: Merit, numerics: Numerics) -> _Answer:

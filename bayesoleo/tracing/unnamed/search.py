@@ -145,9 +145,10 @@ class Search:
             groups.setdefault(item.key, []).append(item)
         return tuple(_refined(group) for group in list(groups.values())[:most])
 
-    def coarser(self, item: Tried) -> tuple[Tried, ...]:
-        """A function and the same of fewer pieces, the coarsest first."""
-        group = [one for one in self.tried if one.key == item.key and one.pieces <= item.pieces]
+    def finenesses(self, item: Tried) -> tuple[Tried, ...]:
+        """A function of the same quantities in the same balance with any number of pieces, the
+        coarsest first."""
+        group = [one for one in self.tried if one.key == item.key]
         return tuple(sorted(group, key=lambda one: one.pieces))
 
 
