@@ -10,17 +10,25 @@ from typing import Any
 
 import pytest
 
-#: Folders whose tests hardly need the compiled solvers. They come first: with an empty cache one
-#: worker compiles meanwhile what the others would compile as well, were they to need it at once.
+#: Modules that take turns over the compiled solvers, the integrator of shooting and the collocation
+#: of periodic motions. One worker runs them all, and first: a minute of compilation is done once,
+#: where workers that begin with an empty cache would each do it at the same time.
+COMPILING = (
+    "test_solver_benchmark.py",
+    "test_orbits.py",
+    "test_initial_value.py",
+    "test_shooting_orbits.py",
+)
+#: Folders whose tests hardly need these; they are what the others run meanwhile.
 UNCOMPILED = ("data", "docs", "effects", "model", "plots", "posterior", "storage")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of a group first, which compile the most, then what needs nothing compiled."""
+    """What compiles the most first, then what needs nothing compiled."""
     root = Path(__file__).parent
 
     def turn(item: pytest.Item) -> int:
-        if item.get_closest_marker("xdist_group"):
+        if item.path.name in COMPILING:
             return 0
         return 1 if item.path.relative_to(root).parts[0] in UNCOMPILED else 2
 
@@ -29,12 +37,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """A module's tests go to one worker, or its fixtures would be set up by each."""
-    from xdist.scheduler import LoadGroupScheduling
+    """A module's quick tests go to one worker, or its fixtures would be set up by each.
 
-    class ByModule(LoadGroupScheduling):
+    Long tests are few and unlike in length: of them a worker takes over what another one has left.
+    The mark ``xdist_group`` would say as much, but pytest-xdist 3.8 writes it where pytest 9.2 does
+    not read it.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    if "not slow" not in config.option.markexpr:
+        return None  # as the option --dist says
+
+    class ByModule(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return super()._split_scope(nodeid).split("::")[0]
+            module = super()._split_scope(nodeid)
+            return "compiling" if module.rpartition("/")[2] in COMPILING else module
 
     config.option.loadscopereorder = False  # as sorted above, not the most numerous first
     return ByModule(config, log)

@@ -13,7 +13,7 @@ import pytest
 
 from bayesoleo import workflow
 from bayesoleo.cli import shell
-from bayesoleo.errors import DataWarning, InputError
+from bayesoleo.errors import DataWarning, InputError, ModelError
 
 
 def test_error_in_a_process_of_its_own(process):
@@ -23,11 +23,13 @@ def test_error_in_a_process_of_its_own(process):
     assert done.stderr.count("\n") == 1
 
 
-def test_debug_shows_the_traceback(process):
-    done = process("systems", "nothing", env={**os.environ, "BAYESOLEO_DEBUG": "1"})
-    assert done.returncode != 0
-    assert "Traceback" in done.stderr
-    assert "ModelError: unknown system (got 'nothing')" in done.stderr
+def test_debug_lets_the_error_out_with_its_traceback(run, monkeypatch):
+    assert isinstance(run("systems", "nothing").exception, SystemExit)
+    monkeypatch.setenv("BAYESOLEO_DEBUG", "1")
+    error = run("systems", "nothing").exception
+    assert isinstance(error, ModelError)
+    assert str(error).startswith("unknown system (got 'nothing')")
+    assert error.__traceback__ is not None
 
 
 def test_unexpected_exceptions_are_not_hidden(run, monkeypatch, campaign):

@@ -43,15 +43,15 @@ def test_figures_of_a_tree(oleo, draw):
     assert len(texts(draw(oleo))) > 10
 
 
-@pytest.mark.parametrize("output", ["force", "pressure"])
 @pytest.mark.parametrize(
-    "draw",
+    ("draw", "output"),
     [
-        plots.fit,
-        plots.predictive,
-        plots.residual,
-        lambda tree, output: plots.residual(tree, output, "velocity"),
-        lambda tree, output: plots.residual(tree, output, "stroke"),
+        (plots.fit, "force"),
+        (plots.fit, "pressure"),
+        (plots.predictive, "pressure"),
+        (plots.residual, "force"),
+        (lambda tree, output: plots.residual(tree, output, "velocity"), "pressure"),
+        (lambda tree, output: plots.residual(tree, output, "stroke"), "force"),
     ],
 )
 def test_figures_of_an_output_have_a_panel_for_each_run(oleo, draw, output):

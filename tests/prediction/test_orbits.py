@@ -15,9 +15,6 @@ from bayesoleo.solvers.shooting.library import shoot_by_library
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
 
-#: Compiling the integrator takes longer than all of its tests: one worker does.
-pytestmark = pytest.mark.xdist_group("integrator")
-
 DUFFING = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.1, [3.0, 0.0, 0.5])})
 PHASES = np.linspace(0.0, 1.0, 41)

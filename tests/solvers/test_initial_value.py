@@ -15,9 +15,6 @@ from bayesoleo.solvers.shooting.signals import evaluate, periodic_signal, piecew
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 
-#: Compiling the integrator takes longer than all of its tests: one worker does.
-pytestmark = pytest.mark.xdist_group("integrator")
-
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 FREQUENCY = 0.2
 

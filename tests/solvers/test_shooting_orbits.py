@@ -11,9 +11,6 @@ from bayesoleo.solvers.shooting.shoot import solve_shooting
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems import system
 
-#: Compiling the integrator takes longer than all of its tests: one worker does.
-pytestmark = pytest.mark.xdist_group("integrator")
-
 END_STOP = harmonics(h0=23.0, h1=20.0)
 #: Verbeek (1993), section 4.3.3: q(0), q'(0) and min q from 60 periods of LSODA at rtol 1e-9.
 TABLE = {

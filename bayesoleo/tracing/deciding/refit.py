@@ -32,7 +32,8 @@ PRIOR_WIDTH = 10.0
 #: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
 SHAPE_SPREAD = 1.0
 #: Two effects explain the data equally well if the data are less than twenty times as likely by the
-#: one as by the other; where more than noise is left, if that differs by less than this factor.
+#: one as by the other; where one leaves more than noise, also if what they leave differs by less
+#: than this factor and they do nearly the same.
 AS_LIKELY, AS_WELL = 2.0 * float(np.log(20.0)), 1.25
 
 
@@ -82,10 +83,10 @@ class Refit:
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot tell two estimated effects apart.
 
-        Where both come down to the noise, the noise says how sure a difference is: effects may do
-        different things and be as likely, if they are small (Burnham and Anderson 2002, section
-        2.6), and nearly the same and not, if they are large. Where more is left a likelihood
-        promises too much, and effects that do nearly the same are not told apart.
+        The noise says how sure a difference is: effects may do different things and be as likely,
+        if they are small (Burnham and Anderson 2002, section 2.6), and nearly the same and not, if
+        they are large. Where one of them leaves more than noise a likelihood promises too much, and
+        effects that do nearly the same are not told apart either.
         """
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
             return False

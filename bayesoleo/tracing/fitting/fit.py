@@ -150,7 +150,7 @@ def fit_model(
     model : Model
         Driven.
     records : sequence of Record
-        Periodic runs.
+        Runs, periodic or transient.
     numerics : Numerics
         Scheme, steps, threads.
     start : ndarray, shape (l,), optional
