@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
@@ -67,6 +67,10 @@ class Axis:
         low, high = float(values.min()), float(values.max())
         more = MARGIN * (high - low)
         return cls(name, expression, unit, low - more, high + more)
+
+    def together(self, other: Axis) -> Axis:
+        """With a range that covers another's of the same quantity too."""
+        return replace(self, low=min(self.low, other.low), high=max(self.high, other.high))
 
     @property
     def word(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from fitted_states import NUMERICS
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.effects import find_effect
-from bayesoleo.tracing.deciding.confirmation import fall_on_hold_out, judged
+from bayesoleo.tracing.deciding.confirmation import confirmed, fall_on_hold_out, judged
 from bayesoleo.tracing.deciding.loop import close_loop
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.errors.holdout import crossed
@@ -97,3 +98,17 @@ def test_a_stop_that_runs_held_out_do_not_reach(tmp_path, stiffness, found):
     assert loop.effects == found
     if found:
         assert "the second half of fitted ones" in loop.rounds[0].reason
+
+
+@pytest.mark.parametrize(
+    ("share", "reached", "enough"),
+    [(0.04, True, False), (0.06, True, True), (0.10, False, False), (0.13, False, True)],
+)
+def test_what_leaves_more_than_noise_must_explain_more(share, reached, enough):
+    """A share that is enough is asked for its posterior next, which here excludes nothing."""
+    item = SimpleNamespace(effect="play", gain=share)
+    result = SimpleNamespace(share=share, reached=reached, excludes_null=lambda: False)
+    after, reason = confirmed(None, item, result, None, NUMERICS, print)
+    assert after is None
+    assert ("does not exclude its null" in reason) is enough
+    assert (f"would explain only {100 * share:.0f} %" in reason) is not enough

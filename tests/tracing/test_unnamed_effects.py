@@ -125,6 +125,45 @@ def test_a_named_effect_keeps_its_name(tmp_path):
     assert loop.effects == ("coulomb_friction",)
 
 
+def softened(x, v, t):
+    """A spring that meets a second one gradually: no effect of the catalogue's."""
+    return 2.0e4 * x + 200.0 * v + 20.0 * np.logaddexp(0.0, (x - 0.004) / 0.0012)
+
+
+SEVERAL = ("end_stop_upper", "quadratic_stiffness", "cubic_stiffness", "coulomb_friction")
+
+
+@pytest.mark.parametrize(
+    ("law", "names"),
+    [
+        (softened, ("unnamed_displacement",)),
+        (
+            lambda x, v, t: 2.0e4 * x + 200.0 * v + 1.5e7 * x**3 + 10.0 * np.sign(v),
+            ("coulomb_friction", "cubic_stiffness"),
+        ),
+    ],
+    ids=["one law", "two laws"],
+)
+def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_path, law, names):
+    """Three names explain a law that the catalogue lacks down to the noise; two true ones stay."""
+    reduced = damper_campaign(
+        tmp_path, law, per_period=60.3, noise=10.0 if len(names) == 1 else 2.0
+    )
+    loop = close_loop(
+        Assembly(damper(cubic=False)),
+        assign(reduced.records),
+        NUMERICS,
+        effects=[find_effect(name) for name in SEVERAL],
+    )
+    assert loop.effects == names
+    assert loop.final.at_floor
+    assert not loop.certain
+    if len(names) == 1:
+        *_, last, _ = loop.rounds
+        assert last.before.at_floor, "the names had come down to the noise"
+        assert "stands instead of end_stop_upper" in last.reason
+
+
 def test_the_score_of_a_curve_that_is_a_named_effect_is_no_less(tmp_path):
     """Quintic stiffness is a smooth function of position: splines explain what it explains."""
 

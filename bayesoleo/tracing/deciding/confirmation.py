@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 #: Least part of the present excess that is worth another effect.
 LEAST_SHARE = 0.05
+#: The same of an effect that leaves more than noise. Of four that are missing, as many as are added
+#: by default, the one that explains most explains a quarter where they do different things; half of
+#: that is asked for. What explains less is near to something that is there rather than there.
+FAIR_SHARE = 0.125
 #: Runs held out that an effect changes by fewer standard deviations of noise than this cannot
 #: judge it alone. If it is real and changes them by ``d``, the error falls by ``d^2`` with standard
 #: error ``2 d``, and so by more than its error in all but the part ``Phi(1 - d/2)`` of cases: one
@@ -36,7 +40,7 @@ def confirmed(
     """The state with an estimated effect in, if runs that were not used confirm it, and why."""
     if not np.isfinite(result.share):
         return None, f"{item.effect} could not be estimated"
-    if result.share < LEAST_SHARE:
+    if result.share < (LEAST_SHARE if result.reached else FAIR_SHARE):
         share = f"{100 * result.share:.0f} % of the excess"
         return None, f"{item.effect} would explain only {share}"
     if not result.excludes_null():

@@ -13,21 +13,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding.confirmation import confirmed
 from bayesoleo.tracing.deciding.refit import Refit, compare, refit
-from bayesoleo.tracing.deciding.rounds import LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
 from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.fitting.assembly import Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME
-from bayesoleo.tracing.unnamed.search import Search, closest, search
+from bayesoleo.tracing.unnamed.quantities import ranges
+from bayesoleo.tracing.unnamed.search import Search, Tried, closest, search
 
 #: Unnamed effects added at most.
 MOST_UNNAMED = 1
@@ -39,10 +42,13 @@ DECISIVE = 10.0
 #: Part of the excess that a name explained by itself, from which on it is not taken for the nearest
 #: to something else: a function of the same quantities repeats what it says, and adds freedom.
 OWN_RIGHT = 0.9
+#: Finer pieces are tried as long as they make up this part of what a function is worse by.
+CLOSER = 0.25
 #: Functions estimated before one is chosen.
 MOST_TRIED = 3
 
 Say = Callable[[str], None]
+Merit = Callable[..., float]
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,7 @@ class _Answer:
     refit: Refit
     ranking: tuple[Score, ...]
     instead: bool
+    merit: float
 
 
 def with_unnamed(
@@ -91,28 +98,34 @@ def with_unnamed(
     if not room and len(steps) < FEWEST_REPLACED:
         return outcome  # named ones had no chance to come together
     # At the floor nothing is left that a function could explain but noise.
-    beside, instead = room and not state.at_floor, named and not _stands_by_itself(first)
+    beside = room and not state.at_floor
+    instead = named and (not _stands_by_itself(first) or _several_in_one_balance(steps))
     if not (beside or instead):
         return outcome
     say("look for an effect without a name")
-    base = state.base()
-    found = search(base, state.assembly, numerics.jobs)
-    outcome = replace(outcome, unnamed=found)
-    if found.p_value >= LEVEL:
-        return outcome
-    chances = [_Chance(state, base, found, outcome, False)] if beside else []
+    chances = []
+    if not state.at_floor:
+        base = state.base()
+        found = search(base, state.assembly, numerics.jobs)
+        outcome = replace(outcome, unnamed=found)
+        if found.p_value >= LEVEL:
+            return outcome
+        if beside:
+            chances.append(_Chance(state, base, found, outcome, False))
     if instead:
         origin = first.before
         reference = origin.base()
-        again = search(reference, origin.assembly, numerics.jobs)
+        # The present model moves as was measured; one with less in it may not get as far.
+        also = ranges(state.fit, state.assembly, origin.assembly.native)
+        again = search(reference, origin.assembly, numerics.jobs, also)
         chances.append(_Chance(origin, reference, again, first, True))
     reasons, common = [outcome.reason], chances[-1].base
-    # What was found so far competes too: a function that explains less does not replace it.
-    present = _worth(state.fit, common)
+    merit = partial(_merit, present=state.fit, reference=common)
     for k in range(MOST_TRIED):
-        answers = [item for chance in chances for item in chance.answers(k, numerics)]
-        answers = [item for item in answers if _merit(item, common) > present]
-        for answer in sorted(answers, key=lambda item: -_merit(item, common)):
+        answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
+        # What was found so far competes too: a function that explains less does not replace it.
+        answers = [item for item in answers if item.merit > 0]
+        for answer in sorted(answers, key=lambda item: -item.merit):
             accepted, reason = _accepting(outcome, answer, roles, numerics, say)
             if accepted.accepted is not None:
                 return accepted
@@ -125,6 +138,13 @@ def _stands_by_itself(first: Round) -> bool:
     return first.accepted is not None and first.accepted.gain >= OWN_RIGHT
 
 
+def _several_in_one_balance(steps: Sequence[Step]) -> bool:
+    """Whether names came together in a balance, where one function of its quantities may be what
+    all of them are a part of."""
+    places = [step.target for step in steps if step.effect.family not in IMITATORS]
+    return any(places.count(place) >= FEWEST_REPLACED for place in places)
+
+
 @dataclass(frozen=True)
 class _Chance:
     """A model, and the functions that may be added to it."""
@@ -135,43 +155,50 @@ class _Chance:
     outcome: Round
     instead: bool
 
-    def answers(self, k: int, numerics: Numerics) -> list[_Answer]:
+    def answers(self, k: int, merit: Merit, numerics: Numerics) -> list[_Answer]:
         """The function that does best but for ``k`` others, estimated; none where there are fewer.
 
-        The score says which, by the same measure as estimates are judged.
+        The score says which, by the same measure as estimates are judged. It says how fine, too,
+        where the model is near to the data; a model without the names is far from them, and a step
+        from there describes a curve badly: pieces are cut finer as long as the estimate gains.
         """
         price = float(np.log(max(self.base.noise, 2.0)))
         leading = self.search.leading(MOST_TRIED)
-        found = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
+        chosen = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
+        found: list[_Answer] = []
+        for item in chosen:
+            for one in self.search.finenesses(item) if self.instead else (item,):
+                answer = self._estimated(one, merit, numerics)
+                if found and answer.merit - found[0].merit <= CLOSER * max(-found[0].merit, 0.0):
+                    break
+                found = [answer]
+        return found
+
+    def _estimated(self, item: Tried, merit: Merit, numerics: Numerics) -> _Answer:
         scales = scales_of(
             self.state.fit, self.state.assembly.drive, tuple(self.state.assembly.native.dofs)
         )
+        result = refit(self.base, item.score(self.base, self.state.assembly, scales), numerics)
         ranking = tuple(item.score for item in self.outcome.ranking)
-        return [
-            _Answer(
-                self.state,
-                self.search,
-                refit(self.base, item.score(self.base, self.state.assembly, scales), numerics),
-                ranking,
-                self.instead,
-            )
-            for item in found
-        ]
+        worth = merit(result, instead=self.instead)
+        return _Answer(self.state, self.search, result, ranking, self.instead, worth)
 
 
-def _merit(answer: _Answer, reference: Base) -> float:
-    """What a function is worth; one that stands instead of names needs none of them."""
-    merit = _worth(answer.refit.fit, reference)
-    return merit + DECISIVE if answer.instead else merit
-
-
-def _worth(fit: Fit, reference: Base) -> float:
-    """Fall of the weighted sum of squares from a common model, less the price of the unknowns."""
-    share, _ = compare(reference, fit)
-    if not np.isfinite(share):
-        return -np.inf
+def _merit(own: Refit, *, instead: bool, present: Fit, reference: Base) -> float:
+    """What a function is worth beyond what was found so far; one that stands instead of names needs
+    none of them."""
+    gained = _fall(own.fit, reference) - _fall(present, reference)
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
-    return share * reference.fall_back - len(fit.problem.names) * float(np.log(values))
+    more = len(own.fit.problem.names) - len(present.problem.names)
+    # What noise of one colour leaves scatters together: of so many values as many less are news.
+    merit = gained / own.inflation - more * float(np.log(values))
+    return merit + DECISIVE if instead else merit
+
+
+def _fall(fit: Fit, reference: Base) -> float:
+    """Of the weighted sum of squares from a common model."""
+    share, _ = compare(reference, fit)
+    return share * reference.fall_back if np.isfinite(share) else -np.inf
 
 
 def _accepting(
@@ -186,6 +213,8 @@ def _accepting(
     after, reason = confirmed(answer.state, item, result, roles, numerics, say)
     if after is None:
         return outcome, reason
+    if outcome.before.at_floor and not after.at_floor:
+        return outcome, f"{item.effect} leaves more than the effects that have names"
     if answer.instead:
         before = [step.effect.id for step in outcome.before.assembly.steps]
         reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,8 +115,14 @@ class Motions:
             found: Array = np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)
         return found
 
-    def axes(self) -> list[tuple[int, Axis]]:
-        """Quantities that move, each with its number and range, none that another one follows."""
+    def axes(self, also: Mapping[str, Axis]) -> list[tuple[int, Axis]]:
+        """Quantities that move, each with its number and range, none that another one follows.
+
+        Parameters
+        ----------
+        also : mapping of str to Axis
+            By name: ranges to be covered besides.
+        """
         found: list[tuple[int, Axis]] = []
         kept: list[Array] = []
         records = self.fit.records
@@ -130,8 +136,23 @@ class Motions:
             if any(_alike(values, other) for other in kept):
                 continue
             kept.append(values)
-            found.append((k, Axis.covering(item.name, item.expression, item.unit, values)))
+            axis = Axis.covering(item.name, item.expression, item.unit, values)
+            found.append((k, axis.together(also[item.name]) if item.name in also else axis))
         return found
+
+
+def ranges(fit: Fit, assembly: Assembly, model: Model) -> dict[str, Axis]:
+    """By name, the ranges of a model's quantities along an estimated motion.
+
+    Parameters
+    ----------
+    fit : Fit
+    assembly : Assembly
+        What was fitted; it may have more effects than the model.
+    model : Model
+        In its own drive.
+    """
+    return {axis.name: axis for _, axis in Motions(fit, assembly, quantities_of(model)).axes({})}
 
 
 def _alike(values: Array, other: Array) -> bool:

@@ -9,7 +9,7 @@ the number of functions that were tried.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
@@ -145,6 +145,12 @@ class Search:
             groups.setdefault(item.key, []).append(item)
         return tuple(_refined(group) for group in list(groups.values())[:most])
 
+    def finenesses(self, item: Tried) -> tuple[Tried, ...]:
+        """A function of the same quantities in the same balance with any number of pieces, the
+        coarsest first."""
+        group = [one for one in self.tried if one.key == item.key]
+        return tuple(sorted(group, key=lambda one: one.pieces))
+
 
 def _refined(group: Sequence[Tried]) -> Tried:
     """The surest of several finenesses, or finer."""
@@ -169,7 +175,9 @@ def corrected(item: Tried, tests: int) -> float:
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
 
 
-def search(base: Base, assembly: Assembly, jobs: int | None = None) -> Search:
+def search(
+    base: Base, assembly: Assembly, jobs: int | None = None, also: Mapping[str, Axis] | None = None
+) -> Search:
     """Try smooth functions of the model's quantities in all of its balances.
 
     Parameters
@@ -180,6 +188,8 @@ def search(base: Base, assembly: Assembly, jobs: int | None = None) -> Search:
         The present model.
     jobs : int, optional
         Threads.
+    also : mapping of str to Axis, optional
+        By name: ranges of quantities to be covered besides those of the present model's motion.
 
     Returns
     -------
@@ -187,7 +197,7 @@ def search(base: Base, assembly: Assembly, jobs: int | None = None) -> Search:
         Empty where no quantity moves, or no balance can be solved with a term added.
     """
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
-    axes = motions.axes()
+    axes = motions.axes(also or {})
     forced = {}
     for target in balance_places(assembly.native):
         try:
