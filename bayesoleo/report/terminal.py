@@ -36,7 +36,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     console.print(_errors(summary))
     for number, entry in enumerate(summary["rounds"], start=1):
         if entry["accepted"]:
-            console.print(_accepted(number, entry))
+            stayed = entry["accepted"] in summary["effects"]
+            later = Text("" if stayed else "; it was taken out again later", style="dim")
+            console.print(_accepted(number, entry) + later)
     for line in sentences.remainder(summary):
         console.print(Text(line, style="dim"))
     for entry in summary.get("proposals", []):

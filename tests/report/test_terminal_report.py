@@ -27,6 +27,14 @@ def test_error_effect_and_files(oleo):
     assert "out/[red]report.html" in text
 
 
+def test_an_effect_that_did_not_stay_is_said_to_have_gone(oleo):
+    summary = json.loads(oleo.attrs["summary"])
+    gone = "it was taken out again later"
+    assert gone not in printed(summary)
+    summary["effects"] = ["unnamed_velocity"]
+    assert gone in printed(summary)
+
+
 def test_nothing_added(two_runs):
     text = printed(json.loads(two_runs.attrs["summary"]))
     assert "Nothing is missing" in text
