@@ -134,8 +134,12 @@ def with_unnamed(
 
 
 def _stands_by_itself(first: Round) -> bool:
-    """Whether the first effect explained nearly all of the excess alone."""
-    return first.accepted is not None and first.accepted.gain >= OWN_RIGHT
+    """Whether the first effect explained nearly all of the excess alone; one that takes up a part
+    of whatever is missing does so only where it left nothing but noise."""
+    found = first.accepted
+    if found is None or found.gain < OWN_RIGHT:
+        return False
+    return not found.imitates or (found.refit is not None and found.refit.reached)
 
 
 def _several_in_one_balance(steps: Sequence[Step]) -> bool:
