@@ -137,9 +137,10 @@ SEVERAL = ("end_stop_upper", "quadratic_stiffness", "cubic_stiffness", "coulomb_
     ("law", "names"),
     [
         (softened, ("unnamed_displacement",)),
-        (
+        pytest.param(
             lambda x, v, t: 2.0e4 * x + 200.0 * v + 1.5e7 * x**3 + 10.0 * np.sign(v),
             ("coulomb_friction", "cubic_stiffness"),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["one law", "two laws"],

@@ -1,23 +1,24 @@
 """The end of a round that found no name: let a smooth function of one or two quantities explain
 what is left, and say which named effects come closest to it.
 
-Named effects go first, one after the other. If something is left then, two answers compete with
-what was found so far: the function beside the named effects, and the function *instead* of them. A
-named effect may have been no more than the nearest to what is in the data. The weighted sum of
-squares decides, less the logarithm of the number of averaged values for each unknown (Schwarz
-1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the runs that
-were not used decide, as for every effect.
+Named effects go first, one after the other. Two answers compete with what was found so far: the
+function beside the named effects, if they left something, and the function *instead* of them. A
+named effect may have been no more than the nearest to what is in the data, and several together may
+come down to the noise where one law of the same quantities is what they are a part of. The weighted
+sum of squares decides, less the logarithm of the number of averaged values for each unknown
+(Schwarz 1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the
+runs that were not used decide, as for every effect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.effects.unnamed import FAMILY, Axis
 from bayesoleo.tracing.deciding.confirmation import confirmed
 from bayesoleo.tracing.deciding.refit import Refit, compare, refit
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
@@ -105,22 +106,25 @@ def with_unnamed(
     say("look for an effect without a name")
     chances = []
     if not state.at_floor:
-        base = state.base()
-        found = search(base, state.assembly, numerics.jobs)
-        outcome = replace(outcome, unnamed=found)
-        if found.p_value >= LEVEL:
+        found = _Chance.at(state, outcome, numerics)
+        outcome = replace(outcome, unnamed=found.search)
+        if found.search.p_value >= LEVEL:
             return outcome
         if beside:
-            chances.append(_Chance(state, base, found, outcome, False))
+            chances.append(found)
     if instead:
-        origin = first.before
-        reference = origin.base()
         # The present model moves as was measured; one with less in it may not get as far.
-        also = ranges(state.fit, state.assembly, origin.assembly.native)
-        again = search(reference, origin.assembly, numerics.jobs, also)
-        chances.append(_Chance(origin, reference, again, first, True))
+        also = ranges(state.fit, state.assembly, first.before.assembly.native)
+        chances.append(_Chance.at(first.before, first, numerics, also))
+    return _decided(outcome, chances, roles, numerics, say)
+
+
+def _decided(
+    outcome: Round, chances: Sequence[_Chance], roles: Roles, numerics: Numerics, say: Say
+) -> Round:
+    """The round with the best function in that the runs not used confirm, or why there is none."""
     reasons, common = [outcome.reason], chances[-1].base
-    merit = partial(_merit, present=state.fit, reference=common)
+    merit = partial(_merit, present=outcome.before.fit, reference=common)
     for k in range(MOST_TRIED):
         answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
         # What was found so far competes too: a function that explains less does not replace it.
@@ -159,6 +163,19 @@ class _Chance:
     outcome: Round
     instead: bool
 
+    @classmethod
+    def at(
+        cls,
+        state: State,
+        outcome: Round,
+        numerics: Numerics,
+        also: Mapping[str, Axis] | None = None,
+    ) -> _Chance:
+        """The functions that a model's remainder asks for; `also` stands for one without names."""
+        base = state.base()
+        found = search(base, state.assembly, numerics.jobs, also)
+        return cls(state, base, found, outcome, also is not None)
+
     def answers(self, k: int, merit: Merit, numerics: Numerics) -> list[_Answer]:
         """The function that does best but for ``k`` others, estimated; none where there are fewer.
 
@@ -173,7 +190,7 @@ class _Chance:
         for item in chosen:
             for one in self.search.finenesses(item) if self.instead else (item,):
                 answer = self._estimated(one, merit, numerics)
-                if found and answer.merit - found[0].merit <= CLOSER * max(-found[0].merit, 0.0):
+                if found and not _goes_on(found[0].merit, answer.merit):
                     break
                 found = [answer]
         return found
@@ -186,6 +203,11 @@ class _Chance:
         ranking = tuple(item.score for item in self.outcome.ranking)
         worth = merit(result, instead=self.instead)
         return _Answer(self.state, self.search, result, ranking, self.instead, worth)
+
+
+def _goes_on(coarse: float, fine: float) -> bool:
+    """Whether finer pieces are worth so much more that still finer ones may be worth the price."""
+    return not np.isfinite(coarse) or fine - coarse > CLOSER * max(-coarse, 0.0)
 
 
 def _merit(own: Refit, *, instead: bool, present: Fit, reference: Base) -> float:
