@@ -17,6 +17,7 @@ from bayesoleo.model.document import from_document, to_document
 from bayesoleo.model.expressions import symbol
 from bayesoleo.systems import equations_latex, system
 from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.unnamed_round import _goes_on
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.roles import assign
 from bayesoleo.tracing.outcome.result import loop_groups
@@ -163,6 +164,21 @@ def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_
         *_, last, _ = loop.rounds
         assert last.before.at_floor, "the names had come down to the noise"
         assert "stands instead of end_stop_upper" in last.reason
+
+
+@pytest.mark.parametrize(
+    ("coarse", "fine", "goes_on"),
+    [
+        (-np.inf, -5.0, True),
+        (-100.0, -60.0, True),
+        (-100.0, -80.0, False),
+        (5.0, 6.0, True),
+        (5.0, 4.0, False),
+        (-5.0, -np.inf, False),
+    ],
+)
+def test_pieces_are_cut_finer_while_that_may_pay(coarse, fine, goes_on):
+    assert _goes_on(coarse, fine) is goes_on
 
 
 def test_the_score_of_a_curve_that_is_a_named_effect_is_no_less(tmp_path):
