@@ -104,7 +104,7 @@ figure = study.figure("spectrum", spectra)
 # %%
 # Before, the error stands up below and around the resonance. What is left after is a hump at three
 # times the resonance, where the circuit is no longer driven: the third harmonics that the cubic
-# spring itself makes. The fitted model has them, in the right size, with another phase:
+# spring itself makes. The fitted model has them, in about the right size, with another phase:
 
 
 def hump():
@@ -121,5 +121,6 @@ def hump():
 study.text("hump", hump)
 
 # %%
-# That is no matter of the mesh, which is refined until the estimate stays, and no effect of the
-# catalogue explains it: an open question of this circuit, or of the chain that measured it.
+# That is no matter of the mesh, which is refined until the estimate stays, and neither an effect of
+# the catalogue nor the function without a name explains it: an open question of this circuit, or of
+# the chain that measured it.
