@@ -12,7 +12,7 @@ from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding.review import reviewed
-from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
+from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
@@ -23,6 +23,9 @@ from bayesoleo.tracing.scoring.significance import SAME
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
+#: Probability with which noise alone would show as much of an effect as there still is, from which
+#: on it is taken out again.
+STAYS = 0.05
 #: Part of the excess that added effects must explain for the loop to call the model's lack found:
 #: what is left is then less than a third of what there was, in size.
 MOSTLY = 0.9
@@ -231,11 +234,20 @@ def _pruned(state: State, roles: Roles, numerics: Numerics, notes: list[str], sa
 
 
 def _superfluous(fit: Fit, step: Step) -> bool:
+    """Whether the null of an effect is as likely as its estimate.
+
+    What takes up a part of whatever is missing came in for want of what has been found since; it
+    stays only if it is worth its unknowns (Schwarz 1978).
+    """
     index = [k for k, name in enumerate(fit.problem.names) if name.split("[")[0] in step.amplitudes]
     value, covariance = fit.point.theta[index], fit.point.covariance[np.ix_(index, index)]
     if not index or not np.isfinite(covariance).all():
         return False
-    return bool(stats.chi2.sf(squared_distance(value, covariance), len(index)) > 0.05)
+    least = float(stats.chi2.isf(STAYS, len(index)))
+    if step.effect.family in IMITATORS:
+        samples = sum(run.measured.size for run in fit.predictor.runs)
+        least = max(least, len(index) * float(np.log(samples)))
+    return squared_distance(value, covariance) < least
 
 
 def _warnings(fit: Fit) -> list[str]:
