@@ -192,7 +192,7 @@ GAIN = _sensor(
 LAG = _sensor(
     "sensor_lag",
     "Lag of a sensor, channels misaligned in time",
-    r"m(t) = y(x(t - \tau)),\quad x(t - \tau) \approx x - \tau \dot x + \frac{1}{2} \tau^2 \ddot x",
+    r"m(t) = y(x(t - \tau)), x(t - \tau) \approx x - \tau \dot x + \frac{1}{2} \tau^2 \ddot x",
     "s",
     r"\tau",
     _laggable,

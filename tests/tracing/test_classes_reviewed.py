@@ -54,7 +54,7 @@ def test_no_function_is_looked_for_where_noise_alone_is_left():
         SimpleNamespace(assembly=SimpleNamespace(steps=())),
         (), {}, accepted("stribeck_friction", ()), None, "", 60.0,
     )  # fmt: skip
-    step = SimpleNamespace(effect=SimpleNamespace(family="friction"))
+    step = SimpleNamespace(effect=SimpleNamespace(family="friction"), target="stroke")
     state = SimpleNamespace(at_floor=True, assembly=SimpleNamespace(steps=(step,)))
     last = Round(state, (), {}, None, None, "nothing is missing", 60.0)
     told: list[str] = []
