@@ -16,6 +16,8 @@ PANEL = "What is built in"
 #: How parts of LaTeX read in a terminal; longer ones first, since some begin alike.
 _READABLE = {
     r"\ddot q": "q̈",
+    r"\ddot x": "ẍ",
+    r"\dot x": "ẋ",
     r"\ddot y": "ÿ",
     r"\dot q": "q̇",
     r"\dot w": "ẇ",

@@ -167,18 +167,20 @@ def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_
 
 
 @pytest.mark.parametrize(
-    ("coarse", "fine", "goes_on"),
+    ("coarse", "fine", "p_value", "goes_on"),
     [
-        (-np.inf, -5.0, True),
-        (-100.0, -60.0, True),
-        (-100.0, -80.0, False),
-        (5.0, 6.0, True),
-        (5.0, 4.0, False),
-        (-5.0, -np.inf, False),
+        (-np.inf, -5.0, 0.0, True),
+        (-100.0, -60.0, 0.0, True),
+        (-100.0, -80.0, 0.0, False),
+        (-5.0, 6.0, 1e-4, True),
+        (6.0, 5.0, 1e-4, True),
+        (5.0, 6.0, 0.1, False),
+        (-5.0, -np.inf, 1.0, False),
     ],
 )
-def test_pieces_are_cut_finer_while_that_may_pay(coarse, fine, goes_on):
-    assert _goes_on(coarse, fine) is goes_on
+def test_pieces_are_cut_finer_while_that_may_pay(coarse, fine, p_value, goes_on):
+    """Significance says how fine a curve is; one that stays far behind the names is given up."""
+    assert _goes_on(coarse, fine, p_value) is goes_on
 
 
 def test_the_score_of_a_curve_that_is_a_named_effect_is_no_less(tmp_path):

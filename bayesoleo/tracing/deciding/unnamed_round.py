@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy import stats
 
 from bayesoleo.effects.unnamed import FAMILY, Axis
 from bayesoleo.tracing.deciding.confirmation import confirmed
@@ -31,7 +32,7 @@ from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME
 from bayesoleo.tracing.unnamed.quantities import ranges
-from bayesoleo.tracing.unnamed.search import Search, Tried, closest, search
+from bayesoleo.tracing.unnamed.search import FINER, Search, Tried, closest, search
 
 #: Unnamed effects added at most.
 MOST_UNNAMED = 1
@@ -127,14 +128,25 @@ def _decided(
     merit = partial(_merit, present=outcome.before.fit, reference=common)
     for k in range(MOST_TRIED):
         answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
-        # What was found so far competes too: a function that explains less does not replace it.
-        answers = [item for item in answers if item.merit > 0]
-        for answer in sorted(answers, key=lambda item: -item.merit):
+        for answer in _better(answers, merit):
             accepted, reason = _accepting(outcome, answer, roles, numerics, say)
             if accepted.accepted is not None:
                 return accepted
             reasons.append(reason)
     return replace(outcome, reason="; ".join(reasons))
+
+
+def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
+    """Answers that are better than what was found so far, the best first.
+
+    What was found so far competes too: a function that explains less does not replace it. All are
+    judged by the same noise. What an answer leaves of a transient counts as noise that is not
+    white, and what a worse one leaves is no noise: so by that of the answer that leaves least.
+    """
+    least = min((item.refit.inflation for item in answers), default=1.0)
+    merits = [merit(item.refit, instead=item.instead, inflation=least) for item in answers]
+    order = sorted(range(len(answers)), key=lambda k: -merits[k])
+    return [answers[k] for k in order if merits[k] > 0]
 
 
 def _stands_by_itself(first: Round) -> bool:
@@ -181,7 +193,8 @@ class _Chance:
 
         The score says which, by the same measure as estimates are judged. It says how fine, too,
         where the model is near to the data; a model without the names is far from them, and a step
-        from there describes a curve badly: pieces are cut finer as long as the estimate gains.
+        from there describes a curve badly: pieces are cut finer as long as the estimate explains
+        significantly more.
         """
         price = float(np.log(max(self.base.noise, 2.0)))
         leading = self.search.leading(MOST_TRIED)
@@ -190,7 +203,7 @@ class _Chance:
         for item in chosen:
             for one in self.search.finenesses(item) if self.instead else (item,):
                 answer = self._estimated(one, merit, numerics)
-                if found and not _goes_on(found[0].merit, answer.merit):
+                if found and not _is_better(answer, found[0]):
                     break
                 found = [answer]
         return found
@@ -201,23 +214,35 @@ class _Chance:
         )
         result = refit(self.base, item.score(self.base, self.state.assembly, scales), numerics)
         ranking = tuple(item.score for item in self.outcome.ranking)
-        worth = merit(result, instead=self.instead)
+        worth = merit(result, instead=self.instead, inflation=result.inflation)
         return _Answer(self.state, self.search, result, ranking, self.instead, worth)
 
 
-def _goes_on(coarse: float, fine: float) -> bool:
-    """Whether finer pieces are worth so much more that still finer ones may be worth the price."""
-    return not np.isfinite(coarse) or fine - coarse > CLOSER * max(-coarse, 0.0)
+def _is_better(fine: _Answer, coarse: _Answer) -> bool:
+    """Whether finer pieces explain significantly more, and come near to what was found so far."""
+    least = min(fine.refit.inflation, coarse.refit.inflation)
+    gained = (fine.refit.fall - coarse.refit.fall) / least
+    more = fine.refit.size - coarse.refit.size
+    return _goes_on(coarse.merit, fine.merit, float(stats.chi2.sf(gained, more)))
 
 
-def _merit(own: Refit, *, instead: bool, present: Fit, reference: Base) -> float:
+def _goes_on(coarse: float, fine: float, p_value: float) -> bool:
+    """Whether to go on to finer pieces, by merits and the probability of the fall by noise."""
+    if not np.isfinite(coarse):
+        return True
+    if fine <= 0.0:
+        return fine - coarse > CLOSER * max(-coarse, 0.0)
+    return p_value < FINER
+
+
+def _merit(own: Refit, *, instead: bool, inflation: float, present: Fit, reference: Base) -> float:
     """What a function is worth beyond what was found so far; one that stands instead of names needs
     none of them."""
     gained = _fall(own.fit, reference) - _fall(present, reference)
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
     more = len(own.fit.problem.names) - len(present.problem.names)
     # What noise of one colour leaves scatters together: of so many values as many less are news.
-    merit = gained / own.inflation - more * float(np.log(values))
+    merit = gained / inflation - more * float(np.log(values))
     return merit + DECISIVE if instead else merit
 
 
