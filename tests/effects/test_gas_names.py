@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from bayesoleo.effects import find_effect
+from bayesoleo.effects import catalogue, find_effect
 from bayesoleo.effects.gas import as_gas_spring
 from bayesoleo.effects.gas_names import undeclared
 from bayesoleo.model import Condition, Model, Output, Parameter
@@ -32,23 +32,27 @@ model = Model(
 """
 
 
-def polytrope() -> Model:
-    """With the five names of the documentation."""
+def polytrope(renamed: str = "") -> Model:
+    """With the five names of the documentation, one of which may be another."""
+
+    def known(text: str) -> str:
+        return text.replace(renamed, "unheard_of") if renamed else text
+
     return Model(
         "gas spring",
         inputs={"stroke": "m"},
-        conditions={"initial_pressure": Condition("Pa")},
+        conditions={known("initial_pressure"): Condition("Pa")},
         parameters={
             "area": Parameter(3.5e-3, "m**2", fixed=True),
-            "initial_volume": Parameter(9.2e-4, "m**3", relative_sd=0.1),
+            known("initial_volume"): Parameter(9.2e-4, "m**3", relative_sd=0.1),
             "exponent": Parameter(1.1, relative_sd=0.1),
-            "ambient_temperature": Parameter(293.0, "K", fixed=True),
+            known("ambient_temperature"): Parameter(293.0, "K", fixed=True),
         },
         definitions={
-            "volume_ratio": "1 - area*stroke/initial_volume",
-            "gas_pressure": "initial_pressure*volume_ratio**(-exponent)",
+            known("volume_ratio"): known("1 - area*stroke/initial_volume"),
+            known("gas_pressure"): known("initial_pressure*volume_ratio**(-exponent)"),
         },
-        outputs={"pressure": Output("gas_pressure", "Pa")},
+        outputs={"pressure": Output(known("gas_pressure"), "Pa")},
     )
 
 
@@ -111,3 +115,23 @@ def test_a_model_file_is_told_what_its_names_keep_from_being_tried(tmp_path):
     assert undeclared(model)["heat_exchange"] == ("initial_volume", "ambient_temperature")
     assert "gas_exponent_error" not in undeclared(model)
     assert undeclared(system("duffing")) == undeclared(system("f16n1d2")) == {}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["volume_ratio", "gas_pressure", "initial_pressure", "initial_volume", "ambient_temperature"],
+)
+def test_what_is_said_to_be_kept_from_trial_is_what_has_no_place(name):
+    """Each name under another: the table of names must not promise what the effects do not do."""
+    whole = polytrope()
+    told = undeclared(polytrope(name))
+    lost = [
+        item.id
+        for item in catalogue()
+        if item.family in ("gas", "thermal")
+        and item.places(whole)
+        and not item.places(polytrope(name))
+    ]
+    assert told.keys() <= set(lost)
+    assert all(missing == (name,) for missing in told.values())
+    assert told

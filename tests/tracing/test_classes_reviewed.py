@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from bayesoleo.tracing.deciding import review
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
-from bayesoleo.tracing.deciding.unnamed_round import with_unnamed
+from bayesoleo.tracing.deciding.unnamed_round import (
+    _several_in_one_balance,
+    _stands_by_itself,
+    with_unnamed,
+)
 
 
 def accepted(effect, same):
@@ -60,3 +65,37 @@ def test_no_function_is_looked_for_where_noise_alone_is_left():
     told: list[str] = []
     assert with_unnamed(last, opening, None, None, say=told.append) is last
     assert not told
+
+
+@pytest.mark.parametrize(
+    ("family", "gain", "reached", "alone"),
+    [
+        ("friction", 0.95, False, True),
+        ("friction", 0.85, True, False),
+        ("run-to-run", 0.95, False, False),
+        ("run-to-run", 0.95, True, True),
+    ],
+)
+def test_what_takes_up_a_part_of_everything_stands_by_itself_only_at_the_noise(
+    family, gain, reached, alone
+):
+    found = replace(accepted("found", ()), gain=gain, refit=SimpleNamespace(reached=reached))
+    found.score.option.candidate.family = family
+    assert _stands_by_itself(Round(None, (found,), {}, found, None, "", 60.0)) is alone
+
+
+@pytest.mark.parametrize(
+    ("steps", "several"),
+    [
+        ([("friction", "stroke"), ("stiffness", "stroke")], True),
+        ([("friction", "stroke"), ("thermal", "heat_loss")], False),
+        ([("friction", "stroke"), ("run-to-run", "stroke")], False),
+    ],
+)
+def test_names_come_together_in_one_balance(steps, several):
+    """What varies by run is no part of one law; another balance has another."""
+    made = [
+        SimpleNamespace(effect=SimpleNamespace(family=family), target=target)
+        for family, target in steps
+    ]
+    assert _several_in_one_balance(made) is several
