@@ -29,7 +29,6 @@ from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME
 from bayesoleo.tracing.unnamed.quantities import ranges
 from bayesoleo.tracing.unnamed.search import FINER, Search, Tried, closest, search
@@ -60,7 +59,7 @@ class _Answer:
     state: State
     search: Search
     refit: Refit
-    ranking: tuple[Score, ...]
+    ranking: tuple[Ranked, ...]
     instead: bool
     merit: float
 
@@ -213,9 +212,8 @@ class _Chance:
             self.state.fit, self.state.assembly.drive, tuple(self.state.assembly.native.dofs)
         )
         result = refit(self.base, item.score(self.base, self.state.assembly, scales), numerics)
-        ranking = tuple(item.score for item in self.outcome.ranking)
         worth = merit(result, instead=self.instead, inflation=result.inflation)
-        return _Answer(self.state, self.search, result, ranking, self.instead, worth)
+        return _Answer(self.state, self.search, result, self.outcome.ranking, self.instead, worth)
 
 
 def _is_better(fine: _Answer, coarse: _Answer) -> bool:
@@ -257,9 +255,14 @@ def _accepting(
 ) -> tuple[Round, str]:
     """The round with the answer accepted, if it is confirmed, and why."""
     result = answer.refit
-    near = closest(result.contribution, answer.ranking)
+    near = closest(result.contribution, [item.score for item in answer.ranking])
     gain = min(max(result.share, 0.0), 1.0) if np.isfinite(result.share) else 0.0
-    same = tuple(name.split(" @ ")[0] for name, cosine in near if cosine > 0 and cosine**2 > SAME)
+    told_apart = {" @ ".join(it.score.option.key) for it in answer.ranking if _told(result, it)}
+    same = tuple(
+        name.split(" @ ")[0]
+        for name, cosine in near
+        if cosine > 0 and cosine**2 > SAME and name not in told_apart
+    )
     item = Ranked(result.score, answer.search.p_value, gain, True, same, result, near)
     after, reason = confirmed(answer.state, item, result, roles, numerics, say)
     if after is None:
@@ -271,6 +274,14 @@ def _accepting(
         reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
     ranking = (item, *outcome.ranking)
     return replace(outcome, ranking=ranking, accepted=item, after=after, reason=reason), reason
+
+
+def _told(own: Refit, other: Ranked) -> bool:
+    """Whether the data tell a function from a name that does nearly the same: by the name's
+    estimate where there is one."""
+    if other.refit is not None:
+        return not own.resembles(other.refit)
+    return own.outdoes(other.score)
 
 
 def unnamed_notes(rounds: Sequence[Round]) -> list[str]:

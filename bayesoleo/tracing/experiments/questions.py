@@ -74,11 +74,13 @@ def questions_of(
     """
     records = [*loop.roles.fitted, *loop.roles.held_out]
     records = list({record.label: record for record in records}.values())
-    found = []
+    found, stayed = [], set(loop.final.assembly.added)
     for number, item in enumerate(loop.rounds, start=1):
         last = number == len(loop.rounds)
         if effects and not last:
             continue
+        if item.accepted and (item.accepted.effect, item.accepted.target) not in stayed:
+            continue  # what was taken out again needs no telling from others
         chosen = named(item, effects) if effects else standing(item)
         if chosen:
             kind = ASKED if effects else OPEN if item.accepted is None else ALIKE
