@@ -18,6 +18,9 @@ from bayesoleo.solvers.status import Status, added, counted
 #: Reached in the record, m, of a stroke that ends at ``TRUTH``: beyond that the gas law has no
 #: pressure.
 REACHED, TRUTH = 0.90, 0.93
+#: From here every trial of the estimators ends at least 0.02 m inside or outside the region, so that
+#: no rounding of another processor's decides which ones fail.
+FAR = 1.1
 
 
 def problem(start: float) -> CampaignProblem:
@@ -39,10 +42,10 @@ def problem(start: float) -> CampaignProblem:
     return CampaignProblem(Predictor(model, [record], steps=64, backend="numpy", jobs=1))
 
 
-@pytest.mark.parametrize("method", ["be", "levenberg-marquardt", "scipy:L-BFGS-B"])
+@pytest.mark.parametrize("method", ["be", "levenberg-marquardt"])
 def test_an_estimate_counts_the_trials_that_left_the_admissible_region(method):
     """From far away the first steps go too far; they are shortened, and the end is found."""
-    point = estimate(problem(1.3), method, tolerance=1e-7)
+    point = estimate(problem(FAR), method, tolerance=1e-7)
     assert point.status is Status.CONVERGED
     assert point["full_stroke"] == pytest.approx(TRUTH, abs=5 * point.sd[0])
     assert set(point.failures) == {"inadmissible"}
@@ -50,6 +53,14 @@ def test_an_estimate_counts_the_trials_that_left_the_admissible_region(method):
     number = point.failures["inadmissible"]
     assert f"trials that failed: {number} inadmissible" in str(point)
     assert json.loads(to_dataset(point).attrs["failures"]) == {"inadmissible": number}
+
+
+def test_an_optimiser_that_stops_at_the_edge_of_the_region_has_not_converged():
+    """Its line search meets vectors without a value, and SciPy calls where it stops a success."""
+    point = estimate(problem(FAR), "scipy:L-BFGS-B", tolerance=1e-7)
+    assert point.failures["inadmissible"] > 0
+    assert abs(point["full_stroke"] - TRUTH) > 0.02  # BE's standard deviation is far below a mm
+    assert point.status is Status.NO_CONVERGENCE
 
 
 def test_nothing_failed_nothing_said():
@@ -60,11 +71,11 @@ def test_nothing_failed_nothing_said():
 
 
 def test_methods_tried_in_turn_add_up():
-    first = estimate(problem(1.3), "be", max_iterations=1)
+    first = estimate(problem(FAR), "be", max_iterations=1)
     assert first.status is Status.NO_CONVERGENCE
-    second = estimate(problem(1.3), "levenberg-marquardt")
-    both = estimate(problem(1.3), ["be", "levenberg-marquardt"], max_iterations=None)
-    assert both.failures == estimate(problem(1.3), "be").failures
+    second = estimate(problem(FAR), "levenberg-marquardt")
+    both = estimate(problem(FAR), ["be", "levenberg-marquardt"], max_iterations=None)
+    assert both.failures == estimate(problem(FAR), "be").failures
     assert added([first.failures, second.failures]) == {
         "inadmissible": first.failures["inadmissible"] + second.failures["inadmissible"]
     }

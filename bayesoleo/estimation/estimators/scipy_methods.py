@@ -4,6 +4,10 @@ They work in the same scaled unknowns and on the same objective, with ``v`` elim
 least-squares methods restage it between solves, the others see the objective in which it is staged
 everywhere.
 Where the objective has a prior they maximise with it, as BE does.
+
+An optimiser's own word for success is checked. A line search that meets vectors which cannot be
+evaluated may stop on a slope and report that the objective no longer changes; such a point is no
+optimum, and its status is ``NO_CONVERGENCE``.
 """
 
 from __future__ import annotations
@@ -39,6 +43,12 @@ _STAGES = 50
 _FINEST = 1e-15
 # What a vector that cannot be evaluated is worth to a minimiser, which needs a finite number.
 _REFUSED = 1e30
+# A point is an optimum if the Gauss-Newton step from it is shorter than one posterior standard
+# deviation, or than this part of the unknowns: where the fit is exact, the standard deviation is
+# round-off. Both are far above what any of the optimisers' own tolerances leave.
+_ONE_SD, _NO_STEP = 1.0, 1e-4
+# Scaled distance to a bound below which an unknown lies on it.
+_ON_BOUND = 1e-8
 
 
 def run_scipy(
@@ -94,7 +104,8 @@ def run_scipy(
                 found = search.by_minimiser(name, tolerance, max_iterations)
         except (ValueError, np.linalg.LinAlgError):  # a vector that cannot be evaluated
             return search.outcome(Status.NOT_FINITE)
-    return search.outcome(Status.CONVERGED if found else Status.NO_CONVERGENCE)
+    converged = found and search.at_optimum()
+    return search.outcome(Status.CONVERGED if converged else Status.NO_CONVERGENCE)
 
 
 class _Search:
@@ -231,6 +242,28 @@ class _Search:
         parts = [j.T @ w for j, w in zip(evaluation.sensitivity, weighted, strict=True)]
         slope = self.scale.unit(theta) * np.sum(parts, axis=0)
         return -(slope + self.scale.slope(theta)) if self.prior else -slope
+
+    def at_optimum(self) -> bool:
+        """Whether the best point is a stationary one, by the Gauss-Newton step from it."""
+        evaluation = self.best
+        if evaluation is None:
+            return False
+        unit, down_up = self.scale.unit(self.theta), self.scale.room(self.theta)
+        jacobian, residual = self.errors.rows(evaluation, unit, self.staged(evaluation))
+        if self.prior:
+            pull = np.linalg.solve(self.scale.root.T, self.scale.slope(self.theta))
+            jacobian = np.vstack((jacobian, self.scale.root))
+            residual = np.concatenate((residual, pull))
+        down, up = (~self.scale.logarithmic & (room < _ON_BOUND) for room in down_up)
+        uphill = jacobian.T @ residual
+        free = ~((down & (uphill < 0)) | (up & (uphill > 0)))
+        if not free.any():
+            return True
+        step = np.linalg.lstsq(jacobian[:, free], residual, rcond=1e-12)[0]
+        if np.linalg.norm(jacobian[:, free] @ step) < _ONE_SD:
+            return True
+        size = np.abs(self.theta[free]) + self.scale.spread[free] * _NO_STEP
+        return bool((np.abs(unit[free] * step) < _NO_STEP * size).all())
 
     def outcome(self, status: Status) -> Outcome:
         """What the loop of the other estimators would return."""
