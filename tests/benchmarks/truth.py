@@ -1,9 +1,9 @@
 """Whether what the package says is true: verdicts, intervals, inputs, solutions, names.
 
-Run as ``python tests/benchmarks/truth.py [--json] [--only PART …] [--fraction 0.1]``. Each part is a
-module ``truth_<part>.py`` beside this one with a function ``figures(fraction, say)``; together they
+Run as ``python tests/benchmarks/truth.py [--json] [--only PART …] [--fraction 0.1]``. A part is a
+module ``truth_<part>.py`` beside this one with a function ``figures(fraction, say)``. Together they
 make one flat object. A fraction below one takes a fixed part of the cases, for a quick look; the
-figures of the README come from all of them. The measured sets are found through ``BAYESOLEO_DATA``.
+figures of the README come from all of them. The measured sets are found by ``BAYESOLEO_DATA``.
 """
 
 from __future__ import annotations

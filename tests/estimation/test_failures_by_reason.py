@@ -18,7 +18,7 @@ from bayesoleo.solvers.status import Status, added, counted
 #: Reached in the record, m, of a stroke that ends at ``TRUTH``: beyond that the gas law has no
 #: pressure.
 REACHED, TRUTH = 0.90, 0.93
-#: From here every trial of the estimators ends at least 0.02 m inside or outside the region, so that
+#: From here every trial of the estimators ends 0.02 m or more inside or outside the region, so that
 #: no rounding of another processor's decides which ones fail.
 FAR = 1.1
 
