@@ -11,6 +11,7 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.review import reviewed
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
@@ -113,6 +114,8 @@ def close_loop(
     seed: int = 0,
     max_effects: int = 4,
     unnamed: bool = True,
+    known: Progress | None = None,
+    keep: Callable[[Progress], None] = lambda _: None,
     say: Say = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model, and add the effects that it lacks one after the other.
@@ -133,6 +136,10 @@ def close_loop(
         Effects added at most.
     unnamed : bool
         Whether a smooth function may be added where no named effect explains what is left.
+    known : Progress, optional
+        Of the same search, stopped before: it goes on from there.
+    keep : callable
+        Given the progress once the model is estimated, and after each round.
     say : callable
         Told what is being done.
 
@@ -140,13 +147,11 @@ def close_loop(
     -------
     ClosedLoop
     """
-    notes: list[str] = []
-    if roles.strategy != "declared":
-        notes.append(roles.description)
-    state = fit_state(assembly, roles, numerics, progress=say)
-    state = _freed(state, roles, numerics, notes, say)
-    first, rounds = state, list[Round]()
-    while True:
+    if known is None:
+        known = _begun(assembly, roles, numerics, say)
+        keep(known)
+    while not known.finished:
+        rounds, state, notes = known.rounds, known.state, list(known.notes)
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = _limit(state.assembly.steps, len(rounds), max_effects)
         outcome = examine(state, roles, numerics, effects=effects, seed=seed, limit=limit, say=say)
@@ -154,21 +159,40 @@ def close_loop(
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects
             outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
-        rounds.append(outcome)
-        if outcome.after is None:
-            break
-        state = _pruned(outcome.after, roles, numerics, notes, say)
-    notes += _warnings(state.fit)
-    notes += unnamed_notes(rounds)
+        if outcome.after is not None:
+            state = _pruned(outcome.after, roles, numerics, notes, say)
+        known = known.after(outcome, state, notes)
+        keep(known)
+    rounds = reviewed(known.rounds, known.state, roles, numerics, effects, say)
+    return loop_of(replace(known, rounds=rounds), roles)
+
+
+def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Progress:
+    """The declared model, estimated."""
+    notes = [] if roles.strategy == "declared" else [roles.description]
+    state = fit_state(assembly, roles, numerics, progress=say)
+    state = _freed(state, roles, numerics, notes, say)
+    return Progress(state, state, notes=tuple(notes))
+
+
+def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
+    """What a search has found, with what a reader should know of its final model.
+
+    Parameters
+    ----------
+    progress : Progress
+        Ended; see :meth:`Progress.ended`.
+    roles : Roles
+    """
+    state = progress.state
+    notes = [*progress.notes, *_warnings(state.fit), *unnamed_notes(progress.rounds)]
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     if not state.at_floor:
         notes.append(
             "intervals count independent noise only: while an error remains that repeats, they are"
             " too narrow"
         )
-    return ClosedLoop(
-        reviewed(rounds, state, roles, numerics, effects, say), first, state, roles, tuple(notes)
-    )
+    return ClosedLoop(progress.rounds, progress.first, state, roles, tuple(notes))
 
 
 def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:

@@ -1,0 +1,50 @@
+"""How far a search has come: all that it needs to go on after its last finished round."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from bayesoleo.tracing.deciding.rounds import Round
+from bayesoleo.tracing.deciding.state import State
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A search between two rounds.
+
+    Parameters
+    ----------
+    first, state : State
+        The model as declared, and with the effects that the finished rounds added.
+    rounds : tuple of Round
+        Those that are finished.
+    notes : tuple of str
+        What a reader should know so far.
+    """
+
+    first: State
+    state: State
+    rounds: tuple[Round, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last round accepted nothing, so that no other follows."""
+        return bool(self.rounds) and self.rounds[-1].after is None
+
+    def after(self, outcome: Round, state: State, notes: list[str]) -> Progress:
+        """With one more round."""
+        return Progress(self.first, state, (*self.rounds, outcome), tuple(notes))
+
+    def ended(self, reason: str) -> Progress:
+        """With a last round that examined nothing and accepts nothing, where there is none.
+
+        Parameters
+        ----------
+        reason : str
+            Why the search went no further.
+        """
+        if self.finished:
+            return self
+        last = Round(self.state, (), {}, None, None, reason, 1.0)
+        return replace(self, rounds=(*self.rounds, last))
