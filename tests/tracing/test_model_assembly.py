@@ -9,6 +9,7 @@ import pytest
 from small_campaigns import damper
 
 from bayesoleo.effects import Amplitude, Effect, Scales, find_effect
+from bayesoleo.effects.unnamed import Axis, Spline
 from bayesoleo.model import Normal
 from bayesoleo.model.expressions import symbol
 from bayesoleo.systems import system
@@ -109,6 +110,22 @@ def test_what_acts_on_an_effect_leaves_with_it(oscillator):
     grown = add(add(grown, "sensor_offset", "force"), "varies_by_run", "damping")
     less = grown.without(grown.steps[0])
     assert less.added == (("sensor_offset", "force"), ("varies_by_run", "damping"))
+
+
+def test_a_curve_over_what_an_effect_brought_leaves_with_it():
+    """A function of the memory of a friction law cannot be evaluated without that memory."""
+    grown = add(Assembly(damper()), "dahl_friction")
+    memory = Axis("dahl_friction_memory", symbol("dahl_friction_memory"), "", -1.0, 1.0)
+    stroke = Axis("displacement", symbol("displacement"), "m", -0.01, 0.01)
+    for axis in (memory, stroke):
+        curve = Spline("force", (axis,), (4,), np.eye(7)).effect()
+        grown = grown.option(curve, "force", SCALES).assembly
+    less = grown.without(grown.steps[0])
+    assert less.added == (("unnamed_displacement", "force"),)
+    assert "dahl_friction_memory" not in less.model().dofs
+    used = less.model().output("force").free_symbols
+    assert symbol("dahl_friction_memory") not in used
+    assert symbol("displacement") in used
 
 
 def test_without_its_only_effect_the_model_is_the_declared_one(oscillator):

@@ -14,6 +14,7 @@ from bayesoleo.effects import Candidate, Effect, Scales, candidates, catalogue
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation.runs.nuisance import Nuisance
 from bayesoleo.model import Model, Parameter, driven_by
+from bayesoleo.model.expressions import split_derivative
 from bayesoleo.model.initial import with_estimated_starts
 
 #: Added effects by name: (effect, target).
@@ -130,12 +131,20 @@ class Assembly:
         )
 
     def without(self, step: Step) -> Assembly:
-        """The same assembly with one effect left out, and those that act on what it brought."""
+        """The same assembly with one effect left out, and those that act on what it brought.
+
+        An effect acts on what another brought if it sits there, as a parameter that varies by run
+        does, or follows it, as a curve follows the memory of a friction law.
+        """
         declared = self.declared or self.native
         base = Assembly(declared, self.drive, nuisance=self.nuisance, starts=self.starts)
+        everywhere = _undeclared(self.model())
         for other in self.steps:
-            if other is not step and other.target in other.effect.places(base._base(other.effect)):
-                base = base.option(other.effect, other.target, other.scales).assembly
+            if other is step or other.target not in other.effect.places(base._base(other.effect)):
+                continue
+            option = base.option(other.effect, other.target, other.scales)
+            if _undeclared(option.model) <= everywhere:
+                base = option.assembly
         present = self.model().parameters
         kept = {name: item for name, item in present.items() if name in base.model().parameters}
         return base.with_parameters(kept)
@@ -188,3 +197,13 @@ class Assembly:
         }
         sensors = (*self.sensors, (effect, candidate.target, scales))
         return replace(grown, sensors=sensors, parameters={**self.parameters, **new})
+
+
+def _undeclared(model: Model) -> set[str]:
+    """Names in a model's expressions that nothing in it declares, such as the time's."""
+    expressions = [*model.definitions.values(), *model.admissible]
+    expressions += [term for terms in model.equations.values() for term in terms.values()]
+    expressions += [term for name in model.outputs for term in model.output_terms(name).values()]
+    used = {split_derivative(item)[0] for e in expressions for item in e.free_symbols}
+    known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
+    return used - known
