@@ -7,11 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fitted_states import NUMERICS
+from fitted_states import NUMERICS, motion
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.effects import find_effect
-from bayesoleo.tracing.deciding.confirmation import confirmed, fall_on_hold_out, judged
+from bayesoleo.tracing.deciding.confirmation import confirmed, judged
+from bayesoleo.tracing.deciding.fall import Fall, fall_on_hold_out, surrogate_variance, with_error
 from bayesoleo.tracing.deciding.loop import close_loop
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.errors.holdout import crossed
@@ -36,24 +37,27 @@ def states(folder, seed, offsets=None):
 
 
 def test_what_fits_noise_is_charged_for_it(tmp_path):
-    """On its own samples a parameter gains one on average; across halves it costs two."""
+    """On its own samples a parameter gains one on average, which is charged; across halves it
+    costs two."""
     own, across = [], []
     for seed in range(25):
         before, after = states(tmp_path / str(seed), seed)
-        own.append(fall_on_hold_out(before, after)[0])
+        own.append(fall_on_hold_out(before, after).value)
         old, new = judged(before, after)
         assert old.held_out == before.held_out, "nothing of its own is estimated on it"
         assert all(p.re_estimated == 0 for p in new.held_out)
-        across.append(fall_on_hold_out(old, new)[0])
+        across.append(fall_on_hold_out(old, new).value)
     # Two runs; each fall is a chi-square, so that the mean of 25 sums scatters by 0.4 and 0.8.
-    assert np.mean(own) == pytest.approx(2.0, abs=1.6)
+    assert np.mean(own) == pytest.approx(0.0, abs=1.6)
     assert np.mean(across) == pytest.approx(-4.0, abs=3.2)
 
 
 def test_an_offset_of_a_run_is_confirmed(tmp_path):
     before, after = states(tmp_path, 0, {"a": 1.0, "d": -2.0, "e": 3.0})
-    fall, error = fall_on_hold_out(*judged(before, after))
-    assert fall > 5 * error
+    fall = fall_on_hold_out(*judged(before, after))
+    assert fall.value > 5 * fall.error
+    # The effect is exactly right: what it lowers the error by is the square of what it changes.
+    assert fall.value == pytest.approx(fall.expected, abs=3 * fall.error)
 
 
 def test_across_halves_predictions_keep_their_place(tmp_path):
@@ -107,8 +111,79 @@ def test_a_stop_that_runs_held_out_do_not_reach(tmp_path, stiffness, found):
 def test_what_leaves_more_than_noise_must_explain_more(share, reached, enough):
     """A share that is enough is asked for its posterior next, which here excludes nothing."""
     item = SimpleNamespace(effect="play", gain=share)
-    result = SimpleNamespace(share=share, reached=reached, excludes_null=lambda: False)
+    result = SimpleNamespace(
+        share=share,
+        reached=reached,
+        excludes_null=lambda: False,
+        fall=324.0,
+        inflation=62.5,
+        size=1,
+    )
     after, reason = confirmed(None, item, result, None, NUMERICS, print)
     assert after is None
     assert ("does not exclude its null" in reason) is enough
     assert (f"would explain only {100 * share:.0f} %" in reason) is not enough
+    assert "by 320 ± 280" in reason, "a fall is never said without its error"
+
+
+def test_a_fall_of_about_its_error_confirms_nothing():
+    fall = Fall(324.0, 300.0, 5000.0)
+    assert not fall.confirms
+    assert not fall.undecided, "a real effect of this size would have been confirmed"
+    assert Fall(324.0, 300.0, 900.0).undecided
+    assert Fall(8.03e4, 1.8e4, 7.1e4).confirms
+    both = fall + Fall(900.0, 400.0, 800.0)
+    assert (both.value, both.error, both.expected) == (1224.0, 500.0, 5800.0)
+    assert both.confirms
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (324.4, 300.2, "320 ± 300"),
+        (-12.346, 0.678, "-12.35 ± 0.68"),
+        (8.027e6, 1.77e4, "8.03e+06 ± 1.8e+04"),
+        (0.0, 0.0, "0 ± 0"),
+    ],
+)
+def test_a_value_has_the_digits_that_its_error_leaves(value, error, text):
+    assert with_error(value, error) == text
+
+
+@pytest.mark.parametrize("size", [200, 201])
+def test_a_remainder_with_random_phases_scatters_as_computed(size):
+    rng = np.random.default_rng(3)
+    t = np.arange(size) / size
+    left = 0.3 + np.sin(2 * np.pi * 3 * t) + 0.5 * np.cos(2 * np.pi * 9 * t + 1.0)
+    change = 0.2 + np.sin(2 * np.pi * 3 * t + 2.0) + np.cos(2 * np.pi * 5 * t)
+    lines = np.abs(np.fft.rfft(left))
+    drawn = []
+    for _ in range(4000):
+        turned = lines * np.exp(2j * np.pi * rng.uniform(size=lines.size))
+        turned[0] = lines[0] * rng.choice([-1.0, 1.0])
+        drawn.append(float(change @ np.fft.irfft(turned, size)))
+    # A variance from 4000 draws scatters by 2 %, by less where draws are bounded.
+    assert surrogate_variance(change, left) == pytest.approx(np.mean(np.square(drawn)), rel=0.08)
+
+
+def test_noise_of_the_input_scatters_a_fall_as_much_as_is_said(tmp_path):
+    """The input's noise moves a fall along with the output's; each is counted once."""
+    pulls = []
+    for seed in range(30):
+        reduced = damper_campaign(
+            tmp_path / str(seed), plain, seed=seed, input_noise=3e-5, noise=0.05,
+            per_period=30.3, periods=4,
+        )  # fmt: skip
+        state = fit_state(Assembly(damper(cubic=False)), assign(reduced.records), NUMERICS)
+
+        def with_damping(value, state=state):
+            found = []
+            for prediction in state.held_out:
+                x, v = motion(prediction.record)
+                found.append(replace(prediction, y=plain(x, v, None)[None] + (value - 200.0) * v))
+            return replace(state, held_out=found)
+
+        fall = fall_on_hold_out(with_damping(199.0), with_damping(200.0))
+        pulls.append((fall.value - fall.expected) / fall.error)
+    # Thirty standard normal draws: their mean square scatters by a quarter.
+    assert 0.4 < np.mean(np.square(pulls)) < 1.9

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesoleo.tracing.deciding.loop import ClosedLoop, _superfluous
+from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.rounds import LEVEL, _hidden, _may_be_significant
 from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME, corrected_p, without_twins
@@ -95,25 +95,3 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
 def test_a_name_is_certain_where_nothing_else_could_be(change, certain):
     # A hundredth shared by sixty tests leaves 1.7e-4 to each: 14.2 of chi-square.
     assert loop(**change).certain is certain
-
-
-@pytest.mark.parametrize(
-    ("family", "distance", "stays"),
-    [
-        ("stiffness", 8.0, True),
-        ("stiffness", 5.0, False),
-        ("run-to-run", 8.0, False),
-        ("run-to-run", 14.0, True),
-    ],
-)
-def test_what_takes_up_a_part_of_everything_stays_only_if_it_is_worth_it(family, distance, stays):
-    """Two unknowns: 5 % are 5.99, and among 500 samples they are worth 2 ln 500 = 12.4."""
-    step = SimpleNamespace(effect=SimpleNamespace(family=family), amplitudes=("a",))
-    runs = [SimpleNamespace(measured=np.zeros((1, 250))), SimpleNamespace(measured=np.zeros(250))]
-    theta = np.array([1.0, np.sqrt(distance / 2), np.sqrt(distance / 2)])
-    fit = SimpleNamespace(
-        problem=SimpleNamespace(names=("b", "a[1]", "a[2]")),
-        point=SimpleNamespace(theta=theta, covariance=np.eye(3)),
-        predictor=SimpleNamespace(runs=runs),
-    )
-    assert _superfluous(fit, step) is not stays

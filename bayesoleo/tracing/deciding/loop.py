@@ -11,22 +11,20 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.elimination import eliminated
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.review import reviewed
-from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Round, examine
+from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
-from bayesoleo.tracing.scoring.projection import information_beside, squared_distance
+from bayesoleo.tracing.scoring.projection import information_beside
 from bayesoleo.tracing.scoring.significance import SAME
 
 #: A constant known to a tolerance is freed if the data know it this many times better.
 FREED_BY = 2.0
-#: Probability with which noise alone would show as much of an effect as there still is, from which
-#: on it is taken out again.
-STAYS = 0.05
 #: Part of the excess that added effects must explain for the loop to call the model's lack found:
 #: what is left is then less than a third of what there was, in size.
 MOSTLY = 0.9
@@ -160,7 +158,7 @@ def close_loop(
             room = len(state.assembly.steps) < max_effects
             outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
         if outcome.after is not None:
-            state = _pruned(outcome.after, roles, numerics, notes, say)
+            state = eliminated(outcome.after, roles, numerics, notes, say)
         known = known.after(outcome, state, notes)
         keep(known)
     rounds = reviewed(known.rounds, known.state, roles, numerics, effects, say)
@@ -245,33 +243,6 @@ def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say
         {name: replace(values[name], fixed=False) for name in chosen}
     )
     return fit_state(assembly, roles, numerics, progress=say)
-
-
-def _pruned(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
-    """Take out effects that a later one has made superfluous."""
-    for step in state.assembly.steps[:-1]:
-        if _superfluous(state.fit, step):
-            say(f"remove {step.effect.id}: its posterior no longer excludes the null")
-            notes.append(f"{step.effect.id} was removed again: a later effect made it superfluous")
-            return fit_state(state.assembly.without(step), roles, numerics, progress=say)
-    return state
-
-
-def _superfluous(fit: Fit, step: Step) -> bool:
-    """Whether the null of an effect is as likely as its estimate.
-
-    What takes up a part of whatever is missing came in for want of what has been found since; it
-    stays only if it is worth its unknowns (Schwarz 1978).
-    """
-    index = [k for k, name in enumerate(fit.problem.names) if name.split("[")[0] in step.amplitudes]
-    value, covariance = fit.point.theta[index], fit.point.covariance[np.ix_(index, index)]
-    if not index or not np.isfinite(covariance).all():
-        return False
-    least = float(stats.chi2.isf(STAYS, len(index)))
-    if step.effect.family in IMITATORS:
-        samples = sum(run.measured.size for run in fit.predictor.runs)
-        least = max(least, len(index) * float(np.log(samples)))
-    return squared_distance(value, covariance) < least
 
 
 def _warnings(fit: Fit) -> list[str]:

@@ -153,19 +153,8 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = score.option.assembly.with_values(base.fit.shared)
     assembly = assembly.with_parameters(new_parameters(assembly, score))
     model = assembly.model()
-    start = _start(base, score, model)
-    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
-    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
-    fit = fit_model(
-        model,
-        base.fit.records,
-        quick,
-        start=start,
-        tolerance=1e-4,
-        max_iterations=15,
-        share=base.fit.predictor,
-        check_mesh=False,
-    )
+    expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    fit = quick_fit(base, model, base.fit.values | expected, numerics)
     share, changes = compare(base, fit)
     contribution = np.concatenate(
         [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]
@@ -174,18 +163,40 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         share = -np.inf  # what cannot be solved at its estimate explains nothing
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
-    inflation, freedom = _inflation(base, fit, score, changes)
+    measured = inflation_along(base, fit, score.names, changes)
+    inflation, freedom = (score.inflation, score.freedom) if measured is None else measured
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
-    price = float(np.log(sum(run.residual.size for run in base.runs)))
+    price = schwarz_price(base)
     return Refit(
         score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price
     )
 
 
-def _inflation(base: Base, fit: Fit, score: Score, changes: Sequence[Array]) -> tuple[float, int]:
-    """Variance of the new amplitudes over white noise's, and its degrees of freedom.
+def schwarz_price(base: Base) -> float:
+    """By how much an unknown has to lower the sum of squares: the logarithm of the samples."""
+    return float(np.log(sum(run.residual.size for run in base.runs)))
 
+
+def inflation_along(
+    base: Base, fit: Fit, names: Sequence[str], changes: Sequence[Array]
+) -> tuple[float, int] | None:
+    """Variance of an effect's unknowns over white noise's, and its degrees of freedom; None where
+    nothing finite is known of it.
+
+    Parameters
+    ----------
+    base : Base
+        What the effect is held against.
+    fit : Fit
+        With the effect in.
+    names : sequence of str
+        Its unknowns.
+    changes : sequence of ndarray, shape (m,)
+        What it changes in each run, in noise units.
+
+    Notes
+    -----
     Periodic runs: as for a score, along what the estimate changes. An effect that a step from the
     null describes badly, like a lag where friction switches, leaves a remainder there that is no
     noise; its estimate does not. What a model leaves of a transient is seldom white, and at the
@@ -195,10 +206,10 @@ def _inflation(base: Base, fit: Fit, score: Score, changes: Sequence[Array]) -> 
     """
     if all(record.periodic for record in fit.records):
         if not all(np.isfinite(change).all() for change in changes):
-            return score.inflation, score.freedom
+            return None
         return inflation_of(base, changes)
     free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
-    own = [k for k, name in enumerate(fit.problem.names) if name in score.names]
+    own = [k for k, name in enumerate(fit.problem.names) if name in names]
     parts = [
         _stretches(run, predicted, replicate(record), fit, free, own)
         for run, predicted, record in zip(
@@ -207,7 +218,7 @@ def _inflation(base: Base, fit: Fit, score: Score, changes: Sequence[Array]) -> 
     ]
     pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
     if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
-        return score.inflation, 0
+        return None
     worst, freedom = 1.0, 0
     for k, row in enumerate(own):
         overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
@@ -268,12 +279,36 @@ def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
     return changed
 
 
-def _start(base: Base, score: Score, model: Model) -> Array:
-    """Present estimates, by-run ones included, and the expected values of the new unknowns."""
-    layout = Layout.of(model, [record.label for record in base.fit.records])
-    known: Mapping[str, float] = base.fit.values | dict(
-        zip(score.names, map(float, score.expected), strict=True)
+def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Numerics) -> Fit:
+    """Estimate a model to compare it with the present one, on the same runs and mesh.
+
+    Parameters
+    ----------
+    base : Base
+        Of the present model.
+    model : Model
+        Driven; its nominal values are where shared unknowns start.
+    known : mapping of str to float
+        Starts of unknowns of single runs, as far as they are known.
+    numerics : Numerics
+    """
+    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
+    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
+    return fit_model(
+        model,
+        base.fit.records,
+        quick,
+        start=_start(base, known, model),
+        tolerance=1e-4,
+        max_iterations=15,
+        share=base.fit.predictor,
+        check_mesh=False,
     )
+
+
+def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
+    """Nominal values, and of unknowns of single runs those that are known."""
+    layout = Layout.of(model, [record.label for record in base.fit.records])
     start = layout.start(model)
     for k, name in enumerate(layout.names):
         if "[" in name and name in known:

@@ -1,0 +1,155 @@
+"""By how much an effect lowers the squared error on runs that were not used, and how sure that is.
+
+References
+----------
+McCullagh and Nelder (1989), Generalized Linear Models, section 4.5: dispersion. Theiler et al.
+(1992), Physica D 58, 77-94: a remainder with the same spectrum and random phases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo.prediction.input_noise import input_columns
+from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.errors.holdout import Prediction
+from bayesoleo.tracing.fitting.masked import weights
+
+Array = NDArray[np.float64]
+
+#: Probability with which an effect is confirmed that does not lower the error.
+FALSE_ALARM = 0.025
+#: So many standard errors a fall must exceed.
+ENOUGH = float(stats.norm.isf(FALSE_ALARM))
+#: Runs held out cannot judge an effect by themselves if its fall, should it be real, would not be
+#: confirmed in all but this part of cases.
+MISSED = 0.025
+
+
+@dataclass(frozen=True)
+class Fall:
+    """Fall of the weighted sum of squares on runs that were not used.
+
+    Parameters
+    ----------
+    value : float
+        Sum over the runs, less the charge for parameters that were estimated on them.
+    error : float
+        Standard error.
+    expected : float
+        What it would be on average if the effect is exactly right.
+    """
+
+    value: float
+    error: float
+    expected: float
+
+    @property
+    def confirms(self) -> bool:
+        """Whether the fall exceeds its error as often as is asked for."""
+        return bool(self.value > ENOUGH * self.error)
+
+    @property
+    def undecided(self) -> bool:
+        """Whether these runs are unlikely to confirm even an effect that is real."""
+        return bool(self.expected < (ENOUGH + stats.norm.isf(MISSED)) * self.error)
+
+    def __add__(self, other: Fall) -> Fall:
+        error = float(np.hypot(self.error, other.error))
+        return Fall(self.value + other.value, error, self.expected + other.expected)
+
+    def __str__(self) -> str:
+        return with_error(self.value, self.error)
+
+
+def with_error(value: float, error: float) -> str:
+    """A value with its standard error, to as many digits as the error leaves."""
+    if not (np.isfinite(value) and np.isfinite(error) and error > 0):
+        return f"{value:.3g} ± {error:.2g}"
+    last = int(np.floor(np.log10(error))) - 1  # two digits of the error
+    if max(abs(value), error) < 1e6 and last > -6:
+        digits = max(0, -last)
+        step = 10.0**last
+        return f"{round(value / step) * step:.{digits}f} ± {round(error / step) * step:.{digits}f}"
+    return f"{value:.3g} ± {error:.2g}"
+
+
+def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fall:
+    """Fall of the weighted sum of squares on held-out runs, and its standard error.
+
+    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``. Noise with the
+    covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
+    ``4 d' w (1/w + B B') w d`` with ``d = b - a``; coloured noise multiplies the first part by the
+    inflation. What the model still leaves, beyond the noise, adds to it. Runs that could not be
+    solved in both states do not count.
+
+    Parameters
+    ----------
+    before, after : State
+        Without and with the effect.
+    inflation : float
+        Variance of the output's noise along what the effect changes, over that of white noise.
+
+    Returns
+    -------
+    Fall
+        Each parameter that only the model with the effect estimates on the runs themselves is
+        charged with what it takes of their noise on average.
+    """
+    fall = expected = variance = 0.0
+    charged = sum(p.re_estimated for p in after.held_out)
+    charged -= sum(p.re_estimated for p in before.held_out)
+    for old, new in zip(before.held_out, after.held_out, strict=True):
+        if not (old.status.ok and new.status.ok):
+            continue
+        parts = _of_run(before, after, old, new, inflation)
+        fall, expected, variance = fall + parts[0], expected + parts[1], variance + parts[2]
+    return Fall(fall - inflation * charged, float(np.sqrt(variance)), expected)
+
+
+def _of_run(
+    before: State, after: State, old: Prediction, new: Prediction, inflation: float
+) -> tuple[float, float, float]:
+    """Fall in one run, what it is on average if the effect is right, and its variance."""
+    predictor, record = old.predictor, old.record
+    columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
+    fall = expected = noise = remainder = 0.0
+    moved: Array | float = 0.0
+    for b, output in enumerate(new.predictor.outputs):
+        weight = before.hold_errors.at(output, record.label).average.sigma ** -2
+        counts = weights(record)
+        left = (record.samples[output] - new.y[b]) * counts
+        change = (new.y[b] - old.y[b]) * counts
+        size = weight * float(change @ change)
+        fall += weight * float(np.sum(((left + change) ** 2 - left**2) * counts))
+        expected += size
+        pulled = weight * (columns[b] @ change)
+        moved = moved + pulled
+        own = inflation * size + float(np.sum(np.square(pulled)))
+        noise += inflation * size
+        if record.periodic and not after.at_floor:
+            ratio = after.hold_errors.at(output, record.label).ratio
+            spread = max(ratio**2 - 1.0, 0.0) * own
+            remainder += min(spread, weight**2 * surrogate_variance(change, left))
+    return fall, expected, 4.0 * (noise + float(np.sum(np.square(moved))) + remainder)
+
+
+def surrogate_variance(change: Array, left: Array) -> float:
+    """Variance of ``change @ s`` over remainders ``s`` with the spectrum of ``left`` and random
+    phases.
+
+    What still repeats scatters a fall: a curve that happens to run along it proves nothing. It is
+    taken to be spread as the noise is, but never to have more power than it shows where the effect
+    has any.
+
+    Parameters
+    ----------
+    change, left : ndarray, shape (N,)
+    """
+    power = np.abs(np.fft.rfft(change)) ** 2 * np.abs(np.fft.rfft(left)) ** 2
+    power[1 : (change.size + 1) // 2] *= 2.0  # each line stands for its conjugate too
+    return float(power.sum() / change.size**2)
