@@ -1,8 +1,8 @@
 """Predict runs that were not used, from a result with all of its uncertainty, and score it.
 
 Unknowns come as draws: of the posterior where the result holds one, else of the normal distribution
-about the estimate. What the result does not know, a by-run parameter of a new run or a constant
-known to a tolerance, is drawn from its prior. Noise of a sample is added to the interval.
+about the estimate. What the result does not know, such as a by-run parameter of a new run, is drawn
+from its prior. Noise of a sample is added to the interval.
 """
 
 from __future__ import annotations
@@ -125,7 +125,6 @@ def predict(
     rng = np.random.default_rng(seed)
     known = draws_of(tree, draws, rng)
     used = model_of(tree) if model is None else model
-    used = used.freeing(*used.uncertain())
     chosen = campaign.records if runs is None else [campaign.record(label) for label in runs]
     records = uncertain_conditions(used).complete(chosen)
     found = [_one_run(used, record, known, rng, level, scheme, steps, jobs) for record in records]

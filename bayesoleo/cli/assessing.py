@@ -165,7 +165,7 @@ def predict(
     """Predict runs that were not used, with intervals, and score the prediction.
 
     Parameters are drawn from the posterior of the result, or from the normal distribution about its
-    estimate; what it does not know, such as a constant held to a tolerance, from its prior. "rms"
+    estimate; what it does not know, such as a parameter of a new run, from its prior. "rms"
     is what came, "expected" what the prediction thought would; the part of the samples within the
     interval, and the distance of their probability integral transform from uniform, say whether the
     prediction knew how good it was.

@@ -13,8 +13,10 @@ from bayesoleo.model.expressions import symbol
 
 
 def _shared(model: Model) -> Sequence[str]:
-    """Estimated parameters that all runs share; a curve's coefficients mean nothing alone."""
-    shared = {n: model.parameters[n] for n in model.estimated() if not model.parameters[n].by_run}
+    """Estimated parameters that all runs share, but for constants known to a tolerance: these are
+    the same in all runs. A curve's coefficients mean nothing alone."""
+    free = {n: item for n, item in model.parameters.items() if not item.fixed}
+    shared = {n: item for n, item in free.items() if not item.by_run}
     return tuple(n for n, item in shared.items() if not item.description.startswith(COEFFICIENT))
 
 

@@ -262,14 +262,14 @@ class Model:
         return found
 
     def estimated(self) -> tuple[str, ...]:
-        """Names of the parameters that are not fixed."""
-        return tuple(name for name, parameter in self.parameters.items() if not parameter.fixed)
+        """Names of the unknowns: parameters that are not fixed, and constants known to a
+        tolerance."""
+        held = {name for name, item in self.parameters.items() if item.fixed and item.prior is None}
+        return tuple(name for name in self.parameters if name not in held)
 
     def uncertain(self) -> tuple[str, ...]:
-        """Names of the parameters that are fixed, but known to a tolerance only."""
-        return tuple(
-            name for name, item in self.parameters.items() if item.fixed and item.prior is not None
-        )
+        """Names of the constants known to a tolerance: fixed, with a prior."""
+        return tuple(name for name, item in self.parameters.items() if item.toleranced)
 
     def nominal(self) -> dict[sp.Symbol, float]:
         """Values of parameters and of conditions that have a default, for substitution."""
@@ -381,13 +381,13 @@ class Model:
         return self.with_parameters(**changed)
 
     def fixing(self, *names: str) -> Model:
-        """Fix parameters at their nominal values."""
+        """Fix parameters at their nominal values, exactly: their priors are dropped."""
         return self.with_parameters(
-            **{name: replace(self.parameters[name], fixed=True) for name in names}
+            **{name: replace(self.parameters[name], fixed=True, prior=None) for name in names}
         )
 
     def freeing(self, *names: str) -> Model:
-        """Estimate parameters that were fixed; they need a prior by now."""
+        """Take constants known to a tolerance for ordinary unknowns: MBE forgets their priors."""
         return self.with_parameters(
             **{name: replace(self.parameters[name], fixed=False) for name in names}
         )

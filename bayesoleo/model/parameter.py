@@ -31,9 +31,9 @@ class Parameter:
     prior : Prior, optional
         Any other prior, instead of ``sd``, ``relative_sd`` and ``bounds``.
     fixed : bool
-        Not estimated: keeps ``value``. With a prior it is known to that tolerance only: effects are
-        scored with its uncertainty counted, and it is freed when a lack of fit remains that it may
-        explain.
+        Not estimated: keeps ``value``. With a prior it is a constant known to that tolerance, and
+        an unknown like a nuisance parameter: the prior is a measurement that every estimator and
+        the posterior count.
     by_run : bool
         One independent value for every run.
     nuisance : bool
@@ -73,7 +73,7 @@ class Parameter:
         # The prior is what counts from here on; a copy with another value keeps it.
         for name in ("sd", "relative_sd", "bounds"):
             object.__setattr__(self, name, None)
-        if self.prior is not None and not self.fixed:
+        if self.prior is not None:
             low, high = self.prior.support
             if not low <= self.value <= high:
                 raise ModelError(
@@ -81,6 +81,16 @@ class Parameter:
                     value=self.value,
                     hint=f"choose a value between {low:g} and {high:g}, or wider bounds",
                 )
+
+    @property
+    def toleranced(self) -> bool:
+        """Whether it is a constant known to a tolerance."""
+        return self.fixed and self.prior is not None
+
+    @property
+    def measured(self) -> bool:
+        """Whether its prior is a measurement, which no estimator may forget."""
+        return self.nuisance or self.toleranced
 
     def _stated_prior(self) -> Prior | None:
         spread = self.sd

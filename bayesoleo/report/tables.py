@@ -207,8 +207,12 @@ def _together(text: str) -> str:
 
 
 def parameters(summary: Mapping[str, Any]) -> Table:
-    """Estimate and posterior of every parameter, each row in its own unit."""
+    """Estimate and posterior of every parameter, each row in its own unit.
+
+    Beside a constant known to a tolerance stands what was known before the data.
+    """
     rows = []
+    any_known = any(entry.get("tolerance") for entry in summary["parameters"].values())
     for label, entry in summary["parameters"].items():
         sizes = [abs(entry[k]) for k in ("estimate", "mean", "sd") if entry[k] is not None]
         scale = engineering(entry["unit"], max(sizes, default=0.0))
@@ -218,8 +222,16 @@ def parameters(summary: Mapping[str, Any]) -> Table:
         text = "–"
         if interval is not None:
             text = " … ".join(_scaled(bound, scale, sd) for bound in interval)
-        rows.append([label, *values, text, scale.unit or "1"])
-    return Table(["parameter", "estimate", "mean", "sd", "95 % interval", "unit"], rows)
+        known = entry.get("tolerance")
+        before = "–"
+        if known:
+            ends = [
+                _scaled(known[key], scale, scale.factor * known["sd"]) for key in ("value", "sd")
+            ]
+            before = " ± ".join(ends)
+        rows.append([label, *values, text, *([before] if any_known else []), scale.unit or "1"])
+    head = ["parameter", "estimate", "mean", "sd", "95 % interval"]
+    return Table([*head, *(["known before"] if any_known else []), "unit"], rows)
 
 
 def records(tree: xr.DataTree) -> Table:

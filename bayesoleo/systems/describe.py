@@ -100,7 +100,7 @@ def describe(model: Model) -> dict[str, Any]:
 
 def _parameter(item: Parameter) -> dict[str, Any]:
     prior = None
-    if item.prior is not None and not item.fixed:
+    if item.prior is not None:
         low, high = (value if abs(value) < float("inf") else None for value in item.prior.support)
         prior = {
             "kind": type(item.prior).__name__,

@@ -30,7 +30,7 @@ def problem(start: float) -> CampaignProblem:
     """
     model = driven_by(system("end_stop"), "displacement")
     end = Parameter(start, "m", sd=0.1)
-    stop = replace(model.parameters["stop_stiffness"], fixed=True)
+    stop = replace(model.parameters["stop_stiffness"], fixed=True, prior=None)
     model = replace(
         model, parameters=model.parameters | {"full_stroke": end, "stop_stiffness": stop}
     )

@@ -215,6 +215,7 @@ def test_model_with_nuisances_is_read_back(oleo):
     assert uncertain_conditions(again).conditions == nuisance.conditions
     problem = CampaignProblem(Predictor(again, nuisance.complete([record]), steps=8))
     assert problem.nuisances == {
+        "orifice_damping",  # known to a tolerance
         "initial_pressure_error[h]", "ambient_temperature_error[h]",
         *(f"sensor_{k}_{c}" for k in ("offset", "gain") for c in nuisance.offset),
     }  # fmt: skip

@@ -89,7 +89,7 @@ def test_posterior_is_drawn_from_where_there_is_one(tmp_path, estimated):
     assert 0.9 < float(found["coverage"][0, 0]) < 0.99
 
 
-def test_constants_held_to_a_tolerance_and_runs_of_their_own_widen_it(estimated):
+def test_constants_with_a_tolerance_and_runs_of_their_own_widen_it(estimated):
     tree, reduced = estimated
     model = damper().with_parameters(
         offset=Parameter(0.0, "N", sd=3.0, fixed=True),

@@ -11,7 +11,7 @@ from small_campaigns import MASS, oscillator_campaign
 
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.tracing.scoring.base import Base, RunBase
-from bayesoleo.tracing.scoring.projection import coefficients, information_beside, squared_distance
+from bayesoleo.tracing.scoring.projection import coefficients, squared_distance
 from bayesoleo.tracing.scoring.score import INVISIBLE, SPANNED, _evaluate, score_all
 from bayesoleo.tracing.scoring.sensitivities import Block
 
@@ -125,23 +125,14 @@ def test_the_same_offset_scores_where_an_output_contains_it(linear_oscillator):
 
 
 @pytest.mark.parametrize("decades", [0, 5, 10])
-def test_units_do_not_matter_to_what_is_known_beside_others(decades):
+def test_units_do_not_matter_to_a_distance(decades):
     """A stiffness of the gas beside one of a stop: parameters ten decades apart."""
     rng = np.random.default_rng(0)
     J = rng.standard_normal((3, 50))
     J[0] += 2 * J[1] + J[2]
-    left = J[0] - J[1:].T @ np.linalg.lstsq(J[1:].T, J[0], rcond=None)[0]
     unit = np.array([1.0, 10.0**decades, 10.0**-decades])
-    scaled = J * unit[:, None]
-    assert information_beside(scaled @ scaled.T, 0) == pytest.approx(left @ left, rel=1e-9)
     covariance = np.linalg.inv(J @ J.T) / np.outer(unit, unit)
     value = np.array([0.3, -0.2, 0.1])
     assert squared_distance(value / unit, covariance) == pytest.approx(
         float(np.sum((value @ J) ** 2)), rel=1e-9
     )
-
-
-def test_nothing_is_known_beside_itself():
-    gram = np.ones((2, 2)) * 4.0
-    assert information_beside(gram, 0) == pytest.approx(0.0, abs=1e-12)
-    assert information_beside(gram[:1, :1], 0) == 4.0

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.iterate import iterate
+from bayesoleo.estimation.estimators.known import with_measured, without_measured
 from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.point import PointEstimate
@@ -19,7 +20,7 @@ from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.summarise import summarise
 from bayesoleo.estimation.objectives.diagonal import output_counts
 from bayesoleo.estimation.objectives.objective import Objective, objective_of
-from bayesoleo.estimation.problems.problem import Array, Problem, jumps_of
+from bayesoleo.estimation.problems.problem import Array, Problem, jumps_of, measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.solvers.status import added
 
@@ -54,8 +55,10 @@ def estimate(
         ``"newton"``, or ``"scipy:"`` and the name of one of SciPy's optimisers. Of several, each
         begins at the start until one converges. ``"be"``, ``"newton"`` and SciPy's end in a mode of
         the posterior where the objective has a prior; the others in the maximum-likelihood point,
-        for which the prior only scales the steps. Unknowns with a log-normal prior are stepped in
-        their logarithm, but the mode is that of the density per unit of the unknown itself.
+        for which the prior only scales the steps: they hold nuisance parameters and constants known
+        to a tolerance where they start, and carry their uncertainty into the covariance. Unknowns
+        with a log-normal prior are stepped in their logarithm, but the mode is that of the density
+        per unit of the unknown itself.
     objective : str or Objective, optional
         What is maximised: ``"diagonal"`` (the thesis's standard), ``"full"``, ``"given"``,
         ``"likelihood"``, ``"determinant"``, ``"weighted"`` or ``"unweighted"``; see
@@ -104,9 +107,8 @@ def estimate(
     found: list[PointEstimate] = []
     jumps = jumps_of(problem)
     for each in [method] if isinstance(method, str | Step) else method:
-        name, outcome = limits.run(problem, each, begin, wanted)
-        found.append(summarise(problem, scale, name, begin, outcome, wanted, bias_corrected))
-        if outcome.status.ok:
+        found.append(_one(problem, each, begin, wanted, limits))
+        if found[-1].status.ok:
             break
     best = found[-1] if found[-1].status.ok else max(found, key=_height)
     return replace(
@@ -115,6 +117,26 @@ def estimate(
         failures=added(point.failures for point in found),
         stability=best.stability and best.stability.with_jumps(jumps_of(problem) - jumps),
     )
+
+
+def _one(
+    problem: Problem, method: Method, start: Array, objective: Objective, limits: _Limits
+) -> PointEstimate:
+    """By one method; one that forgets the priors holds what was measured beside the data."""
+    measured = measured_of(problem)
+    if measured.any() and not _counts_prior(method, objective):
+        section = without_measured(problem, start, measured)
+        point = _one(section, method, start[~measured], objective, limits)
+        return with_measured(point, problem, start, measured)
+    scale = PriorScale.of(problem.priors, problem.names)
+    name, outcome = limits.run(problem, method, start, objective)
+    return summarise(problem, scale, name, start, outcome, objective, limits.bias_corrected)
+
+
+def _counts_prior(method: Method, objective: Objective) -> bool:
+    """Whether an estimator ends where the prior wants it, too."""
+    by_scipy = isinstance(method, str) and method.startswith(PREFIX)
+    return objective.prior and (by_scipy or find_method(method).fixed_prior)
 
 
 @dataclass(frozen=True)

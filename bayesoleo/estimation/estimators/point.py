@@ -26,6 +26,7 @@ EXACT = (
 SILENT = "the data say nothing of {}"
 UNDETERMINED = "the data do not determine {}, at most combinations of these (see principal_axes)"
 FROM_PRIOR = ": what is known beyond is the prior's"
+KNOWN = "held at the declared value, known to a tolerance that the covariance carries: {}"
 NO_SD = ": there is no standard deviation"
 _MOST_NAMES = 8
 
@@ -80,6 +81,9 @@ class PointEstimate:
         jumped to another branch on the way; None where there are no periodic solutions.
     exact : tuple of str
         Outputs that are fitted to the rounding of their samples.
+    known : tuple of str
+        Unknowns that were held, because the method forgets what was measured of them; their
+        uncertainty is carried into the covariance.
     """
 
     names: tuple[str, ...]
@@ -106,6 +110,7 @@ class PointEstimate:
     failures: Mapping[str, int] = field(default_factory=dict)
     stability: Stability | None = field(default=None, repr=False)
     exact: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
 
     @property
     def sd(self) -> Array:
@@ -121,7 +126,8 @@ class PointEstimate:
     def undetermined(self) -> tuple[str, ...]:
         """Unknowns that the data alone do not determine; none after a failed start."""
         open_ones = np.isnan(np.diag(self.covariance_likelihood)) & (len(self.history) > 0)
-        return tuple(name for name, is_open in zip(self.names, open_ones, strict=True) if is_open)
+        pairs = zip(self.names, open_ones, strict=True)
+        return tuple(name for name, is_open in pairs if is_open and name not in self.known)
 
     @property
     def doubts(self) -> list[str]:
@@ -137,7 +143,8 @@ class PointEstimate:
     def notes(self) -> list[str]:
         """What to know of an estimate: of its solutions, such as that one is unstable, and of its
         standard deviations."""
-        return [*([] if self.stability is None else self.stability.notes()), *self.doubts]
+        held = [KNOWN.format(_listed(self.known))] if self.known else []
+        return [*([] if self.stability is None else self.stability.notes()), *self.doubts, *held]
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])

@@ -78,14 +78,14 @@ def least_squares(rows: Array, target: Array, rank: float | None = None) -> Arra
     Parameters
     ----------
     rows : ndarray, shape (k, l)
-    target : ndarray, shape (k,)
+    target : ndarray, shape (k,) or (k, m)
     rank : float, optional
         Singular values below this part of the largest are taken for zero; by default those that the
         factorisation's own rounding would leave.
 
     Returns
     -------
-    ndarray, shape (l,)
+    ndarray, shape (l,) or (l, m)
 
     Raises
     ------
@@ -95,7 +95,7 @@ def least_squares(rows: Array, target: Array, rank: float | None = None) -> Arra
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
     solution = np.linalg.lstsq(rows / length, target, rcond=rank)[0]
-    return solution / length
+    return solution / (length if solution.ndim == 1 else length[:, None])
 
 
 def inverse_gram(rows: Array, rank: float | None = None) -> Array:

@@ -73,7 +73,7 @@ class CampaignProblem:
         """Unknowns whose prior is a measurement, and counts in every estimator."""
         layout, parameters = self.predictor.layout, self.predictor.model.parameters
         owners = zip(layout.names, layout.parameters, strict=True)
-        return frozenset(name for name, owner in owners if parameters[owner].nuisance)
+        return frozenset(name for name, owner in owners if parameters[owner].measured)
 
     @property
     def start(self) -> Array:

@@ -53,11 +53,14 @@ class FunctionProblem:
         differences with steps scaled to the value, or to the prior where the value is near zero.
     output : str, optional
         Name of the output.
+    nuisances : sequence of str, optional
+        Unknowns whose prior is a measurement, such as constants known to a tolerance: it counts in
+        every estimator, where another only scales the steps of MBE.
 
     Raises
     ------
     InputError
-        If lengths disagree, or the data are empty or not finite.
+        If lengths disagree, the data are empty or not finite, or there is no such unknown.
     """
 
     def __init__(
@@ -70,6 +73,7 @@ class FunctionProblem:
         start: ArrayLike | None = None,
         jacobian: Callable[[Any, Array], ArrayLike] | None = None,
         output: str = "y",
+        nuisances: Sequence[str] = (),
     ) -> None:
         # Data of extended precision keep it until the residual is formed: where a model fits to the
         # last digits, the residual would else be the rounding of the two numbers it comes from.
@@ -91,6 +95,15 @@ class FunctionProblem:
                 "names, start and priors must have one entry per unknown",
                 value=(len(self._names), self._start.shape, length),
             )
+        for name in nuisances:
+            if name not in self._names:
+                raise InputError(
+                    "there is no such unknown",
+                    key="nuisances",
+                    value=name,
+                    hint=f"use {', '.join(self._names)}",
+                )
+        self._nuisances = frozenset(nuisances)
         # Only the function knows how it reads x: where the lengths differ, ask it.
         if isinstance(x, np.ndarray | list | tuple) and len(x) != self._y.size and length:
             self._prediction.one(self._start)
@@ -102,6 +115,11 @@ class FunctionProblem:
     def names(self) -> tuple[str, ...]:
         """Names of the unknowns."""
         return self._names
+
+    @property
+    def nuisances(self) -> frozenset[str]:
+        """Unknowns whose prior is a measurement."""
+        return self._nuisances
 
     @property
     def priors(self) -> tuple[Prior, ...]:

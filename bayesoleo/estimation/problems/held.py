@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import Array, Evaluation, Misfit, Problem, jumps_of
+from bayesoleo.estimation.problems.problem import (
+    Array,
+    Evaluation,
+    Misfit,
+    Problem,
+    jumps_of,
+    measured_of,
+)
 from bayesoleo.model.correlated import Correlated, JointNormal, joint_groups
 from bayesoleo.model.priors import Prior
 
@@ -34,6 +41,12 @@ class Held:
     def names(self) -> tuple[str, ...]:
         """Names of the free unknowns."""
         return tuple(self.problem.names[k] for k in self.free)
+
+    @property
+    def nuisances(self) -> frozenset[str]:
+        """Free unknowns whose prior is a measurement."""
+        pairs = zip(self.problem.names, measured_of(self.problem), strict=True)
+        return frozenset({name for name, measured in pairs if measured} & set(self.names))
 
     @property
     def start(self) -> Array:

@@ -64,6 +64,24 @@ def jumps_of(problem: Problem) -> NDArray[np.int64]:
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
 
 
+class Named(Protocol):
+    """Something with unknowns that have names."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the unknowns."""
+
+
+def measured_of(problem: Named) -> NDArray[np.bool_]:
+    """Which unknowns have a prior that is a measurement, shape (l,).
+
+    These are nuisance parameters and constants known to a tolerance: what is known of them counts
+    in every estimator. A problem names them in ``nuisances``.
+    """
+    nuisances = getattr(problem, "nuisances", frozenset[str]())
+    return np.array([name in nuisances for name in problem.names], dtype=bool)
+
+
 class Problem(Protocol):
     """Something with ``l`` unknowns, ``N`` runs and ``s`` outputs that can be fitted."""
 

@@ -55,7 +55,8 @@ def comparable(each: xr.Dataset) -> Comparable:
     kept = 2 * determined[regular].sum(axis=0) > regular.sum()
     usable = regular & determined[:, kept].all(axis=1)
     usable[usable] = [_is_definite(S) for S in covariances[usable][:, kept][:, :, kept]]
-    left_out = _left_out(names, runs, good, regular, determined, kept, usable)
+    held = str(each.attrs.get("held", "")).split(", ")
+    left_out = _left_out(names, runs, good, regular, determined, kept, usable, held)
     return Comparable(usable, kept, left_out)
 
 
@@ -102,10 +103,14 @@ def _left_out(
     determined: NDArray[np.bool_],
     kept: NDArray[np.bool_],
     usable: NDArray[np.bool_],
+    held: Sequence[str],
 ) -> tuple[str, ...]:
     """What is not compared, and why, a clause each."""
     said = []
     for k in np.flatnonzero(~kept) if regular.any() else ():
+        if names[k] in held:
+            said.append(f"parameter {names[k]}, held: a constant known to a tolerance")
+            continue
         where = ", ".join(runs[regular & ~determined[:, k]])
         said.append(f"parameter {names[k]}, not determined by run {where}")
     for n in np.flatnonzero(~usable):

@@ -36,8 +36,8 @@ def data_against_prior(
     priors : mapping of str to Prior, or sequence of Prior
         Of the same parameters; a sequence in the estimate's order.
     model : Model, optional
-        Its constants that are known to a tolerance and were held are listed too: they were not
-        asked.
+        Its constants that are known to a tolerance and were not estimated are listed too: they were
+        not asked.
     silent : float, optional
         Ratio from which on the data are said to add nothing.
 
@@ -59,8 +59,9 @@ def data_against_prior(
             raise InputError("no prior is given for this parameter", key=name)
     prior_sd = {name: known[name].sd for name in found}
     parameters = {} if model is None else {n: model.parameters[n] for n in model.uncertain()}
-    held = [name for name in parameters if name not in found]
-    for name in held:
+    absent = [name for name in parameters if name not in found]
+    held = [*(sd.known if isinstance(sd, PointEstimate) else ()), *absent]
+    for name in absent:
         prior = parameters[name].prior
         assert prior is not None
         found[name] = prior_sd[name] = prior.sd

@@ -7,7 +7,8 @@ outputs to the nuisances, in units of their standard deviations, the physical pa
 estimated as if the noise covariance were :math:`V + B B^T`.
 
 Their prior is itself a measurement. An estimator that re-centres priors (MBE) would forget it, so
-that MBE runs with nuisances at their null, and the Bayesian estimator frees them from there.
+that MBE runs with nuisances at their null and carries their uncertainty into its covariance
+(:mod:`bayesoleo.estimation.estimators.known`); the Bayesian estimator frees them from there.
 """
 
 from __future__ import annotations
@@ -21,8 +22,6 @@ import numpy as np
 from bayesoleo.effects import Effect, Scales, find_effect
 from bayesoleo.effects.places import substitute
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.problems.problem import Array
 from bayesoleo.model import Condition, Model, Parameter
 from bayesoleo.model.expressions import symbol
 from bayesoleo.prediction.records import Record
@@ -233,48 +232,3 @@ def _uncertain_sensor(model: Model, effect: Effect, channel: str, sd: float) -> 
         0.0, new.unit, sd=sd, nuisance=True, latex=new.latex, description=new.description
     )
     return candidate.model.with_parameters(**{name: known})
-
-
-def with_held(
-    point: PointEstimate, names: Sequence[str], held: Mapping[str, float], sd: Mapping[str, float]
-) -> PointEstimate:
-    """An estimate of some unknowns as one of all, the others held where they were.
-
-    Parameters
-    ----------
-    point : PointEstimate
-        Of the unknowns that are not held.
-    names : sequence of str, length l
-        All unknowns, in order.
-    held : mapping of str to float
-        Values of the others.
-    sd : mapping of str to float
-        Their standard deviations: what is known of them without the data.
-
-    Returns
-    -------
-    PointEstimate
-    """
-    place = np.array([names.index(name) for name in point.names], dtype=np.int64)
-    base = np.array([held.get(name, 0.0) for name in names])
-    spread = np.array([sd.get(name, 0.0) for name in names])
-
-    def vectors(values: Array) -> Array:
-        full = np.repeat(base[None], len(values), axis=0)
-        full[:, place] = values
-        return full
-
-    def square(values: Array) -> Array:
-        full = np.diag(spread**2)
-        full[np.ix_(place, place)] = values
-        return full
-
-    return replace(
-        point,
-        names=tuple(names),
-        theta=vectors(point.theta[None])[0],
-        start=vectors(point.start[None])[0],
-        covariance=square(point.covariance),
-        covariance_likelihood=square(point.covariance_likelihood),
-        history=vectors(point.history),
-    )

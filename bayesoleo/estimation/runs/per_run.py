@@ -97,7 +97,9 @@ def by_run_dataset(
         parameter, parameter_column), the latter without the prior; ``rms``, ``largest`` and
         ``residual_mean`` (run, output) of the residual; ``status``, ``on_limit`` (unknowns on a
         limit of their prior's support), ``iterations``, ``halvings`` (run); ``unit`` (parameter).
-        The estimate of a run that failed stays where it stopped: select with ``status ==
+        The attribute ``held`` names constants known to a tolerance, which MBE holds: ``covariance``
+        carries their uncertainty, which all runs share, ``covariance_likelihood`` does not. The
+        estimate of a run that failed stays where it stopped: select with ``status ==
         "converged"``.
 
     Raises
@@ -137,7 +139,7 @@ def by_run_dataset(
             schema.PARAMETER_COLUMN: list(first.names),
             schema.OUTPUT: list(first.outputs),
         },
-        attrs={"method": first.method},
+        attrs={"method": first.method, "held": ", ".join(first.known)},
     )
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.objectives.diagonal import log_likelihood, log_prior
+from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.problem import ShootingProblem
 from bayesoleo.estimation.trajectories.step import Change, Local
@@ -139,6 +140,7 @@ class _Loop:
         self.local: Local | None = None
         self.before: tuple[Change, Change, float] | None = None
         self.damped = 0
+        self.pulled = np.flatnonzero(measured_of(problem) | (prior == "be"))
         # Variances from an earlier fit mean a start that is continuous already.
         self.slack = 1.0 if variance is None else 0.0
         self.first_gaps: Array | None = None
@@ -292,8 +294,10 @@ class _Loop:
     def _record(self) -> None:
         sums = self.problem.sums(self.theta, self.x)
         objective = log_likelihood(sums, self.variance, self.problem.counts)
-        if self.prior == "be":
-            objective += log_prior(self.problem.priors, self.theta)
+        pulled = self.pulled
+        if pulled.any():
+            priors = [self.problem.priors[k] for k in pulled]
+            objective += log_prior(priors, self.theta[pulled])
         self.history.append(Line(self.theta, self.variance, objective, self.damped))
         self.damped = 0
 

@@ -136,7 +136,8 @@ def multiple_shooting(
         :func:`~bayesoleo.prediction.arrays.transient_record`. Some of the model's outputs do.
     method : {"mbe", "be", "gauss-newton"}
         As in :func:`~bayesoleo.estimation.estimate`; ``"be"`` ends in the posterior's mode, the
-        others in the maximum-likelihood point.
+        others in the maximum-likelihood point, for which what is known of constants with a
+        tolerance counts like data.
     start : array_like, shape (l,), optional
         Of the unknowns; by default their nominal values.
     steps : int, optional

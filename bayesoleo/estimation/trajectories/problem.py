@@ -75,6 +75,13 @@ class ShootingProblem:
         return self.layout.names
 
     @property
+    def nuisances(self) -> frozenset[str]:
+        """Unknowns whose prior is a measurement."""
+        parameters = self.runs[0].model.parameters
+        owners = zip(self.layout.names, self.layout.parameters, strict=True)
+        return frozenset(name for name, owner in owners if parameters[owner].measured)
+
+    @property
     def counts(self) -> NDArray[np.int64]:
         """Number of samples of each output, shape (s,)."""
         return np.array(

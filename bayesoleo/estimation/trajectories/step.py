@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.estimation.objectives.bounded import bounded_step
+from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.problem import ShootingProblem
 from bayesoleo.prediction.normal_equations import NormalEquations
@@ -108,8 +109,16 @@ class Local:
 
     @property
     def weight(self) -> Array:
-        """The prior's rows in the step, shape (l, l) or (0, l)."""
-        return self.scale.root if self.prior != "gauss-newton" else self.scale.root[:0]
+        """The prior's rows in the step, shape (l, l) or fewer rows."""
+        if self.prior != "gauss-newton":
+            return self.scale.root
+        return self.scale.root[measured_of(self.problem)]
+
+    @property
+    def pulled(self) -> NDArray[np.bool_]:
+        """Unknowns that the prior pulls: all for the Bayesian estimator, for the others those whose
+        prior is a measurement, shape (l,)."""
+        return measured_of(self.problem) | (self.prior == "be")
 
     @property
     def unit(self) -> Array:
@@ -142,9 +151,7 @@ class Local:
 
     def step(self) -> Change:
         """From the present point to the linearised solution."""
-        slope = np.zeros(self.theta.size)
-        if self.prior == "be":
-            slope = self.scale.slope(self.theta)
+        slope = np.where(self.pulled, self.scale.slope(self.theta), 0.0)
         answers = [(item.linear.gap, item.linear.y) for item in self.normal]
         return self.change(answers, slope, self.scale.room(self.theta))
 
@@ -160,8 +167,7 @@ class Local:
             answers.append(answer)
         # A prior that only scales the steps is centred where this one began.
         slope = -self.weight.T @ (self.weight @ taken)
-        if self.prior == "be":
-            slope = self.scale.slope(theta)
+        slope = np.where(self.pulled, self.scale.slope(theta), slope)
         anywhere = np.full(taken.size, np.inf)
         return self.change(answers, slope, (anywhere, anywhere))
 

@@ -16,7 +16,7 @@ from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts, staged_variance
 from bayesoleo.estimation.problems.held import Held
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Array, Problem, measured_of
 
 Kind = Literal["likelihood", "posterior"]
 
@@ -40,6 +40,15 @@ class Drop:
             raise InputError(
                 "unknown kind", key="kind", value=kind, hint="use 'likelihood' or 'posterior'"
             )
+        measured = measured_of(problem)
+        if self.kind == "likelihood" and measured.any():
+            known = [
+                name for name, is_known in zip(problem.names, measured, strict=True) if is_known
+            ]
+            raise InputError(
+                f"the likelihood forgets what is known of {', '.join(known)}", key="kind",
+                value=self.kind, hint="use kind='posterior' with an estimate by 'be'",
+            )  # fmt: skip
         if tuple(point.names) != tuple(problem.names):
             raise InputError("the estimate is of another problem", value=point.names)
         self.counts = output_counts(problem.counts)

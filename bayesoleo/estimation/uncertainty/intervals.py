@@ -13,8 +13,13 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.objectives.curvature import curvature, inverse_scaled, noise_of_gradient
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.objectives.curvature import (
+    curvature,
+    inverse_scaled,
+    noise_of_gradient,
+    prior_precision,
+)
+from bayesoleo.estimation.problems.problem import Array, Problem, measured_of
 from bayesoleo.estimation.shown import Shown, columns
 
 Form = Literal["posterior", "propagated"]
@@ -43,7 +48,8 @@ def linearised_covariance(
         near ``[A + diag(w)^-1]^-1``. Without a prior they agree up to the cross terms of ``v``.
     prior : bool, optional
         Whether the objective contains the prior; not for a maximum-likelihood estimate, which MBE
-        ends in.
+        ends in. That of a nuisance parameter or of a constant known to a tolerance always counts:
+        it is a measurement, and scatters over experiments like the data.
     exact : bool, optional
         Take second derivatives of the residual into account.
 
@@ -58,12 +64,23 @@ def linearised_covariance(
             value=form,
             hint="use 'propagated' or 'posterior'",
         )
-    inverse = inverse_scaled(
-        curvature(problem, point.theta, point.variance, prior=prior, exact=exact)
-    )
+    matrix = curvature(problem, point.theta, point.variance, prior=prior, exact=exact)
+    measured, size = _measured_precision(problem, point.theta), point.theta.size
+    if not prior:
+        matrix[:size, :size] += measured
+    inverse = inverse_scaled(matrix)
     if form == "posterior":
         return inverse
-    return inverse @ noise_of_gradient(problem, point.theta, point.variance) @ inverse
+    noise = noise_of_gradient(problem, point.theta, point.variance)
+    noise[:size, :size] += measured
+    return inverse @ noise @ inverse
+
+
+def _measured_precision(problem: Problem, theta: Array) -> Array:
+    """Precision of what was measured beside the data, shape (l, l)."""
+    measured = measured_of(problem)
+    precision = prior_precision(problem.priors, theta)
+    return np.where(np.outer(measured, measured), precision, 0.0)
 
 
 def linearised_intervals(

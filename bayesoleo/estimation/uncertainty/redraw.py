@@ -160,6 +160,11 @@ class Shifted:
         return self.problem.priors
 
     @property
+    def nuisances(self) -> frozenset[str]:
+        """Unknowns whose prior is a measurement."""
+        return frozenset(getattr(self.problem, "nuisances", ()))
+
+    @property
     def start(self) -> Array:
         """Where an estimate starts, shape (l,)."""
         return self.problem.start

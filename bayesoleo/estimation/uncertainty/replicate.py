@@ -23,7 +23,7 @@ from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.problems.batch import BatchProblem
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo.estimation.problems.problem import Array, measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.uncertainty.walk_together import Lanes, Walk
 from bayesoleo.parallel import single_blas_thread, thread_map
@@ -102,7 +102,7 @@ def estimate_many(
         Measured samples, runs one after the other.
     method, tolerance, max_iterations, bias_corrected
         As in :func:`~bayesoleo.estimation.estimate`. BE, MBE and Gauss-Newton are computed
-        together, the others one by one.
+        together, the others one by one; so are those that hold what was measured beside the data.
     start : array_like, shape (l,) or (R, l), optional
         One for all or one each; by default the problem's own.
     jobs : int, optional
@@ -125,12 +125,13 @@ def estimate_many(
     scale = PriorScale.of(problem.priors, problem.names)
     starts = _checked_starts(problem, scale, start, len(data[0]))
     walk = Walk(problem, step, scale, tolerance, max_iterations, bias_corrected)
+    together = step.steady and (step.fixed_prior or not measured_of(problem).any())
     size = problem.lanes
     cuts = [slice(k, min(k + size, len(starts))) for k in range(0, len(starts), size)]
 
     def work(cut: slice) -> Lanes:
         rows = [column[cut] for column in data]
-        lanes = walk.together(starts[cut], rows) if step.steady else walk.nothing(starts[cut])
+        lanes = walk.together(starts[cut], rows) if together else walk.nothing(starts[cut])
         for lane in map(int, np.flatnonzero(~lanes.done)):
             lanes.keep(lane, walk.alone(starts[cut][lane], [row[lane] for row in rows]))
         if progress is not None:

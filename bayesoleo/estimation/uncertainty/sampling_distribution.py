@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -24,7 +24,7 @@ from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import prior_precision
 from bayesoleo.estimation.problems.batch import BatchProblem
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Array, Problem, measured_of
 from bayesoleo.estimation.shown import Shown
 from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
 from bayesoleo.estimation.uncertainty.redraw import DataSource, NoiseBlock, data_source
@@ -152,6 +152,8 @@ def sampling_distribution(
         ``(parameter, parameter_column)``. Expected is the noise propagated through the linearised
         estimator, the bound is that of Cramér and Rao, the efficiency is the bound's variance over
         the one found. Replications that did not converge are counted and left out.
+        A method that forgets priors holds nuisance parameters and constants known to a tolerance at
+        the truth: the attribute ``held`` names them, and the scatter is that of noise alone.
 
     Raises
     ------
@@ -248,15 +250,21 @@ def _summarise(
     """The group ``sampling_distribution`` from finished replications."""
     good = parts["status"] == Status.CONVERGED.value
     precision = None
+    free = np.arange(len(work.theta))
     if find_method(work.method).fixed_prior:
         precision = prior_precision(problem.priors, work.theta)
+    else:  # held at the truth: they do not scatter
+        free = np.flatnonzero(~measured_of(problem))
+        blocks = [replace(part, sensitivity=part.sensitivity[:, free]) for part in blocks]
+    names, truth = [problem.names[k] for k in free], work.theta[free]
+    parts = {**parts, "theta": parts["theta"][:, free]}
     weights = parts["variance"][good].mean(axis=0) if good.any() else np.ones(len(problem.outputs))
     expected, bound = propagated(blocks, weights, precision), cramer_rao(blocks)
     data = xr.Dataset(
-        {**by_replication(parts), **moments(parts["theta"][good], work.theta, expected, bound)},
+        {**by_replication(parts), **moments(parts["theta"][good], truth, expected, bound)},
         coords={
-            schema.PARAMETER: list(problem.names),
-            schema.PARAMETER_COLUMN: list(problem.names),
+            schema.PARAMETER: names,
+            schema.PARAMETER_COLUMN: names,
             schema.OUTPUT: list(problem.outputs),
         },
     )
@@ -267,5 +275,6 @@ def _summarise(
         "converged": int(good.sum()),
         "outcomes": json.dumps(count(parts["status"])),
         "iterations": float(parts["iterations"].mean()),
+        "held": ", ".join(name for name in problem.names if name not in names),
     }
     return data

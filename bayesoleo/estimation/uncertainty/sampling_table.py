@@ -100,4 +100,6 @@ def sampling_text(data: xr.Dataset) -> str:
     end = (
         f"{about['method']}, {about['converged']} of {about['replications']} replications converged"
     )
-    return f"{columns(head, rows)}\n{end}, {about['iterations']:.1f} iterations on average"
+    text = f"{columns(head, rows)}\n{end}, {about['iterations']:.1f} iterations on average"
+    held = about.get("held", "")
+    return f"{text}\nheld at the truth, so that noise alone scatters: {held}" if held else text

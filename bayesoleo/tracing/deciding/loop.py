@@ -20,11 +20,8 @@ from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
-from bayesoleo.tracing.scoring.projection import information_beside
 from bayesoleo.tracing.scoring.significance import SAME
 
-#: A constant known to a tolerance is freed if the data know it this many times better.
-FREED_BY = 2.0
 #: Part of the excess that added effects must explain for the loop to call the model's lack found:
 #: what is left is then less than a third of what there was, in size.
 MOSTLY = 0.9
@@ -41,8 +38,7 @@ class ClosedLoop:
     rounds : tuple of Round
         The last one accepts nothing.
     first, final : State
-        The model as declared - constants that had to be freed are estimated in both - and with
-        all effects that were added.
+        The model as declared, and with all effects that were added.
     roles : Roles
     notes : tuple of str
         What a reader should know.
@@ -169,7 +165,6 @@ def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Pr
     """The declared model, estimated."""
     notes = [] if roles.strategy == "declared" else [roles.description]
     state = fit_state(assembly, roles, numerics, progress=say)
-    state = _freed(state, roles, numerics, notes, say)
     return Progress(state, state, notes=tuple(notes))
 
 
@@ -214,35 +209,6 @@ def _ratios(state: State) -> str:
         for output, values in table.items()
     ]
     return "ratio to noise: " + ", ".join(parts)
-
-
-def _freed(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
-    """Estimate constants known to a tolerance where a lack of fit remains and the data know them
-    better.
-
-    A wrong constant is no missing effect, and must not be mistaken for one.
-    """
-    names = state.fit.model.uncertain()
-    if not names or state.at_floor:
-        return state
-    base = state.base()
-    known = base.gram.shape[0] - len(names)
-    chosen = []
-    for k, name in enumerate(names, start=known):
-        # In units of the tolerance, whose own information is one.
-        if information_beside(base.gram, k) - 1.0 > FREED_BY**2:
-            chosen.append(name)
-    if not chosen:
-        return state
-    say(f"free {', '.join(chosen)}, known to a tolerance only")
-    notes.append(
-        f"{', '.join(chosen)}: fixed within a tolerance, freed because a lack of fit remained"
-    )
-    values = state.assembly.model().parameters
-    assembly = state.assembly.with_parameters(
-        {name: replace(values[name], fixed=False) for name in chosen}
-    )
-    return fit_state(assembly, roles, numerics, progress=say)
 
 
 def _warnings(fit: Fit) -> list[str]:

@@ -65,9 +65,8 @@ class Knowledge:
     @classmethod
     def of(cls, fit: Fit) -> Knowledge:
         """Shared parameters as the runs know them; those of single runs as they scatter between
-        these; constants known to a tolerance, and what few runs say nothing of, as in their
-        priors."""
-        model = fit.model.freeing(*fit.model.uncertain())
+        these; what few runs say nothing of, as in their priors."""
+        model = fit.model
         layout = Layout.of(model, ["any"])
         values, names = fit.values, fit.problem.names
         theta = layout.start(model)
@@ -82,7 +81,7 @@ class Knowledge:
             elif model.parameters[owner].by_run:
                 own = [value for key, value in values.items() if key.startswith(f"{owner}[")]
                 theta[k] = np.mean(own) if own else theta[k]
-                if len(own) >= ENOUGH_RUNS and not model.parameters[owner].nuisance:
+                if len(own) >= ENOUGH_RUNS and not model.parameters[owner].measured:
                     covariance[k, k] = np.var(own, ddof=1) * (1 + 1 / len(own))
         return cls(theta, _root(covariance), model)
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from bayesoleo.estimation import PointEstimate, estimate, polish
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.runs.nuisance import with_held
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor, RunPrediction
 from bayesoleo.prediction.records import Record
@@ -181,7 +180,14 @@ def fit_model(
     while True:
         problem = _problem(model, records, numerics, steps, share)
         say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
-        mbe = _robust_estimate(problem, start, tolerance, max_iterations)
+        mbe = estimate(
+            problem,
+            "mbe",
+            start=start,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            resolution=RESOLUTION,
+        )
         say("posterior mode")
         point = polish(
             problem,
@@ -201,27 +207,6 @@ def fit_model(
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         steps, start = 2 * steps, point.theta
-
-
-def _robust_estimate(
-    problem: CampaignProblem, start: Array | None, tolerance: float, max_iterations: int
-) -> PointEstimate:
-    """MBE, with nuisance parameters where they start: it would forget what is known of them."""
-    names, begin = problem.names, problem.start if start is None else start
-    held = {n: float(v) for n, v in zip(names, begin, strict=True) if n in problem.nuisances}
-    free = np.array([name not in held for name in names], dtype=bool)
-    point = estimate(
-        problem.holding(held) if held else problem,
-        "mbe",
-        start=begin[free],
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        resolution=RESOLUTION,
-    )
-    if not held:
-        return point
-    sd = {name: prior.sd for name, prior in zip(names, problem.priors, strict=True)}
-    return with_held(point, names, held, sd)
 
 
 def _problem(

@@ -99,12 +99,15 @@ def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, An
     fit, table = state.fit, {}
     for k, name in enumerate(fit.problem.names):
         owner = fit.predictor.layout.parameters[fit.predictor.layout.names.index(name)]
+        declared, prior = fit.model.parameters[owner], fit.problem.priors[k]
+        known = {"value": float(prior.mean), "sd": float(prior.sd)}
         entry: dict[str, Any] = {
             "estimate": float(fit.point.theta[k]),
             "mean": None,
             "sd": float(fit.point.sd[k]),
             "interval": None,
-            "unit": fit.model.parameters[owner].unit,
+            "unit": declared.unit,
+            "tolerance": known if declared.toleranced else None,
         }
         if samples is not None:
             draws = samples.draws[:, :, samples.names.index(name)]

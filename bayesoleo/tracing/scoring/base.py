@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.data.noise_spectrum import NoiseSpectrum
+from bayesoleo.estimation.problems.problem import measured_of
+from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.prediction.input_noise import input_columns
-from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.records import Record
-from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.errors.errors_table import RunError
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import counted, weights
-from bayesoleo.tracing.scoring.sensitivities import present_constants, sensitivities_of
+from bayesoleo.tracing.scoring.sensitivities import present_constants
 
 Array = NDArray[np.float64]
 
@@ -45,8 +45,7 @@ class RunBase:
         Inverse standard deviation of a single sample's noise.
     residual : ndarray, shape (m,)
     sensitivity : ndarray, shape (l, m)
-        With respect to present unknowns and uncertain constants, each in units of its prior's
-        standard deviation.
+        With respect to present unknowns, each in units of its prior's standard deviation.
     input_noise : ndarray, shape (k, m)
         ``B``: change of the outputs by one standard deviation of each input coefficient that
         matters.
@@ -119,7 +118,8 @@ class Base:
     runs : list of RunBase
         Residuals and sensitivities by run.
     gram : ndarray, shape (l, l)
-        ``J' W J``, with the prior precision of uncertain constants.
+        ``J' W J``, with the prior precision of nuisance parameters and of constants known to a
+        tolerance.
     gradient : ndarray, shape (l,)
         ``J' W e``.
     noise : float
@@ -160,14 +160,13 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
     errors : mapping of (run, output) to RunError
         What is left in the fitted runs, and the noise.
     """
-    tolerances = _tolerance_columns(fit)
     gram, gradient = _prior_terms(fit)
     runs, noise, excess, variance = [], 0.0, 0.0, 0.0
     for r, record in enumerate(fit.records):
         entries = [errors[record.label, output] for output in fit.predictor.outputs]
         measured = fit.predictor.runs[r].measured
         sigma = [_sigma(e.sigma, m) for e, m in zip(entries, measured, strict=True)]
-        run = _run_base(fit, r, sigma, tolerances[r], _spectra(entries))
+        run = _run_base(fit, r, sigma, _spectra(entries))
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
         for entry, value in zip(entries, sigma, strict=True):
@@ -182,21 +181,19 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
 def _prior_terms(fit: Fit) -> tuple[Array, Array]:
     """What priors add to ``J' W J`` and ``J' W e``, unknowns in units of their priors' sd.
 
-    A constant known to a tolerance is no free parameter: its prior's precision, one in this unit,
-    stays with it, as that of a nuisance parameter does.
+    Only of what was measured beside the data: a nuisance parameter or a constant known to a
+    tolerance is no free parameter, and must not take up an effect beyond what is known of it.
     """
-    known = len(fit.problem.priors)
-    gram = np.diag(np.repeat([0.0, 1.0], [known, len(fit.model.uncertain())]))
-    gradient = np.zeros(len(gram))
-    for k, (name, prior) in enumerate(zip(fit.problem.names, fit.problem.priors, strict=True)):
-        if name in fit.problem.nuisances:
-            gram[k, k] += 1.0
-            gradient[k] -= (fit.point.theta[k] - prior.mean) / prior.sd
-    return gram, gradient
+    scale = PriorScale.of(fit.problem.priors, fit.problem.names)
+    theta, measured = fit.point.theta, measured_of(fit.problem)
+    slope = scale.slope(theta) * scale.sd / scale.unit(theta)
+    # Next to nothing is known of the curvature within bounds; the width says as much.
+    precision = scale.root.T @ scale.root
+    return np.where(np.outer(measured, measured), precision, 0.0), np.where(measured, slope, 0.0)
 
 
 def _run_base(
-    fit: Fit, r: int, sigma: Sequence[float], tolerances: Array, spectra: tuple[NoiseSpectrum, ...]
+    fit: Fit, r: int, sigma: Sequence[float], spectra: tuple[NoiseSpectrum, ...]
 ) -> RunBase:
     """One run at the present estimate, given the noise of a sample by output."""
     run, record = fit.predictor.runs[r], fit.records[r]
@@ -207,7 +204,7 @@ def _run_base(
     return RunBase.of(
         np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
         (run.measured - fit.predictions[r].y).ravel(),
-        flat(np.concatenate([own, tolerances], axis=1)),
+        flat(own),
         flat(input_columns(run, present_constants(fit, r))),
         np.tile(replicate(record), len(sigma)),
         spectra,
@@ -235,23 +232,3 @@ def flat(columns: Array) -> Array:
     """Columns of shape (ny, k, N) as (k, ny N), outputs one after the other."""
     outputs, count, samples = columns.shape
     return np.moveaxis(columns, 1, 0).reshape(count, outputs * samples)
-
-
-def _tolerance_columns(fit: Fit) -> list[Array]:
-    """Sensitivities to the constants known to a tolerance only, in units of their priors' standard
-    deviations."""
-    names = fit.model.uncertain()
-    if not names:
-        return [
-            np.zeros((run.measured.shape[0], 0, run.measured.shape[1]))
-            for run in fit.predictor.runs
-        ]
-    model = fit.model.fixing(*fit.model.estimated()).freeing(*names)
-    scale = np.array([prior.sd for prior in Layout.of(model, ["any"]).priors(model)])
-    blocks = sensitivities_of(fit, model, [{}])
-    if isinstance(blocks, Status):
-        return [
-            np.zeros((run.measured.shape[0], len(scale), run.measured.shape[1]))
-            for run in fit.predictor.runs
-        ]
-    return [block * scale[:, None] for block in blocks[0].by_run]

@@ -52,22 +52,6 @@ def remains(gram: Array, project: Array, own: Array, information: Array) -> NDAr
     return kept
 
 
-def information_beside(gram: Array, k: int) -> float:
-    """What ``J' W J`` says of one direction when all others are free.
-
-    Parameters
-    ----------
-    gram : ndarray, shape (l, l)
-        ``J' W J``; units may differ by any factor.
-    k : int
-        Which.
-    """
-    others = np.arange(len(gram)) != k
-    cross = gram[others, k]
-    inner = coefficients(gram[np.ix_(others, others)], cross[:, None])[:, 0]
-    return float(gram[k, k] - cross @ inner)
-
-
 def squared_distance(value: Array, covariance: Array) -> float:
     """``value' covariance^-1 value`` of values (k,) in units that may differ by any factor.
 
