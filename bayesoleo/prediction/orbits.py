@@ -8,8 +8,8 @@ held against each other.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,15 +24,18 @@ from bayesoleo.prediction.orbit import adaptive_problem, periodic_answer
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, record_of
-from bayesoleo.solvers.adaptive.switched import crossings_of
+from bayesoleo.solvers.adaptive.error_estimate import NONE, ErrorEstimate, estimate_error
+from bayesoleo.solvers.adaptive.switched import PeriodicProblem, crossings_of
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
-from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities
+from bayesoleo.solvers.periodic.solve import Boundary, sensitivities
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.shooting.hybrid import differentiate_on_mesh
+from bayesoleo.solvers.shooting.initial_value import Dynamics
+from bayesoleo.solvers.shooting.library import FEWEST_STEPS as LIBRARY_STEPS
 from bayesoleo.solvers.shooting.library import shoot_by_library
-from bayesoleo.solvers.shooting.shoot import Shot, solve_shooting
+from bayesoleo.solvers.shooting.shoot import Shot, shoot_on_steps, solve_shooting
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
 
@@ -40,6 +43,12 @@ Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]
 
 METHODS = ("discretisation", "adaptive", "shooting", "hybrid", "library")
+#: Equal steps to begin with, at least and for each harmonic of an input, and at most.
+FEWEST_STEPS, STEPS_PER_HARMONIC, MOST_STEPS = 64, 4, 8192
+#: An error from which it falls with the method's order, if the equations have no kinks.
+CLOSE = 1e-4
+#: How often shooting is tried on finer steps, and the smallest local error of a library.
+MORE_SHOTS, LEAST_LOCAL = 4, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +127,7 @@ class PeriodicOrbits:
     def _each(self, functions: tuple[Rows, ...], phase: Array, shape: tuple[int, ...]) -> Array:
         found = np.full((len(self.orbits), *shape, phase.size), np.nan)
         for lane, (orbit, function) in enumerate(zip(self.orbits, functions, strict=True)):
-            if orbit.status is Status.CONVERGED:
+            if orbit.status.solved:
                 found[lane] = function(phase)
         return found
 
@@ -129,7 +138,7 @@ def periodic_orbit(
     values: Mapping[str, ArrayLike] | None = None,
     method: str = "discretisation",
     *,
-    steps: int = 256,
+    steps: int | None = None,
     scheme: str = DEFAULT_SCHEME,
     tolerance: float = 1e-8,
     backend: str = "numba",
@@ -150,11 +159,17 @@ def periodic_orbit(
         On a mesh of equal steps; on a mesh with error control; by shooting, with derivatives by the
         second, linear problem; by shooting, with derivatives on a mesh made of its steps; by
         shooting with SciPy's LSODA, the slow and independent check.
-    steps, scheme : int and str
-        Of the mesh of equal steps; the hybrid's has at least so many. Shooting does
-        without; only equal steps can use ``thesis``.
+    steps : int, optional
+        Of the mesh of equal steps; by default they are halved until the tolerance is met, down to
+        :data:`MOST_STEPS`. The hybrid's mesh for derivatives has at least so many.
+    scheme : str
+        Of the meshes. Shooting does without; only equal steps can use ``thesis``.
     tolerance : float
-        Of the adaptive mesh and of shooting; of LSODA the local error.
+        Estimated largest error of a state, anywhere in the period, over that state's swing, or of
+        the time of a kink in cycles. The error of every motion is estimated after it was found,
+        with the equations looked at between the steps' own points as well. It is the orbit's
+        ``error``; where it is larger, its status is ``TOLERANCE_NOT_MET``, and where it cannot be
+        estimated, ``NO_ERROR_ESTIMATE``. Derivatives by parameters are not judged.
     backend : {"numba", "numpy"}
         Kernels; NumPy's need no compilation, but are called back from compiled shooting slowly.
     jobs : int, optional
@@ -187,12 +202,13 @@ def periodic_orbit(
             hint = f"give inputs={{{name!r}: motion(…)}}"
             raise InputError(f"model {model.name!r} needs the input {name!r}", hint=hint)
     compiled = kernels(model, model.estimated(), backend)
-    run = RunPredictor(model, compiled, record_of(model, plan), steps, scheme)
+    record = record_of(model, plan)
+    run = RunPredictor(model, compiled, record, steps or _first_steps(record), scheme)
     p = np.repeat(run.base_constants()[None], len(lanes), axis=0)
     for row, lane in zip(p, lanes, strict=True):
         for name, value in lane.items():
             row[compiled.derived.constants.index(name)] = value
-    way = _Way(model, plan, run, tolerance, scheme, backend, jobs)
+    way = _Way(model, plan, run, steps, tolerance, scheme, backend, jobs)
     ways: dict[str, Callable[[Array], list[Found]]] = {
         "discretisation": way.discretised,
         "adaptive": partial(way.adaptive, lanes),
@@ -202,6 +218,13 @@ def periodic_orbit(
     }
     orbits, motions, slopes = zip(*ways[method](p), strict=True)
     return PeriodicOrbits(orbits, motions, slopes, compiled, run.record, p)
+
+
+def _first_steps(record: Record) -> int:
+    """Equal steps to begin with: a few for each harmonic of the inputs, a power of two."""
+    highest = max((int(h.orders.max(initial=1)) for h in record.harmonics.values()), default=1)
+    wanted = max(FEWEST_STEPS, STEPS_PER_HARMONIC * highest)
+    return min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted))))
 
 
 def _lanes(model: Model, values: Mapping[str, ArrayLike]) -> list[dict[str, float]]:
@@ -231,52 +254,65 @@ class _Way:
     model: Model
     plan: RunPlan
     run: RunPredictor
+    steps: int | None
     tolerance: float
     scheme: str
     backend: str
     jobs: int | None
 
+    # -- errors ----------------------------------------------------------------------------
+
+    @cached_property
+    def problem(self) -> PeriodicProblem:
+        """By which errors are estimated: the equations are evaluated a few times only, so that
+        nothing is compiled for it."""
+        return adaptive_problem(self.model, self.plan, "numpy")[1]
+
+    def judged(
+        self, found: Found, p: Array, method: str = DEFAULT_SCHEME
+    ) -> tuple[Found, ErrorEstimate]:
+        """An orbit with the error of its motion, and a status that compares it to the tolerance."""
+        orbit, motion, slopes = found
+        if not orbit.status.ok:
+            return found, NONE
+        mesh = Mesh(np.append(orbit.phases, 1.0))
+        error = estimate_error(self.problem, tableau(method), p, motion, mesh, self.tolerance)
+        judged = replace(orbit, status=error.judged(self.tolerance), error=error.error)
+        return (judged, motion, slopes), error
+
+    # -- equal steps -----------------------------------------------------------------------
+
     def discretised(self, p: Array) -> list[Found]:
+        return [self._refined(row) for row in p]
+
+    def _refined(self, p: Array) -> Found:
+        """On a mesh of equal steps, halved until the tolerance is met unless they are given."""
         run = self.run
-        each = [run.solve_from_guess(row) for row in p]
-        solution = Solution(*(
-            np.concatenate([getattr(one, name) for one in each])
-            for name in ("x", "status", "iterations")
-        ))  # fmt: skip
-        solution, x_theta, monodromy = sensitivities(run.boundary, p, solution)
-        size, found = run.scheme.state_size, []
-        for lane in range(len(p)):
-            spent = int(solution.iterations[lane] + 1) * run.points.size
-            orbit = Orbit(
-                np.arange(run.steps) / run.steps, self._states(solution, lane)[:, :size],
-                run.period, floquet_multipliers(monodromy[lane]),
-                Status(int(solution.status[lane])), np.nan, spent,
-            )  # fmt: skip
-            found.append(
-                (orbit, self._sampled(solution.x[lane][..., None], True),
-                 self._sampled(x_theta[lane], False))
-            )  # fmt: skip
+        found, error = self.judged(self._on(run, p), p)
+        while self.steps is None and found[0].status is Status.TOLERANCE_NOT_MET:
+            before = error.error
+            run = RunPredictor(self.model, run.kernels, run.record, 2 * run.steps, self.scheme)
+            finer, error = self.judged(self._on(run, p), p)
+            if not finer[0].status.solved:
+                break
+            found = finer
+            if not _promises(before, error.error, self.tolerance, run.steps):
+                break
         return found
 
-    def _states(self, solution: Solution, lane: int) -> Array:
-        """States at the nodes ``(n, D)``, also of a scheme whose unknowns are values only."""
-        nodes = np.arange(self.run.steps) / self.run.steps
-        rows = self._sampled(solution.x[lane][..., None], True)(nodes)
-        return rows[self._state_rows()].T
+    def _on(self, run: RunPredictor, p: Array) -> Found:
+        solution, lane = run.solve_from_guess(p), p[None]
+        solution, x_theta, monodromy = sensitivities(run.boundary, lane, solution)
+        rows = _sampled(run, solution.x[0][..., None], True)
+        nodes = np.arange(run.steps) / run.steps
+        orbit = Orbit(
+            nodes, rows(nodes)[_state_rows(run)].T, run.period, floquet_multipliers(monodromy[0]),
+            Status(int(solution.status[0])), np.nan,
+            int(solution.iterations[0] + 1) * run.points.size,
+        )  # fmt: skip
+        return orbit, rows, _sampled(run, x_theta[0], False)
 
-    def _state_rows(self) -> list[int]:
-        first = np.cumsum([0, *(order + 1 for order in self.run.scheme.orders)])
-        return [int(first[j]) + k for j, o in enumerate(self.run.scheme.orders) for k in range(o)]
-
-    def _sampled(self, x: Array, single: bool) -> Rows:
-        """Rows at phases of unknowns ``(n, w, C)`` on the mesh of equal steps."""
-        scheme, n, step = self.run.scheme, self.run.steps, self.run.boundary.step(self.run.steps)
-
-        def rows(phase: Array) -> Array:
-            found = scheme.sample(x[None], scheme.plan(phase, n), step)[0]
-            return found[:, 0] if single else found
-
-        return rows
+    # -- a mesh of its own -----------------------------------------------------------------
 
     def adaptive(self, lanes: list[dict[str, float]], p: Array) -> list[Found]:
         def one(lane: dict[str, float]) -> Found:
@@ -288,48 +324,79 @@ class _Way:
 
         return thread_map(one, lanes, self.jobs)
 
-    def shots(self, p: Array, *, by_parameter: bool) -> list[Shot]:
+    # -- shooting --------------------------------------------------------------------------
+
+    def shots(self, p: Array, *, by_parameter: bool) -> list[tuple[Shot, Orbit]]:
+        """Motions by shooting, with their judged orbits."""
         active = self.run.kernels.derived.active
         dynamics = dynamics_of(self.model, self.run.record, active, self.backend)
 
-        def one(row: Array) -> Shot:
+        def one(row: Array) -> tuple[Shot, Orbit]:
             start = np.ascontiguousarray(self._start(row))
-            return solve_shooting(
+            shot = solve_shooting(
                 dynamics, row, self.run.period, start,
                 tolerance=self.tolerance, sensitivities=by_parameter,
             )  # fmt: skip
+            return self._on_more_steps(dynamics, row, shot, by_parameter)
 
         return thread_map(one, list(p), self.jobs)
 
+    def _on_more_steps(
+        self, dynamics: Dynamics, p: Array, shot: Shot, by_parameter: bool
+    ) -> tuple[Shot, Orbit]:
+        """Shoot again, by steps that resolve what the integrator stepped over."""
+        (orbit, *_), error = self.judged((shot.orbit(), shot.sample, shot.sample), p, "radau5")
+        for _ in range(MORE_SHOTS):
+            better = error.better
+            if orbit.status is not Status.TOLERANCE_NOT_MET or better is None:
+                break
+            mesh = better.mesh.halved()
+            kinks = np.zeros(0) if better.kinks is None else better.kinks.phases
+            other = shoot_on_steps(
+                dynamics, p, shot, np.ascontiguousarray(better.x[0, : shot.start.size]),
+                mesh.edges, np.isin(mesh.edges[1:], kinks),
+                tolerance=self.tolerance, sensitivities=by_parameter,
+            )  # fmt: skip
+            if other is None:
+                break
+            (again, *_), following = self.judged(
+                (other.orbit(), other.sample, other.sample), p, "radau5"
+            )
+            if not following.error < error.error:
+                break
+            shot, orbit, error = other, again, following
+        return shot, orbit
+
     def _start(self, row: Array) -> Array:
         """State of the guess at phase zero, shape (D,)."""
-        return self._sampled(self.run.guess(row)[0][..., None], True)(np.zeros(1))[
-            self._state_rows(), 0
-        ]
+        rows = _sampled(self.run, self.run.guess(row)[0][..., None], True)(np.zeros(1))
+        return rows[_state_rows(self.run), 0]
 
     def shot(self, p: Array) -> list[Found]:
         return [
-            (shot.orbit(), shot.sample, shot.sample_theta)
-            for shot in self.shots(p, by_parameter=True)
+            (orbit, shot.sample, shot.sample_theta)
+            for shot, orbit in self.shots(p, by_parameter=True)
         ]
 
     def hybrid(self, p: Array) -> list[Found]:
         _, problem, _ = adaptive_problem(self.model, self.plan, self.backend)
         method = tableau(self.scheme)
 
-        def one(item: tuple[Array, Shot]) -> Found:
-            row, shot = item
-            if not shot.status.ok:
-                return shot.orbit(), shot.sample, shot.sample_theta
+        def one(item: tuple[Array, tuple[Shot, Orbit]]) -> Found:
+            row, (shot, orbit) = item
+            if not orbit.status.solved:
+                return orbit, shot.sample, shot.sample_theta
 
             def on(mesh: Mesh, motion: Rows) -> Boundary:
                 return problem.on(method, mesh, crossings_of(problem, motion, mesh, row))
 
             found = differentiate_on_mesh(shot, on, row, self.run.steps)
-            return shot.orbit(), shot.sample, found.sample_theta
+            return orbit, shot.sample, found.sample_theta
 
         shots = self.shots(p, by_parameter=False)
         return thread_map(one, list(zip(p, shots, strict=True)), self.jobs)
+
+    # -- a library -------------------------------------------------------------------------
 
     def by_library(self, p: Array) -> list[Found]:
         derived, run = self.run.kernels.derived, self.run
@@ -342,9 +409,49 @@ class _Way:
         )
 
         def one(row: Array) -> Found:
-            shot = shoot_by_library(
-                space, row, run.period, self._start(row), tolerance=self.tolerance
-            )
-            return shot.orbit, shot.sample, shot.sample_theta
+            start, local, steps = self._start(row), self.tolerance, LIBRARY_STEPS
+            best: tuple[Found, ErrorEstimate] | None = None
+            for _ in range(MORE_SHOTS):
+                shot = shoot_by_library(
+                    space, row, run.period, start, tolerance=local, fewest_steps=steps
+                )
+                now = self.judged((shot.orbit, shot.sample, shot.sample_theta), row)
+                if best is None or now[1].error < best[1].error:
+                    best = now
+                if now[0][0].status is not Status.TOLERANCE_NOT_MET or local <= LEAST_LOCAL:
+                    break
+                start, steps = shot.orbit.states[0], 4 * steps
+                # Errors of steps add up: they are asked for as much smaller.
+                local = max(LEAST_LOCAL, 0.1 * local * self.tolerance / now[1].error)
+            assert best is not None
+            return best[0]
 
         return thread_map(one, list(p), self.jobs)
+
+
+def _promises(before: float, now: float, tolerance: float, steps: int) -> bool:
+    """Whether halving equal steps goes on to pay: kinks leave an error that hardly falls."""
+    if 2 * steps > MOST_STEPS:
+        return False
+    if not now < CLOSE:  # far from where an order shows
+        return True
+    gain = max(before / now, 1.0 + 1e-9)
+    halvings = np.log(now / tolerance) / np.log(gain)
+    return bool(halvings <= np.log2(MOST_STEPS / steps) + 1.0)
+
+
+def _state_rows(run: RunPredictor) -> list[int]:
+    """Rows, of values and derivatives of all dofs, that are the state, length D."""
+    first = np.cumsum([0, *(order + 1 for order in run.scheme.orders)])
+    return [int(first[j]) + k for j, o in enumerate(run.scheme.orders) for k in range(o)]
+
+
+def _sampled(run: RunPredictor, x: Array, single: bool) -> Rows:
+    """Rows at phases of unknowns ``(n, w, C)`` on the mesh of equal steps."""
+    scheme, n, step = run.scheme, run.steps, run.boundary.step(run.steps)
+
+    def rows(phase: Array) -> Array:
+        found = scheme.sample(x[None], scheme.plan(phase, n), step)[0]
+        return found[:, 0] if single else found
+
+    return rows

@@ -27,10 +27,10 @@ class Orbit:
     multipliers : ndarray of complex, shape (D,)
         Floquet multipliers, largest first; NaN where they are not known.
     status : Status
-        How the solver ended; unless it is ``CONVERGED`` the states are only where it stopped.
+        How the solver ended; unless it is ``solved`` the states are only where it stopped.
     error : float
-        Estimated largest error of a state over that state's largest size; NaN where the solver
-        makes no estimate.
+        Estimated largest error of a state over that state's swing, or of the time of a kink in
+        cycles; NaN where there is no estimate.
     evaluations : int
         How often the equations were evaluated, counted by points in time.
     """

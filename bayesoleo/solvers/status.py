@@ -20,6 +20,7 @@ class Status(IntEnum):
     NOT_FINITE = 4
     OUT_OF_BOUNDS = 5
     TOLERANCE_NOT_MET = 6
+    NO_ERROR_ESTIMATE = 7
 
     @property
     def message(self) -> str:
@@ -31,6 +32,11 @@ class Status(IntEnum):
         """Whether the result may be used."""
         return self is Status.CONVERGED
 
+    @property
+    def solved(self) -> bool:
+        """Whether there is a solution at all, be its error too large or not known."""
+        return self in (Status.CONVERGED, Status.TOLERANCE_NOT_MET, Status.NO_ERROR_ESTIMATE)
+
 
 _MESSAGES = {
     Status.CONVERGED: "converged",
@@ -40,6 +46,7 @@ _MESSAGES = {
     Status.NOT_FINITE: "a residual or a derivative is not finite",
     Status.OUT_OF_BOUNDS: "a parameter lies outside its prior's support",
     Status.TOLERANCE_NOT_MET: "the error stays above the tolerance on the finest mesh allowed",
+    Status.NO_ERROR_ESTIMATE: "the iteration converged, but its error could not be estimated",
 }
 
 

@@ -68,11 +68,12 @@ def test_all_ways_agree_with_another_code_in_motion_and_derivatives(method, exac
     """Three parameter vectors at once."""
     found = periodic_orbit(
         DUFFING, PLAN, {"stiffness": STIFFNESSES}, method,
-        steps=256, tolerance=1e-9, backend="numpy", jobs=1,
+        steps=512, tolerance=1e-9, backend="numpy", jobs=1,
     )  # fmt: skip
     assert found.parameters == ("damping", "stiffness", "cubic_spring")
     assert set(found.status) == {Status.CONVERGED}
     assert all(orbit.stable for orbit in found.orbits)
+    assert max(orbit.error for orbit in found.orbits) <= 1e-9
     q, slope = exact
     # Of an integrator at 1e-12 through a closure; derivatives carry the orbit's error a thousand
     # times where two of them cancel.

@@ -149,34 +149,78 @@ class _Step:
 
 def _newton_step(problem: PeriodicProblem, level: Level, p: Array) -> _Step:
     """Solve the linearised equations of all steps and all edges."""
-    boundary, scheme, kinks = level.boundary, level.scheme, level.placed
-    count, n, lane = kinks.phases.size, level.mesh.steps, np.array([0])
+    dx, shift = linearised_change(problem, level, p)
+    points = level.boundary.inputs.shape[1]
+    return _Step(dx[..., 0], shift[:, 0], 2 * points if level.placed.phases.size else points)
+
+
+def linearised_change(
+    problem: PeriodicProblem, level: Level, p: Array, missed: Array | None = None
+) -> tuple[Array, Array]:
+    """A step of Newton's method, and the response to what is added to the state after each step.
+
+    Parameters
+    ----------
+    problem : PeriodicProblem
+        Equations and inputs.
+    level : Level
+        A motion on a mesh; its kinks, if any, stand on edges.
+    p : ndarray, shape (np,)
+        Constants.
+    missed : ndarray, shape (D, n), optional
+        Added to the states at the ends of steps.
+
+    Returns
+    -------
+    dx : ndarray, shape (n, w, C)
+        Changes of the unknowns: Newton's step, and the response; NaN where the system is singular.
+    shift : ndarray, shape (K, C)
+        Changes of the phases of the kinks, in cycles.
+    """
+    boundary, scheme, lane = level.boundary, level.scheme, np.array([0])
+    count, n = 0 if level.kinks is None else level.kinks.phases.size, level.mesh.steps
     z = level.rows()
     g, gz = _equations(level, p, z, boundary.inputs)
-    right = np.zeros((1, g.shape[0], 1 + count, g.shape[1]))
-    jumps = np.zeros((1, scheme.state_size, 1 + count, n))
+    more = 0 if missed is None else 1
+    right = np.zeros((1, g.shape[0], 1 + count + more, g.shape[1]))
+    jumps = np.zeros((1, scheme.state_size, 1 + count + more, n))
     right[0, :, 0] = g
     if count:
-        right[0, :, 1:], jumps[0, :, 1:] = _by_edges(problem, level, p, z, g, gz)
+        edges = slice(1, 1 + count)
+        right[0, :, edges], jumps[0, :, edges] = _by_edges(problem, level, p, z, g, gz)
+    if missed is not None:
+        jumps[0, :, -1] = missed
     found, _, ok = scheme.linear(
         gz[None], right, level.x[None], lane, boundary.step(n), jumps=jumps
     )
+    changes = found[0][:, :, [0, *range(1 + count, 1 + count + more)]]
     if not ok[0]:
-        return _Step(np.full(level.x.shape, np.nan), np.zeros(count), g.shape[1])
+        return np.full(changes.shape, np.nan), np.zeros((count, 1 + more))
     if not count:
-        return _Step(found[0, :, :, 0], np.zeros(0), g.shape[1])
+        return changes, np.zeros((0, 1 + more))
+    return _with_edges(problem, level, p, found[0], changes)
+
+
+def _with_edges(
+    problem: PeriodicProblem, level: Level, p: Array, found: Array, changes: Array
+) -> tuple[Array, Array]:
+    """Move the edges so that their switching functions stay zero, ``(n, w, C)`` and ``(K, C)``."""
     values, own, by_state = _at_edges(problem, level, p)
-    at = np.searchsorted(level.mesh.edges, kinks.phases) % n
-    change = np.einsum("kj,kjc->kc", by_state, found[0, at, : scheme.state_size])
-    shift = -_solve(np.diag(own) + change[:, 1:], values + change[:, 0])
-    return _Step(found[0, :, :, 0] + found[0, :, :, 1:] @ shift, shift, 2 * g.shape[1])
+    phases, states = level.placed.phases, level.scheme.state_size
+    at = np.searchsorted(level.mesh.edges, phases) % level.mesh.steps
+    change = np.einsum("kj,kjc->kc", by_state, found[at, :states])
+    columns = [0, *range(1 + phases.size, found.shape[2])]
+    right = change[:, columns]
+    right[:, 0] += values
+    shift = -_solve(np.diag(own) + change[:, 1 : 1 + phases.size], right)
+    return changes + found[:, :, 1 : 1 + phases.size] @ shift, shift
 
 
 def _solve(matrix: Array, right: Array) -> Array:
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
-        return np.full(right.size, np.nan)
+        return np.full(right.shape, np.nan)
 
 
 def _equations(level: Level, p: Array, z: Array, u: Array) -> tuple[Array, Array]:

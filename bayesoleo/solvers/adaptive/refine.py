@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.solvers.adaptive.crossings import Crossings
+from bayesoleo.solvers.adaptive.error_estimate import ErrorEstimate, estimate_error
 from bayesoleo.solvers.adaptive.moving_edges import solve_on
 from bayesoleo.solvers.adaptive.remesh import Misfit, remesh
 from bayesoleo.solvers.adaptive.switched import (
@@ -142,7 +143,7 @@ def solve_adaptive(
     method : str
         A collocation method, see :func:`~bayesoleo.solvers.schemes.tableau.tableau`.
     tolerance : float
-        Estimated largest error of a state, anywhere in the period, over that state's largest size.
+        Estimated largest error of a state, anywhere in the period, over that state's swing.
     max_steps : int
         Of the last mesh; where they do not suffice the status is ``TOLERANCE_NOT_MET``.
 
@@ -194,12 +195,26 @@ class _Work:
             )  # fmt: skip
             end = _End(replace(fine, kinks=kinks), Status.CONVERGED, misfit.largest, mesh, spent)
             if misfit.largest <= self.tolerance and (fine.kinks is None or fine.kinks is kinks):
-                return end
+                found = self._checked(fine)
+                # The comparison of both meshes is of the coarser one: it errs on the safe side.
+                error = max(found.error, misfit.largest)
+                end = replace(end, status=found.judged(self.tolerance), error=error)
+                if end.status is not Status.TOLERANCE_NOT_MET or found.better is None:
+                    return end
+                # Both meshes stepped over something; the one of the estimate does not.
+                mesh, kinks = found.better.mesh, found.better.kinks
+                enough = mesh.steps <= self.max_steps // 2
             if not enough and level.mesh.steps >= self.max_steps // 2:
                 break
             level = self._solve(mesh, fine.motion, kinks)
             spent += level.evaluations
         return replace(end, status=Status.TOLERANCE_NOT_MET)
+
+    def _checked(self, level: Level) -> ErrorEstimate:
+        """The error, looked for between the points that a solution is made of as well."""
+        return estimate_error(
+            self.problem, self.method, self.p, level.motion, level.mesh, self.tolerance
+        )
 
     def _first(self, start: Start) -> tuple[Level, int]:
         if start.mesh is not None:
@@ -222,12 +237,13 @@ class _Work:
 def _finish(end: _End, problem: PeriodicProblem, p: Array) -> AdaptiveSolution:
     level, status, scheme = end.level, end.status, end.level.scheme
     multipliers = np.full(scheme.state_size, complex(np.nan))
-    if status is Status.CONVERGED:
+    if status.solved:
         held = problem.on(scheme.method, level.mesh, level.kinks)
         level = replace(level, boundary=held)
         found = Solution(level.x[None], np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
         found, _, monodromy = sensitivities(held, p[None], found)
-        status = Status(int(found.status[0]))
+        if found.status[0] != Status.CONVERGED.value:
+            status = Status(int(found.status[0]))
         multipliers = floquet_multipliers(monodromy[0])
     orbit = Orbit(
         phases=level.mesh.edges[:-1],

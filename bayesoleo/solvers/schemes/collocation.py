@@ -236,7 +236,7 @@ class Collocation:
             if sparse.needs_factorisation(bool(ok[lane]), monodromy[lane]):
                 ends = np.zeros((self.state_size, right.shape[2], n))
                 if x is not None:
-                    ends += self._jumps(x[lane], h)[:, None]
+                    ends[:, 0] += self._jumps(x[lane], h)
                 if jumps is not None:
                     ends += jumps[lane]
                 found = sparse.collocation_step(gz[lane], right[lane], ends, method, self.orders, h)

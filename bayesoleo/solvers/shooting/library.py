@@ -29,7 +29,7 @@ LOOSE = 1e-6
 MAXIMUM_PASSES = 12
 #: Evaluations of the right-hand side after which an integration has failed.
 MOST_EVALUATIONS = 200_000
-#: Steps in a period at least: an integrator must not stride over the inputs.
+#: Steps in a period at least, unless more are asked for.
 FEWEST_STEPS = 64
 #: A correction is final when it is below this many tolerances, over the sizes of the states.
 FINAL = 30.0
@@ -89,6 +89,7 @@ def shoot_by_library(
     *,
     integrator: str = "LSODA",
     tolerance: float = 1e-9,
+    fewest_steps: int = FEWEST_STEPS,
 ) -> LibraryShot:
     """Find the state that returns to itself after a period, with SciPy's integrators.
 
@@ -106,6 +107,8 @@ def shoot_by_library(
         Of SciPy.
     tolerance : float
         Local error over each state's size.
+    fewest_steps : int
+        In a period, at least: an integrator must not stride over the inputs.
 
     Returns
     -------
@@ -120,7 +123,7 @@ def shoot_by_library(
     if integrator not in INTEGRATORS:
         hint = f"use {', '.join(INTEGRATORS)}"
         raise InputError("no such integrator", key="integrator", value=integrator, hint=hint)
-    return _Library(space, p, period, integrator, tolerance).run(start)
+    return _Library(space, p, period, integrator, tolerance, fewest_steps).run(start)
 
 
 class _TooLongError(Exception):
@@ -131,9 +134,10 @@ class _Library:
     """One search; evaluations are counted from pass to pass."""
 
     def __init__(
-        self, space: StateSpace, p: Array, period: float, integrator: str, tolerance: float
-    ):
-        self.space, self.p, self.period = space, p, period
+        self, space: StateSpace, p: Array, period: float, integrator: str, tolerance: float,
+        fewest_steps: int,
+    ):  # fmt: skip
+        self.space, self.p, self.period, self.fewest = space, p, period, fewest_steps
         self.integrator, self.tolerance, self.evaluations = integrator, tolerance, 0
 
     def run(self, start: Array) -> LibraryShot:
@@ -179,7 +183,7 @@ class _Library:
             with np.errstate(all="ignore"):
                 path = solve_ivp(
                     counted, (0.0, periods * self.period), start, self.integrator, rtol=rtol,
-                    atol=atol, max_step=self.period / FEWEST_STEPS, dense_output=True,
+                    atol=atol, max_step=self.period / self.fewest, dense_output=True,
                 )  # fmt: skip
         # SciPy raises where a Jacobian or a first step is not a number.
         except (_TooLongError, ValueError, np.linalg.LinAlgError):

@@ -151,6 +151,43 @@ def solve_shooting(
     return shooter.run(start)
 
 
+def shoot_on_steps(
+    dynamics: Dynamics,
+    p: Array,
+    like: Shot,
+    start: Array,
+    steps: Array,
+    cut: NDArray[np.bool_],
+    *,
+    tolerance: float = 1e-8,
+    sensitivities: bool = False,
+) -> Shot | None:
+    """Find the state that returns to itself by given steps.
+
+    Parameters
+    ----------
+    dynamics, p, tolerance, sensitivities
+        As in :func:`solve_shooting`.
+    like : Shot
+        A motion close to it, of the same constants.
+    start : ndarray, shape (D,)
+        Where to begin.
+    steps : ndarray, shape (n + 1,)
+        Where steps end, in cycles from 0 to 1.
+    cut : ndarray of bool, shape (n,)
+        Steps that end at a switch.
+
+    Returns
+    -------
+    Shot or None
+        None where Newton's method does not converge on these steps.
+    """
+    path = like.trajectory
+    shooter = _Shooter(dynamics, p, like.period, tolerance, path.tops.shape[1], sensitivities)
+    times = path.times[0] + like.period * steps
+    return shooter.finish(start, replace(path, times=times, aims=times[1:], switched=cut))
+
+
 class _Shooter:
     """One iteration: counts, tolerance and sizes are carried from pass to pass."""
 

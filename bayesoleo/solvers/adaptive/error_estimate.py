@@ -1,0 +1,296 @@
+"""How far a periodic motion is from the solution, whichever solver found it.
+
+The motion is put on a mesh of steps half as long, with an edge at every kink, and one step of
+Newton's method is taken there: what it changes is what the solver's own steps leave. A method sees
+the equations at its stages only, and an integrator's damped estimate passes over what is narrower
+than a step. So the equations are looked at densely between the stages as well; the part of the
+residual that no polynomial through the stages follows acts as a jump at the end of each step, and
+the linearised problem says what it does to the motion. Where that matters, steps are cut and the
+estimate is made again.
+
+References
+----------
+Ascher, U., Mattheij, R. and Russell, R. (1995). Numerical Solution of Boundary Value Problems for
+Ordinary Differential Equations, SIAM, section 9.3 (defects and halved meshes).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.solvers.adaptive.crossings import Crossings
+from bayesoleo.solvers.adaptive.moving_edges import linearised_change, moved, unknowns
+from bayesoleo.solvers.adaptive.switched import (
+    Level,
+    Motion,
+    PeriodicProblem,
+    crossings_of,
+    state_rows,
+    switched,
+)
+from bayesoleo.solvers.periodic.solve import Equations
+from bayesoleo.solvers.schemes.mesh import Mesh
+from bayesoleo.solvers.schemes.tableau import Tableau
+from bayesoleo.solvers.status import Status
+
+Array = NDArray[np.float64]
+
+#: Points of a period at which equations are looked at, at least, and of a step: a pulse as short as
+#: a ten-thousandth of the period is seen wherever it stands.
+LOOKS, LEAST_LOOKS = 16_384, 8
+#: Steps are cut while what is missed between stages is more than this part of the error, or of the
+#: tolerance.
+PART = 0.1
+MAXIMUM_ROUNDS, MOST_STEPS = 10, 60_000
+#: A step is cut if it holds more than this part of the largest missed share of a step.
+SHARE = 0.02
+#: A kink this close to an edge, over the step and in cycles, takes its place.
+BESIDE, CLOSEST = 0.05, 1e-9
+#: Places in a step at which motions are compared.
+COMPARED = 8
+#: Steps shorter than this part of the period are joined to the next.
+SHORTEST = 1e-12
+#: A motion about a level that is smaller than this part of it is measured by the level.
+LEAST_SWING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorEstimate:
+    """An estimate of a motion's error.
+
+    Parameters
+    ----------
+    error : float
+        Largest error of a state, anywhere in the period, over that state's swing, or of the time
+        of a kink in cycles; NaN where no estimate could be made.
+    better : Level or None
+        The motion after one step of Newton's method, on a mesh that resolves the equations along
+        it: where to start for a smaller error.
+    """
+
+    error: float
+    better: Level | None
+
+    def judged(self, tolerance: float) -> Status:
+        """Whether the error is known, and meets a tolerance."""
+        if not np.isfinite(self.error):
+            return Status.NO_ERROR_ESTIMATE
+        return Status.CONVERGED if self.error <= tolerance else Status.TOLERANCE_NOT_MET
+
+
+NONE = ErrorEstimate(float("nan"), None)
+
+
+def estimate_error(
+    problem: PeriodicProblem,
+    method: Tableau,
+    p: Array,
+    motion: Motion,
+    mesh: Mesh,
+    tolerance: float,
+) -> ErrorEstimate:
+    """Estimate the error of a motion that is said to solve a periodic problem.
+
+    Parameters
+    ----------
+    problem : PeriodicProblem
+        Equations and inputs.
+    method : Tableau
+        Collocation method.
+    p : ndarray, shape (np,)
+        Constants.
+    motion : callable
+        Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,).
+    mesh : Mesh
+        Steps by which it was found.
+    tolerance : float
+        Largest error wanted: below a tenth of it nothing more is resolved.
+
+    Returns
+    -------
+    ErrorEstimate
+    """
+    finest, found = _apart(mesh).halved(), NONE
+    for _ in range(MAXIMUM_ROUNDS):
+        kinks = crossings_of(problem, motion, finest, p)
+        if kinks is not None:
+            finest = _with_edges(finest, kinks)
+        boundary = problem.on(method, finest, kinks)
+        x = unknowns(boundary, finest, motion)
+        level = Level(boundary, x, Status.CONVERGED, kinks, 0)
+        look = _look(problem, level, p)
+        if look is None:
+            return NONE
+        found, missed = _estimate(problem, level, p, motion, look)
+        if not np.isfinite(found.error) or missed <= PART * max(tolerance, found.error - missed):
+            return found
+        if finest.steps >= MOST_STEPS:
+            return found
+        finest = _cut(finest, look.shares)
+    return found
+
+
+def _apart(mesh: Mesh) -> Mesh:
+    """A mesh without steps whose length is round-off: an integrator takes them at a jump."""
+    inner = mesh.edges[1:-1]
+    kept = (np.diff(mesh.edges)[:-1] > SHORTEST) & (1.0 - inner > SHORTEST)
+    return Mesh(np.concatenate([[0.0], inner[kept], [1.0]]))
+
+
+def _with_edges(mesh: Mesh, kinks: Crossings) -> Mesh:
+    """A mesh with an edge at every kink, in place of edges that almost stand there."""
+    inner = mesh.edges[1:-1]
+    if kinks.phases.size and inner.size:
+        near = np.abs(inner[:, None] - kinks.phases).min(axis=1)
+        lengths = np.diff(mesh.edges)
+        inner = inner[near > np.maximum(BESIDE * np.minimum(lengths[1:], lengths[:-1]), CLOSEST)]
+    return Mesh(np.unique(np.concatenate([[0.0], inner, kinks.phases, [1.0]])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What the equations leave between the stages.
+
+    Parameters
+    ----------
+    jumps : ndarray, shape (D, n)
+        What a step misses of the state at its end.
+    between : ndarray, shape (D,)
+        Largest error of a state inside a step that is forgotten before its end.
+    scale : ndarray, shape (D,)
+        Swing of each state.
+    shares : ndarray, shape (n,)
+        Larger of both by step, over the scale.
+    """
+
+    jumps: Array
+    between: Array
+    scale: Array
+    shares: Array
+
+
+def _look(problem: PeriodicProblem, level: Level, p: Array) -> _Look | None:
+    """Look at the equations between the stages of all steps; None where they are no numbers."""
+    scheme, n = level.scheme, level.mesh.steps
+    count = max(LEAST_LOOKS, -(-LOOKS // n))
+    nodes, weights = np.polynomial.legendre.leggauss(min(count, 64))
+    parts = -(-count // nodes.size)
+    position = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
+    weight = np.tile(weights / 2 / parts, parts)
+    z = level.inside(np.repeat(np.arange(n), position.size), np.tile(position, n))
+    phases = level.mesh.points(position)
+    g, gz = _evaluate(problem, z, problem.inputs_at(phases), p)
+    at_stages, _ = _held(level, p)
+    follow = at_stages.reshape(-1, n, scheme.method.stages) @ scheme.method.weights(position)[0].T
+    missed = g - follow.reshape(g.shape)
+    if not (np.isfinite(missed).all() and np.isfinite(gz).all()):
+        return None
+    h = np.repeat(scheme.lengths(n, level.boundary.step(n)), position.size)
+    whole = _response(scheme.orders, gz, missed, h)
+    short = _response(scheme.orders, gz, missed, h * np.tile(weight, n))
+    return _collect(level, z, whole, short, weight, position, h)
+
+
+def _collect(
+    level: Level, z: Array, whole: Array, short: Array, weight: Array, position: Array, h: Array
+) -> _Look:
+    """Sum what is missed over each step, and take the largest of what does not last."""
+    orders, n, count = level.scheme.orders, level.mesh.steps, position.size
+    kept = state_rows(orders)
+    states = z[kept]
+    size = np.abs(states).max(axis=1)
+    scale = np.maximum.reduce(
+        [np.ptp(states, axis=1), LEAST_SWING * size, np.full(len(kept), 1e-300)]
+    )
+    jumps, between = np.empty((len(kept), n)), np.empty((len(kept), n))
+    lengths, own, state = h.reshape(n, count), weight * np.ones((n, 1)), 0
+    for j, order in enumerate(orders):
+        top, brief = whole[j].reshape(n, count), short[j].reshape(n, count)
+        last = state + order - 1
+        jumps[last] = np.sum(own * lengths * top, axis=1)
+        between[last] = np.abs(own * lengths * brief).max(axis=1)
+        if order == 2:
+            jumps[state] = np.sum(own * lengths**2 * (1.0 - position) * top, axis=1)
+            between[state] = np.abs((own * lengths) ** 2 * brief).max(axis=1)
+        state += order
+    shares = (np.maximum(np.abs(jumps), between) / scale[:, None]).max(axis=0)
+    return _Look(-jumps, between.max(axis=1), scale, shares)
+
+
+def _response(orders: tuple[int, ...], gz: Array, residual: Array, h: Array) -> Array:
+    """Highest derivatives ``(d, N)`` by which an implicit Euler step of length ``h (N,)`` removes a
+    residual ``(d, N)``."""
+    d = len(orders)
+    matrix, row = np.empty((h.size, d, d)), 0
+    for j, order in enumerate(orders):
+        column = gz[:, row] * h if order == 1 else gz[:, row] * h**2 + gz[:, row + 1] * h
+        matrix[:, :, j] = (column + gz[:, row + order]).T
+        row += order + 1
+    try:
+        return np.asarray(np.linalg.solve(matrix, residual.T[:, :, None])[:, :, 0].T)
+    except np.linalg.LinAlgError:
+        return np.full(residual.shape, np.inf)
+
+
+def _evaluate(problem: PeriodicProblem, z: Array, u: Array, p: Array) -> tuple[Array, Array]:
+    """Residuals ``(d, N)`` and their derivatives ``(d, nz, N)``, with the modes of the motion."""
+    own = u if problem.switches is None else switched(problem.switches, z, u, p)
+    return _with_inputs(problem.equations, len(problem.orders), z, own, p)
+
+
+def _held(level: Level, p: Array) -> tuple[Array, Array]:
+    """The same at the scheme's points, with the modes that are held there."""
+    boundary = level.boundary
+    return _with_inputs(
+        boundary.equations, len(level.scheme.orders), level.rows(), boundary.inputs, p
+    )
+
+
+def _with_inputs(equations: Equations, d: int, z: Array, u: Array, p: Array) -> tuple[Array, Array]:
+    g, gz = np.empty((1, d, z.shape[1])), np.empty((1, d, *z.shape))
+    with np.errstate(all="ignore"):
+        equations.jacobian(z[None], u, p[None], np.array([0]), g, gz)
+    return g[0], gz[0]
+
+
+def _estimate(
+    problem: PeriodicProblem, level: Level, p: Array, motion: Motion, look: _Look
+) -> tuple[ErrorEstimate, float]:
+    """The error by one step of Newton's method, and how much of it is missed between stages."""
+    dx, shift = linearised_change(problem, level, p, look.jumps)
+    if not (np.isfinite(dx).all() and np.isfinite(shift).all()):
+        return NONE, 0.0
+    kept = state_rows(level.scheme.orders)
+    missed = float(((np.abs(dx[:, : len(kept), 1]).max(axis=0) + look.between) / look.scale).max())
+    missed = max(missed, float(np.abs(shift[:, 1]).max(initial=0.0)))
+    better = _moved_level(problem, level, dx[..., 0], shift[:, 0])
+    n, position = level.mesh.steps, np.arange(COMPARED) / COMPARED
+    step = np.repeat(np.arange(n), position.size)
+    # At the same place between kinks: a contact that comes later is an error of its time.
+    now = better.inside(step, np.tile(position, n))[kept]
+    changed = np.abs(now - motion(level.mesh.points(position))[kept]) / look.scale[:, None]
+    own = max(float(changed.max()), float(np.abs(shift[:, 0]).max(initial=0.0)))
+    return ErrorEstimate(own + missed, better), missed
+
+
+def _moved_level(problem: PeriodicProblem, level: Level, dx: Array, shift: Array) -> Level:
+    """The motion after a step of Newton's method, its kinks moved along."""
+    if shift.size == 0:
+        return replace(level, x=level.x + dx)
+    try:
+        mesh, kinks = moved(level.mesh, level.placed, shift)
+    except ValueError:  # kinks change their order: the step is too long to be taken
+        return replace(level, x=level.x + dx)
+    return replace(
+        level, boundary=problem.on(level.scheme.method, mesh, kinks), kinks=kinks, x=level.x + dx
+    )
+
+
+def _cut(mesh: Mesh, shares: Array) -> Mesh:
+    """Halve the steps in which much is missed."""
+    cut = shares > SHARE * shares.max()
+    middle = 0.5 * (mesh.edges[:-1] + mesh.edges[1:])[cut]
+    return Mesh(np.sort(np.concatenate([mesh.edges, middle])))
