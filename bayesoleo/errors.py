@@ -73,6 +73,31 @@ class ResultsError(InputError):
     """A stored result is missing, broken or of another kind than expected."""
 
 
+class UnfinishedError(BayesoleoError):
+    """A late stage failed; what was known before it is kept.
+
+    Parameters
+    ----------
+    stages : sequence of mapping
+        Each with ``stage`` and ``reason``, as in the summary's ``unfinished``.
+    tree : xarray.DataTree
+        What is known, with its summary.
+    folder : path-like, optional
+        Where it was written.
+
+    Attributes
+    ----------
+    stages, tree, folder
+        The same.
+    """
+
+    def __init__(self, stages: Any, tree: Any, folder: Any = None) -> None:
+        self.stages, self.tree, self.folder = tuple(stages), tree, folder
+        failed = "; ".join(f"{item['stage']}: {item['reason']}" for item in self.stages)
+        where = "" if folder is None else f"; what is known without it is in {folder}"
+        super().__init__(f"unfinished: {failed}{where}")
+
+
 class DataWarning(UserWarning):
     """A record is usable but deserves a look."""
 

@@ -150,6 +150,7 @@ EQUATIONS_LATEX: Final = "equations_latex"
 EFFECTS: Final = "effects"
 VERDICT: Final = "verdict"
 SUMMARY: Final = "summary"
+UNFINISHED: Final = "unfinished"
 BETWEEN_RUNS: Final = "between_runs"
 
 # Attributes of every variable

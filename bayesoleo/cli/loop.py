@@ -11,10 +11,13 @@ import typer
 
 from bayesoleo import schema
 from bayesoleo.cli import options, shell, tables
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, UnfinishedError
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from bayesoleo.model import Model
+    from bayesoleo.workflow import Settings
 
 PANEL = "The whole loop"
 DEMO_SYSTEM = "f16n2d2"
@@ -63,7 +66,6 @@ def demo(
       bayesoleo demo
       bayesoleo demo --seed 3 --out /tmp/demo
     """
-    from bayesoleo import workflow
     from bayesoleo.demo import demo_campaign
     from bayesoleo.modelfile import load_model
 
@@ -74,8 +76,7 @@ def demo(
         say("simulating a shaker campaign of an oleo")
         campaign = _fresh_campaign(out, seed, demo_campaign)
         model = load_model(DEMO_SYSTEM)
-        tree = workflow.close(campaign, model, chosen, out=out, say=say, progress=progress)
-    _print(tree, out)
+        _closed(campaign, model, chosen, out, say, progress)
 
 
 def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
@@ -137,7 +138,6 @@ def close(
       bayesoleo close shaker --model f16n2d1 --drive force --seed 7
       bayesoleo close shaker --model f16n2d2 --effects mine.py:drag
     """
-    from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
 
     folder = shell.output_folder(out, campaign)
@@ -159,7 +159,25 @@ def close(
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(folder):
-        tree = workflow.close(campaign, declared, chosen, out=folder, say=say, progress=progress)
+        _closed(campaign, declared, chosen, folder, say, progress)
+
+
+def _closed(
+    campaign: Path,
+    model: Model,
+    chosen: Settings,
+    folder: Path,
+    say: Callable[[str], None],
+    progress: bool,
+) -> None:
+    """Close the loop and print what came out, also where a late stage failed."""
+    from bayesoleo import workflow
+
+    try:
+        tree = workflow.close(campaign, model, chosen, out=folder, say=say, progress=progress)
+    except UnfinishedError as error:
+        _print(error.tree, folder)
+        raise
     _print(tree, folder)
 
 

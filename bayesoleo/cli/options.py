@@ -42,7 +42,7 @@ Out = Annotated[
         metavar="DIR",
         show_default=False,
         rich_help_panel=OUTPUT,
-        help="Folder to write to. An older result in it stays until the new one is complete.",
+        help="Folder to write to. An older result is kept in DIR/older until this one is done.",
     ),
 ]
 Json = Annotated[

@@ -6,7 +6,6 @@ import inspect
 import os
 import re
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,16 +16,17 @@ import typer
 from typer.core import TyperGroup
 
 from bayesoleo import schema
-from bayesoleo.errors import BayesoleoError, InputError
+from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 DEBUG = "BAYESOLEO_DEBUG"
-RESULTS = "results.nc"
+RESULTS, OLDER = "results.nc", "older"
 
-#: Exit statuses: input that cannot be used; stopped by the user (128 + SIGINT).
-UNUSABLE, STOPPED = 2, 130
+#: Exit statuses: input that cannot be used; a late stage failed, and what was known before it is
+#: written; stopped by the user (128 + SIGINT).
+UNUSABLE, UNFINISHED, STOPPED = 2, 3, 130
 
 
 class Stopped(BayesoleoError):  # noqa: N818 - the user's wish is not an error
@@ -47,7 +47,8 @@ class Commands(TyperGroup):
         Raises
         ------
         typer.Exit
-            With status 2 for input that cannot be used, 130 where the user stopped the command.
+            With status 2 for input that cannot be used, 3 where a late stage failed, 130 where the
+            user stopped the command.
         """
         try:
             with one_line_warnings():
@@ -55,6 +56,11 @@ class Commands(TyperGroup):
         except (Stopped, KeyboardInterrupt) as stop:
             complain(str(stop) or "stopped; nothing was written")
             raise typer.Exit(STOPPED) from None
+        except UnfinishedError as error:
+            if os.environ.get(DEBUG, "0") not in ("", "0"):
+                raise
+            complain(f"error: {error}")
+            raise typer.Exit(UNFINISHED) from None
         except BayesoleoError as error:
             if os.environ.get(DEBUG, "0") not in ("", "0"):
                 raise
@@ -120,12 +126,32 @@ def stoppable(folder: Path | None) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as stop:
-        kept = "nothing was written"
-        if folder is not None and folder.is_dir():
-            kept = f"an older result in {folder} is as it was"
-            if next(folder.rglob("segment-*.npz"), None) is not None:
-                kept += "; draws made so far are kept there, and the same command goes on from them"
-        raise Stopped(f"stopped: {kept}") from stop
+        raise Stopped(f"stopped: {kept_in(folder)}") from stop
+
+
+def kept_in(folder: Path | None) -> str:
+    """What a command that was stopped leaves in its folder."""
+    if folder is None or not folder.is_dir():
+        return "nothing was written"
+    older, results = folder / OLDER, folder / RESULTS
+    said = "no result was written"
+    if older.is_dir():
+        said = f"an older result is in {older}, what is known of the new one in {folder}"
+    elif results.is_file() and _unfinished(results):
+        said = f"what is known is in {results}"
+    elif results.is_file():
+        said = f"an older result in {folder} is as it was"
+    kinds = {"draws made so far": "segment-*.npz", "finished rounds": "search.pickle"}
+    kept = [kind for kind, name in kinds.items() if next(folder.rglob(name), None) is not None]
+    if kept:
+        said += f"; {' and '.join(kept)} are kept there, and the same command goes on from them"
+    return said
+
+
+def _unfinished(results: Path) -> bool:
+    from bayesoleo.storage import read_attributes
+
+    return schema.UNFINISHED in read_attributes(results)
 
 
 def console() -> Console:
@@ -204,8 +230,7 @@ def output_folder(out: Path | None, campaign: Path, ending: str = "") -> Path:
     """
     if out is None:
         out = Path(f"bayesoleo-{campaign_name(campaign)}{ending}")
-    folder = out.expanduser()
-    check_writable(folder)
+    folder = check_writable(out.expanduser())
     _check_own(folder, campaign)
     return folder
 
@@ -228,27 +253,11 @@ def _check_own(folder: Path, campaign: Path) -> None:
         )
 
 
-def check_writable(folder: Path) -> None:
-    """Check that a folder is there, or can be made, and takes files.
+def check_writable(folder: Path) -> Path:
+    """See :func:`bayesoleo.storage.check_writable`."""
+    from bayesoleo.storage import check_writable
 
-    Raises
-    ------
-    InputError
-        If not, with the reason.
-    """
-    hint = "choose a folder that you may write to, with --out"
-    nearest = folder.absolute()
-    while not os.path.lexists(nearest):
-        nearest = nearest.parent
-    if not nearest.is_dir():
-        raise InputError("is not a folder; nothing can be written there", file=nearest, hint=hint)
-    try:
-        # What is allowed shows only in trying: permissions, read-only disks, quotas.
-        with tempfile.TemporaryDirectory(prefix=".bayesoleo-", dir=nearest):
-            pass
-    except OSError as error:
-        problem = f"cannot be written to: {error.strerror or error}"
-        raise InputError(problem, file=folder, hint=hint) from error
+    return check_writable(folder)
 
 
 def print_json(value: Any) -> None:

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import xarray as xr
@@ -20,7 +21,7 @@ from bayesoleo.report.proposals import proposal_lines, proposal_table
 from bayesoleo.storage import write_text_atomic
 
 
-def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> None:
+def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> list[str]:
     """Write the report of a result as a self-contained HTML page.
 
     Parameters
@@ -30,16 +31,28 @@ def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> None:
     path : path-like
         Replaced as a whole or not at all.
 
+    Returns
+    -------
+    list of str
+        Figures that could not be drawn, each with the reason; the page says so too.
+
     Raises
     ------
     ResultsError
         The tree holds no summary, or the place cannot be written to.
     """
-    write_text_atomic(path, render_report(tree))
+    text, failed = _render(tree)
+    write_text_atomic(path, text)
+    return failed
 
 
 def render_report(tree: xr.DataTree) -> str:
     """The page of :func:`write_report` as text."""
+    return _render(tree)[0]
+
+
+def _render(tree: xr.DataTree) -> tuple[str, list[str]]:
+    """The page, and the figures that it lacks."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -50,28 +63,35 @@ def render_report(tree: xr.DataTree) -> str:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["first_of"] = next
-    return environment.get_template("report.html.jinja").render(_content(tree))
+    drawing = sections.Drawing()
+    content = _content(tree, drawing)
+    page = environment.get_template("report.html.jinja").render(content)
+    return page, drawing.failed
 
 
-def _content(tree: xr.DataTree) -> dict[str, Any]:
+def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
     """What the template fills in."""
     summary = _summary(tree)
     units = tables.output_units(tree, summary)
+    figures = _figures(tree, drawing)
+    rounds = list(_rounds(tree, summary, drawing))
+    proposals = list(_proposals(tree, summary, drawing))
     return {
         "summary": summary,
         "attributes": tree.attrs,
         "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
         "headline": sentences.headline(summary),
+        "unfinished": [*sentences.unfinished(summary), *drawing.failed],
         "role": sentences.role_shown(summary),
         "tiles": sentences.tiles(summary, units),
         "error_by_role": tables.error_by_role(summary, units),
         "error_by_run": tables.error_by_run(summary, units),
         "case": case(summary, units, tree),
         "remainder": sentences.remainder(summary),
-        "proposals": list(_proposals(tree, summary)),
+        "proposals": proposals,
         "stability": sentences.stability(summary),
         "records": tables.records(tree),
-        "rounds": list(_rounds(tree, summary)),
+        "rounds": rounds,
         "parameters": tables.parameters(summary),
         "diagnostics": tables.diagnostics(tree),
         "diagnostics_by_parameter": tables.diagnostics_by_parameter(tree),
@@ -79,7 +99,7 @@ def _content(tree: xr.DataTree) -> dict[str, Any]:
         "formulas": _formulas(tree),
         "equations": str(tree.attrs.get(schema.EQUATIONS, "")).strip(),
         "provenance": tables.provenance(tree),
-        "figures": _figures(tree),
+        "figures": figures,
         "residual_title": sections.residual_title(tree),
         "number": itertools.count(1),
     }
@@ -94,7 +114,9 @@ def _summary(tree: xr.DataTree) -> dict[str, Any]:
     return summary
 
 
-def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _rounds(
+    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+) -> Iterator[dict[str, Any]]:
     """Table, figure and decision of every round."""
     for number, entry in enumerate(summary["rounds"]):
         yield {
@@ -103,33 +125,36 @@ def _rounds(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, An
             "table": tables.candidates(entry) if entry["candidates"] else None,
             "failed": tables.failed(entry),
             "figures": [
-                *sections.ranking_figure(tree, number),
-                *sections.unnamed_figure(tree, entry),
+                *drawing.of("the ranking", partial(sections.ranking_figure, tree, number)),
+                *drawing.of("the curve", partial(sections.unnamed_figure, tree, entry)),
             ],
         }
 
 
-def _proposals(tree: xr.DataTree, summary: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _proposals(
+    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+) -> Iterator[dict[str, Any]]:
     """Sentences, table and figure for each set of effects that is left to be told apart."""
     for entry in summary.get("proposals", []):
         yield {
             "lines": proposal_lines(entry),
             "table": proposal_table(entry),
-            "figures": sections.proposal_figure(tree, entry),
+            "figures": drawing.of("the next run", partial(sections.proposal_figure, tree, entry)),
         }
 
 
-def _figures(tree: xr.DataTree) -> dict[str, list[sections.Shown]]:
-    return {
-        "data": sections.data_figures(tree),
-        "fit": sections.fit_figures(tree),
-        "where": sections.whereabouts_figure(tree),
-        "residual": sections.residual_figures(tree),
-        "posterior": sections.posterior_figures(tree),
-        "predictive": sections.predictive_figures(tree),
-        "trace": sections.trace_figures(tree),
-        "error": sections.error_figure(tree),
+def _figures(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, list[sections.Shown]]:
+    makers = {
+        "data": ("the data", sections.data_figures),
+        "fit": ("the fit", sections.fit_figures),
+        "where": ("where the error lives", sections.whereabouts_figure),
+        "residual": ("the residual", sections.residual_figures),
+        "posterior": ("the posterior", sections.posterior_figures),
+        "predictive": ("the posterior's prediction", sections.predictive_figures),
+        "trace": ("the sampler's chains", sections.trace_figures),
+        "error": ("the error of each run", sections.error_figure),
     }
+    return {name: drawing.of(words, partial(make, tree)) for name, (words, make) in makers.items()}
 
 
 def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -26,6 +26,28 @@ class Shown:
 
     image: Image
     caption: str
+
+
+@dataclass
+class Drawing:
+    """Draws figures; one that fails is left out and named.
+
+    Parameters
+    ----------
+    failed : list of str
+        Sentences about those that failed.
+    """
+
+    failed: list[str] = field(default_factory=list)
+
+    def of(self, what: str, draw: Callable[[], list[Shown]]) -> list[Shown]:
+        """The figures of one kind; none where one of them fails."""
+        try:
+            return draw()
+        except Exception as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            self.failed.append(f"The figure of {what} could not be drawn. {reason}")
+            return []
 
 
 Draw = Callable[[], Figure]

@@ -39,6 +39,14 @@ def headline(summary: Mapping[str, Any]) -> str:
     return f"Something is missing{rest}."
 
 
+def unfinished(summary: Mapping[str, Any]) -> list[str]:
+    """Which stages did not finish, and why."""
+    return [
+        f"Unfinished: the stage {item['stage']} failed. {item['reason']}"
+        for item in summary.get(schema.UNFINISHED, [])
+    ]
+
+
 def _told_apart(summary: Mapping[str, Any]) -> list[str]:
     """What was added, by name; one that was added at several places with each of them."""
     effects, names = list(summary["effects"]), list[str]()

@@ -33,6 +33,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     """
     console.print()
     console.print(Text(sentences.headline(summary), style=f"bold {COLOURS[summary['verdict']]}"))
+    for line in sentences.unfinished(summary):
+        console.print(Text(line, style="bold red"))
     console.print(_errors(summary))
     for number, entry in enumerate(summary["rounds"], start=1):
         if entry["accepted"]:

@@ -43,7 +43,7 @@ def provenance(seed: int | None, **more: Any) -> dict[str, Any]:
     """
     attributes: dict[str, Any] = {schema.FORMAT_ATTRIBUTE: schema.FORMAT}
     for package in PACKAGES:
-        attributes[f"{package}_version"] = _version(package)
+        attributes[f"{package}_version"] = package_version(package)
     attributes["python_version"] = platform.python_version()
     attributes["platform"] = f"{platform.system()} {platform.machine()}"
     attributes[schema.CREATED] = datetime.now(UTC).isoformat(timespec="seconds")
@@ -52,7 +52,7 @@ def provenance(seed: int | None, **more: Any) -> dict[str, Any]:
     return {name: _plain(value) for name, value in attributes.items() if value is not None}
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str:
     """Installed version; a source tree on the path has none."""
     try:
         return version(package)

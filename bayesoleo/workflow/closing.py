@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import xarray as xr
 
 from bayesoleo.effects import catalogue
 from bayesoleo.model import Model
-from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop
+from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop, loop_of
+from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.experiments.questions import Question, questions_of
-from bayesoleo.workflow.result import write_result
+from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.result import Drawn, report_what_is_there, result_tree, write_result
 from bayesoleo.workflow.sampling import draw
 from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.stages import POSTERIOR, PROPOSALS, REPORT, SEARCH, Stages, reason_of
 from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
+
+#: What stands in the place of the search's last round while it goes on.
+NOT_YET = "the search had not finished when this was written"
+#: And in that of the posterior until it is sampled.
+NOT_SAMPLED = "the posterior had not been sampled when this was written"
 
 
 def trace(
@@ -22,17 +30,20 @@ def trace(
     model: Model,
     settings: Settings = Settings(),
     *,
-    out: Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     say: Say = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Hold a fitted model's residual against the noise and rank what might be missing; add nothing.
 
-    Parameters are those of :func:`close`.
+    Parameters are those of :func:`close`, and so are its errors.
     """
+    output = Output.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
-    loop = run_loop(task, 0, say)
-    return write_result(task, loop, None, out, say, what_next(task, loop, say))
+    stages = Stages(say)
+    loop = run_loop(task, 0, stages, output)
+    questions = stages.attempt(PROPOSALS, lambda: what_next(task, loop, say), no_questions)
+    return _written(task, loop, None, output, stages, questions)
 
 
 def close(
@@ -40,12 +51,15 @@ def close(
     model: Model,
     settings: Settings = Settings(),
     *,
-    out: Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     say: Say = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
     and after.
+
+    What is known is written as soon as it is known: the estimate, and the result of each round. The
+    same call, with the same campaign, model and settings, goes on after the last finished round.
 
     Parameters
     ----------
@@ -55,9 +69,9 @@ def close(
         In its own drive.
     settings : Settings
         Seed, threads, drive and so on.
-    out : Path, optional
-        Folder for ``results.nc``, ``report.html``, ``summary.json`` and the sampler's checkpoints,
-        from which a run that was stopped goes on.
+    out : path-like, optional
+        Folder for ``results.nc``, ``report.html``, ``summary.json`` and ``checkpoints``, from which
+        a run that was stopped goes on. It is tried before anything is computed.
     say : callable
         Told what is being done.
     progress : bool
@@ -71,32 +85,137 @@ def close(
     Raises
     ------
     InputError
-        If campaign, model and settings do not fit together.
+        If campaign, model and settings do not fit together, or the folder cannot be written to.
+    UnfinishedError
+        If a stage after the first estimate failed. It carries the tree of what is known, whose
+        summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
+    output = Output.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
-    loop = run_loop(task, settings.max_effects, say)
-    found = what_next(task, loop, say)
-    say("sample the posterior")
-    drawn = draw(task, loop.final.fit, out, say, progress)
-    return write_result(task, loop, drawn, out, say, found)
+    with output.alone():
+        stages = Stages(say)
+        loop = run_loop(task, settings.max_effects, stages, output, resume=True)
+        questions = stages.attempt(PROPOSALS, lambda: what_next(task, loop, say), no_questions)
+        if not settings.quick:
+            _write_found(task, loop, output, stages, questions)
+        say("sample the posterior")
+        fit, place = loop.final.fit, output.checkpoints
+        drawn = stages.attempt(
+            POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
+        )
+        return _written(task, loop, drawn, output, stages, questions)
 
 
-def run_loop(task: Task, max_effects: int, say: Say) -> ClosedLoop:
-    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled."""
-    settings = task.settings
+def no_questions() -> tuple[Question, ...]:
+    """Where none could be asked."""
+    return ()
+
+
+def _write_found(
+    task: Task,
+    loop: ClosedLoop,
+    output: Output,
+    stages: Stages,
+    questions: Sequence[Question],
+) -> None:
+    """Write what was found, with its report, before what may take hours."""
+    so_far = Stages(failed=[*stages.failed, {"stage": POSTERIOR, "reason": NOT_SAMPLED}])
+    try:
+        write_result(task, loop, None, output, so_far, questions)
+    except Exception as error:
+        stages.say(f"what is known so far could not be written: {reason_of(error)}")
+
+
+def _written(
+    task: Task,
+    loop: ClosedLoop,
+    drawn: Drawn | None,
+    output: Output,
+    stages: Stages,
+    questions: Sequence[Question],
+) -> xr.DataTree:
+    """The result, written; if nothing failed on the way to it."""
+    try:
+        tree = write_result(task, loop, drawn, output, stages, questions)
+    except Exception as error:
+        stages.fail(REPORT, reason_of(error), error)
+        found = report_what_is_there(output, stages)
+        if found is None:
+            raise
+        tree = found
+    stages.finish(tree, output.folder)
+    output.finish()
+    return tree
+
+
+def run_loop(
+    task: Task, max_effects: int, stages: Stages, output: Output, *, resume: bool = False
+) -> ClosedLoop:
+    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
+
+    Parameters
+    ----------
+    task : Task
+    max_effects : int
+        Effects added at most.
+    stages : Stages
+        A search that fails after the first estimate is a failed stage: the loop is then what was
+        found before.
+    output : Output
+        Written to after the estimate and after each round.
+    resume : bool
+        Whether to keep how far the search has come, and to go on from there.
+
+    Raises
+    ------
+    Exception
+        Of any kind, if the model could not be estimated.
+    """
+    settings, say = task.settings, stages.say
     for effect in settings.effects or ():
         base = task.assembly.model() if effect.on_channels else task.assembly.native
         if effect not in catalogue() and not effect.places(base):
             say(f"effect {effect.id} has no place in this model: it needs {effect.applies_to}")
-    return close_loop(
-        task.assembly,
-        task.roles,
-        settings.numerics,
-        effects=settings.effects,
-        seed=settings.seed,
-        max_effects=max_effects,
-        say=say,
-    )
+    known = output.kept(task, say) if resume else None
+    reached = [] if known is None else [known]
+
+    def keep(progress: Progress) -> None:
+        reached.append(progress)
+        write_so_far(task, progress, output, say, resume=resume)
+
+    try:
+        return close_loop(
+            task.assembly,
+            task.roles,
+            settings.numerics,
+            effects=settings.effects,
+            seed=settings.seed,
+            max_effects=max_effects,
+            known=known,
+            keep=keep,
+            say=say,
+        )
+    except Exception as error:
+        if not reached:
+            raise
+        reason = reason_of(error)
+        stages.fail(SEARCH, reason, error)
+        return loop_of(reached[-1].ended(f"the search broke off here: {reason}"), task.roles)
+
+
+def write_so_far(task: Task, progress: Progress, output: Output, say: Say, *, resume: bool) -> None:
+    """Write what is known; failing at that must not end what goes on."""
+    if output.folder is None:
+        return
+    stages = Stages()
+    stages.fail(SEARCH, NOT_YET)
+    try:
+        if resume:
+            output.keep(task, progress)
+        loop = loop_of(progress.ended(NOT_YET), task.roles)
+        output.write(*result_tree(task, loop, None, output, stages))
+    except Exception as error:
+        say(f"what is known so far could not be written: {reason_of(error)}")
 
 
 def what_next(

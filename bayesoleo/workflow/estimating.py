@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
-from pathlib import Path
 
 import xarray as xr
 
@@ -13,9 +13,11 @@ from bayesoleo.model import Model
 from bayesoleo.tracing.fitting.fit import Fit, fit_model
 from bayesoleo.tracing.outcome.inference import at_mode, mode_group, mode_of
 from bayesoleo.tracing.outcome.result import point_group
-from bayesoleo.workflow.result import finish
+from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.result import finish, mark_unfinished
 from bayesoleo.workflow.settings import Settings
-from bayesoleo.workflow.task import Say, Source, prepare, silent
+from bayesoleo.workflow.stages import POSTERIOR, Stages
+from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
 
 
 def estimate(
@@ -23,7 +25,7 @@ def estimate(
     model: Model,
     settings: Settings = Settings(),
     *,
-    out: Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     say: Say = silent,
 ) -> xr.DataTree:
     """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
@@ -32,8 +34,8 @@ def estimate(
     ----------
     campaign, model, settings
         See :func:`close`.
-    out : Path, optional
-        Folder for ``results.nc``.
+    out : path-like, optional
+        Folder for ``results.nc``; it is tried before anything is computed.
     say : callable
         Told what is being done.
 
@@ -41,11 +43,31 @@ def estimate(
     -------
     xarray.DataTree
         With the groups of the records and ``point``.
+
+    Raises
+    ------
+    InputError
+        If campaign, model and settings do not fit together, or the folder cannot be written to.
+    UnfinishedError
+        If the mode under another error model was not found; it carries the estimate without it.
     """
+    output, stages = Output.checked(out), Stages(say)
     task = prepare(campaign, model, settings)
+    fit, more = estimated(task, stages)
+    tree = finish(task, {schema.POINT: point_group(fit), **more}, fit)
+    mark_unfinished(tree, stages.failed)
+    output.write(tree)
+    stages.finish(tree, output.folder)
+    output.finish()
+    return tree
+
+
+def estimated(task: Task, stages: Stages) -> tuple[Fit, dict[str, xr.Dataset]]:
+    """The estimate, at the mode under the error model that was chosen if that was found."""
+    settings, say = task.settings, stages.say
     fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
-    fit, more = under_error_model(fit, settings, say)
-    return finish(task, {schema.POINT: point_group(fit), **more}, fit, out)
+    plain: tuple[Fit, dict[str, xr.Dataset]] = (fit, {})
+    return stages.attempt(POSTERIOR, lambda: under_error_model(fit, settings, say), lambda: plain)
 
 
 def under_error_model(fit: Fit, settings: Settings, say: Say) -> tuple[Fit, dict[str, xr.Dataset]]:

@@ -9,8 +9,10 @@ import xarray as xr
 from bayesoleo.model import Model
 from bayesoleo.tracing.experiments.propose import check_periodic
 from bayesoleo.workflow.closing import run_loop, what_next
+from bayesoleo.workflow.output import Output
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.stages import Stages
 from bayesoleo.workflow.task import Say, Source, prepare, silent
 
 
@@ -58,6 +60,7 @@ def propose(
     """
     task = prepare(campaign, model, settings)
     check_periodic(task.reduced.records)  # before anything is estimated for nothing
-    loop = run_loop(task, 0, say)
+    output, stages = Output(None), Stages(say)
+    loop = run_loop(task, 0, stages, output)
     found = what_next(task, loop, say, rivals=rivals, limits=limits)
-    return write_result(task, loop, None, None, say, found)
+    return stages.finish(write_result(task, loop, None, output, stages, found), None)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.data import findings
+from bayesoleo.errors import BayesoleoError
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, compare
-from bayesoleo.report import write_report
-from bayesoleo.storage import provenance, write_text_atomic, write_tree
+from bayesoleo.report import write_plain_report, write_report
+from bayesoleo.storage import provenance, read_tree
 from bayesoleo.systems import equations, equations_latex
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.experiments.questions import Question
@@ -27,20 +27,23 @@ from bayesoleo.tracing.outcome.result import (
     records_tree,
 )
 from bayesoleo.tracing.outcome.summary import summarise
-from bayesoleo.workflow.task import Say, Task
+from bayesoleo.workflow import stages as stage_names
+from bayesoleo.workflow.output import REPORT, RESULTS, SUMMARY, Output
+from bayesoleo.workflow.stages import Stages
+from bayesoleo.workflow.task import Task
 
-RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
+Drawn = tuple[Samples, LogDensity]
 
 
 def write_result(
     task: Task,
     loop: ClosedLoop,
-    drawn: tuple[Samples, LogDensity] | None,
-    out: Path | None,
-    say: Say,
+    drawn: Drawn | None,
+    output: Output,
+    stages: Stages,
     questions: Sequence[Question] = (),
 ) -> xr.DataTree:
-    """The tree of a closed loop, with its summary; with a folder, its three files.
+    """The tree of a closed loop, with its summary and its report; with a folder, its three files.
 
     Parameters
     ----------
@@ -48,35 +51,99 @@ def write_result(
     loop : ClosedLoop
     drawn : tuple of (Samples, LogDensity) or None
         The posterior of the final model, if it was sampled.
-    out : Path or None
+    output : Output
         The folder.
-    say : callable
-        Told what is being done.
+    stages : Stages
+        What failed before; what fails here is added.
     questions : sequence of Question, optional
         What it left to be told apart, and by which runs that could be done.
     """
+    tree, summary = result_tree(task, loop, drawn, output, stages, questions)
+    if output.folder is None:
+        return tree
+    stages.say("write results and report")
+    output.write(tree, summary)
+    page, failed = output.folder / REPORT, len(stages.failed)
+    for figure in stages.attempt(
+        stage_names.REPORT,
+        lambda: write_report(tree, page),
+        lambda: write_plain_report({**summary, schema.UNFINISHED: stages.failed}, page),
+    ):
+        stages.fail(stage_names.REPORT, figure)
+    if len(stages.failed) > failed:
+        summary[schema.UNFINISHED] = list(stages.failed)
+        _mark(tree, summary)
+        output.write(tree, summary)
+    return tree
+
+
+def report_what_is_there(output: Output, stages: Stages) -> xr.DataTree | None:
+    """The result as it was last written, with what failed since, and a report of it.
+
+    None where nothing was written, or that cannot be read.
+    """
+    if output.folder is None:
+        return None
+    try:
+        tree = read_tree(output.folder / RESULTS)
+        summary = json.loads(tree.attrs[schema.SUMMARY])
+    except (BayesoleoError, KeyError, ValueError):
+        return None
+    summary[schema.UNFINISHED] = list(stages.failed)
+    _mark(tree, summary)
+    output.write(tree, summary)
+    write_plain_report(summary, output.folder / REPORT)
+    return tree
+
+
+def result_tree(
+    task: Task,
+    loop: ClosedLoop,
+    drawn: Drawn | None,
+    output: Output,
+    stages: Stages,
+    questions: Sequence[Question] = (),
+) -> tuple[xr.DataTree, dict[str, Any]]:
+    """The tree of :func:`write_result` and its summary; nothing is written."""
     seed, fit = task.settings.seed, loop.final.fit
-    samples, density = drawn or (None, None)
+    unit = _drive_unit(task, loop)
+    groups = {schema.POINT: point_group(fit)}
+    groups |= stages.attempt(
+        stage_names.PREDICTIONS,
+        lambda: loop_groups(loop, drawn, seed),
+        lambda: _without_failing(loop, seed),
+    )
+    groups |= proposals_group(questions, unit)
+    if drawn is not None:
+        groups |= stages.attempt(
+            stage_names.POSTERIOR, lambda: _posterior(fit, drawn, seed, groups), dict
+        )
+    samples = drawn[0] if drawn is not None and schema.POSTERIOR in groups else None
     # Bare names: they stay true when the folder moves.
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
-    files = {} if out is None else names
+    files = {} if output.folder is None else names
     summary = summarise(loop, samples, {**task.about(), "files": files})
     summary["notes"] = [*summary["notes"], *findings(task.reduced.records, task.campaign.units)]
-    unit = _drive_unit(task, loop)
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
-    groups = {schema.POINT: point_group(fit), **loop_groups(loop, drawn, seed)}
-    groups |= proposals_group(questions, unit)
-    if samples is not None:
-        groups |= posterior_groups(fit, samples, seed, density)
-        groups[schema.COMPARISON] = compare(groups)
-    tree = finish(task, groups, fit, None, summary=summary)
-    if out is not None:
-        say("write results and report")
-        out.mkdir(parents=True, exist_ok=True)
-        write_tree(tree, out / RESULTS)
-        write_report(tree, out / REPORT)
-        write_text_atomic(out / SUMMARY, schema.summary_json(summary))
-    return tree
+    summary[schema.UNFINISHED] = list(stages.failed)
+    return finish(task, groups, fit, summary), summary
+
+
+def _posterior(
+    fit: Fit, drawn: Drawn, seed: int, groups: Mapping[str, xr.Dataset]
+) -> dict[str, xr.Dataset]:
+    """The groups of the posterior, and how the point compares with it."""
+    samples, density = drawn
+    found = posterior_groups(fit, samples, seed, density)
+    return {**found, schema.COMPARISON: compare({**groups, **found})}
+
+
+def _without_failing(loop: ClosedLoop, seed: int) -> dict[str, xr.Dataset]:
+    """The groups of a loop that do not need its posterior; none if these fail too."""
+    try:
+        return loop_groups(loop, None, seed)
+    except Exception:  # what failed is known already
+        return {}
 
 
 def _drive_unit(task: Task, loop: ClosedLoop) -> str:
@@ -90,10 +157,9 @@ def finish(
     task: Task,
     groups: Mapping[str, xr.Dataset],
     fit: Fit,
-    out: Path | None,
     summary: Mapping[str, Any] | None = None,
 ) -> xr.DataTree:
-    """One tree with provenance; written if a folder is given."""
+    """One tree with provenance."""
     roles = task.roles
     runs = {record.label: record for record in (*roles.fitted, *roles.held_out)}
     tree = xr.DataTree.from_dict({**records_tree(list(runs.values()), task.campaign), **groups})
@@ -110,14 +176,21 @@ def finish(
         schema.COMMAND: task.settings.command,
         schema.MODEL_DOCUMENT: json.dumps(to_document(fit.model)),
     }
-    if summary is not None:
-        more |= {
-            schema.EFFECTS: list(summary["effects"]),
-            schema.VERDICT: summary["verdict"],
-            schema.SUMMARY: schema.summary_json(dict(summary)),
-        }
     tree.attrs.update(provenance(task.settings.seed, **more))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_tree(tree, out / RESULTS)
+    if summary is not None:
+        _mark(tree, summary)
     return tree
+
+
+def _mark(tree: xr.DataTree, summary: Mapping[str, Any]) -> None:
+    """Put a summary into a tree's attributes."""
+    tree.attrs[schema.EFFECTS] = json.dumps(list(summary["effects"]), ensure_ascii=False)
+    tree.attrs[schema.VERDICT] = summary["verdict"]
+    tree.attrs[schema.SUMMARY] = schema.summary_json(dict(summary))
+    mark_unfinished(tree, summary[schema.UNFINISHED])
+
+
+def mark_unfinished(tree: xr.DataTree, failed: Sequence[Mapping[str, str]]) -> None:
+    """Say in a tree's attributes what is missing in it, if anything is."""
+    if failed:
+        tree.attrs[schema.UNFINISHED] = json.dumps(list(failed), ensure_ascii=False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import xarray as xr
@@ -12,16 +14,19 @@ from bayesoleo import schema
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
-from bayesoleo.tracing.fitting.fit import Fit, fit_model
+from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.outcome.inference import mixture_at
 from bayesoleo.tracing.outcome.result import point_group, posterior_groups, predictive_groups
-from bayesoleo.workflow.estimating import under_error_model
-from bayesoleo.workflow.result import finish
+from bayesoleo.workflow.estimating import estimated
+from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.result import finish, mark_unfinished
 from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.stages import POSTERIOR, PREDICTIONS, Stages
 from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
 
 #: Starts drawn from the priors that look for other modes than the estimate before sampling.
 STARTS = 4
+NOT_YET = "the posterior had not been sampled when this was written"
 
 
 def sample(
@@ -29,29 +34,67 @@ def sample(
     model: Model,
     settings: Settings = Settings(),
     *,
-    out: Path | None = None,
+    out: str | os.PathLike[str] | None = None,
     say: Say = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Estimate, then sample the posterior from there with emcee.
 
-    Parameters are those of :func:`close`; the tree has the groups of the records, the point and the
-    posterior.
+    Parameters are those of :func:`close`, and so are its errors; the tree has the groups of the
+    records, the point and the posterior. The estimate is written before the posterior is sampled.
     """
+    output, stages = Output.checked(out), Stages(say)
     task = prepare(campaign, model, settings)
-    fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
-    fit, more = under_error_model(fit, settings, say)
-    samples, density = draw(task, fit, out, say, progress)
-    groups = {schema.POINT: point_group(fit), **more}
-    groups |= posterior_groups(fit, samples, settings.seed, density)
-    groups |= predictive_groups(fit, samples, density, settings.seed)
-    groups[schema.COMPARISON] = compare(groups)
-    return finish(task, groups, fit, out)
+    with output.alone():
+        fit, groups = estimated(task, stages)
+        groups[schema.POINT] = point_group(fit)
+        tree = finish(task, groups, fit)
+        mark_unfinished(tree, [*stages.failed, {"stage": POSTERIOR, "reason": NOT_YET}])
+        output.write(tree)
+        place, seed = output.checkpoints, settings.seed
+        drawn = stages.attempt(
+            POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
+        )
+        if drawn is not None:
+            groups |= _groups(fit, drawn, seed, groups, stages)
+        tree = finish(task, groups, fit)
+        mark_unfinished(tree, stages.failed)
+        output.write(tree)
+        stages.finish(tree, output.folder)
+        output.finish()
+    return tree
+
+
+def no_groups() -> dict[str, xr.Dataset]:
+    """Where a stage failed."""
+    return {}
+
+
+def _groups(
+    fit: Fit,
+    drawn: tuple[Samples, LogDensity],
+    seed: int,
+    groups: Mapping[str, xr.Dataset],
+    stages: Stages,
+) -> dict[str, xr.Dataset]:
+    """Of the draws, of what they predict, and how the point compares with them."""
+    samples, density = drawn
+    found: dict[str, xr.Dataset] = {}
+    found |= stages.attempt(
+        POSTERIOR, lambda: posterior_groups(fit, samples, seed, density), no_groups
+    )
+    found |= stages.attempt(
+        PREDICTIONS, lambda: predictive_groups(fit, samples, density, seed), no_groups
+    )
+    if schema.POSTERIOR in found:
+        found[schema.COMPARISON] = compare({**groups, **found})
+    return found
 
 
 def draw(
-    task: Task, fit: Fit, out: Path | None, say: Say, progress: bool
+    task: Task, fit: Fit, checkpoints: Path | None, say: Say, progress: bool
 ) -> tuple[Samples, LogDensity]:
+    """Draws of the posterior, from the checkpoints if there are some."""
     settings = task.settings
     density = settings.inference.density(fit, settings.jobs)
     starts = 0 if settings.quick else STARTS
@@ -65,7 +108,7 @@ def draw(
         start,
         effective_size=settings.effective_size,
         seed=settings.seed,
-        out=None if out is None else out / "checkpoints" / fingerprint[:16],
+        out=None if checkpoints is None else checkpoints / fingerprint[:16],
         fingerprint=fingerprint,
         progress=progress,
         quick=settings.quick,

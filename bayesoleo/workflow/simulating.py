@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import xarray as xr
 from bayesoleo.estimation.runs.nuisance import uncertain_conditions
 from bayesoleo.model import Model, driven_by
 from bayesoleo.simulation import merged, model_of, parameter_sets, simulate_like
+from bayesoleo.storage import check_writable
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.task import Source, choose_drive, reduce
 
@@ -19,7 +21,7 @@ def simulate(
     campaign: Source,
     settings: Settings = Settings(),
     *,
-    out: Path,
+    out: str | os.PathLike[str],
     values: Mapping[str, float] | None = None,
     draws: int | None = None,
     noise: Mapping[str, float] | None = None,
@@ -34,7 +36,7 @@ def simulate(
         Gives inputs, sampling, conditions, channels and the noise.
     settings : Settings
         Seed, drive (of a model), scheme and steps.
-    out : Path
+    out : path-like
         Folder of the new campaign; must not hold files.
     values : mapping of str to float, optional
         Parameters at other values, SI.
@@ -53,6 +55,7 @@ def simulate(
     InputError
         If a name is unknown, or the model cannot be solved.
     """
+    folder = check_writable(out)
     reduced = reduce(campaign, jobs=settings.jobs)
     if isinstance(source, Model):
         drive = choose_drive(source, reduced.campaign, settings.drive)
@@ -65,7 +68,7 @@ def simulate(
         reduced.campaign,
         uncertain_conditions(model).complete(reduced.records),
         merged(sets, values, model),
-        out=out,
+        out=folder,
         noise=noise,
         seed=settings.seed,
         scheme=settings.scheme,

@@ -68,7 +68,7 @@ def test_interrupt_says_what_is_kept(run, monkeypatch, campaign, model, tmp_path
     assert result.exit_code == 130
     (line,) = result.stderr.splitlines()
     if kept:
-        assert line.startswith(f"stopped: an older result in {out} is as it was; draws made so far")
+        assert line.startswith("stopped: no result was written; draws made so far are kept there")
     else:
         assert line == "stopped: nothing was written"
 
