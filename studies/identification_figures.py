@@ -161,14 +161,30 @@ def print_table(table: Mapping[str, object]) -> None:
     rows = table["rows"]
     assert isinstance(rows, list)
     print(f"{len(rows)} of {table['planned']} campaigns, version {table['version']}")
+    _print("campaigns that failed", f"{table['failed']:4d} of {table['planned']:4d}")
     for factor in study.FACTORS:
-        found = [study.right(row) for row in study.named(rows, factor)]
-        print(f"right at {factor:>2g} times the limit      {_fraction(found)}")
+        _print_size(study.named(rows, factor), f"{factor:>2g} times the limit")
     false = [bool(row["added"]) for row in study.plain(rows)]
-    print(f"false additions, nothing lacks  {_fraction(false)}")
+    _print("nothing lacks, something added", _fraction(false))
     strange = study.strange(rows)
-    print(f"called certain, outside         {_fraction([row['certain'] for row in strange])}")
-    print(f"given a likely name, outside    {_fraction([bool(row['added']) for row in strange])}")
+    certain, given = [row["certain"] for row in strange], [bool(row["added"]) for row in strange]
+    _print("outside the catalogue, given a likely name", _fraction(given))
+    _print("outside the catalogue, called certain", _fraction(certain))
+
+
+def _print_size(rows: Sequence[Row], size: str) -> None:
+    """What was named at one size, and how surely."""
+    right = [study.right(row) for row in rows]
+    one = [study.alone(row) and study.right(row) for row in rows]
+    wrong = [row["certain"] and not study.right(row) for row in rows]
+    _print(f"{size}, right alone or in a class of 3", _fraction(right))
+    _print(f"{size}, one name, and it is right", _fraction(one))
+    _print(f"{size}, called certain", _fraction([row["certain"] for row in rows]))
+    _print(f"{size}, certain and wrong", _fraction(wrong))
+
+
+def _print(what: str, figure: str) -> None:
+    print(f"{what:<52}{figure}")
 
 
 def _fraction(values: Sequence[bool]) -> str:

@@ -56,6 +56,11 @@ def strange(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row["effect"] in STRANGE]
 
 
+def alone(row: Row) -> bool:
+    """Whether one name is the answer: something was added, and no other effect looks like it."""
+    return bool(row["added"]) and not row["same"]
+
+
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """The study's figures: fractions, and the mean size of classes."""
     done = [row for row in rows if "failed" not in row]
@@ -64,9 +69,17 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         table[f"right_at_{factor:g}x"] = _mean([right(row) for row in named(done, factor)])
     table["false_additions"] = _mean([bool(row["added"]) for row in plain(done)])
     table["mean_class_size"] = _mean([1 + len(r["same"]) for r in named(done) if r["added"]])
+    table["outside_given_a_name"] = _mean([bool(row["added"]) for row in strange(done)])
     table["outside_named_as_certain"] = _mean([row["certain"] for row in strange(done)])
     for factor in FACTORS[1:]:
-        table[f"certain_at_{factor:g}x"] = _mean([row["certain"] for row in named(done, factor)])
+        found = named(done, factor)
+        table[f"certain_at_{factor:g}x"] = _mean([row["certain"] for row in found])
+        table[f"certain_and_wrong_at_{factor:g}x"] = sum(
+            row["certain"] and not right(row) for row in found
+        )
+        table[f"one_name_and_right_at_{factor:g}x"] = _mean(
+            [alone(row) and right(row) for row in found]
+        )
     return table
 
 

@@ -8,6 +8,12 @@ out, from a creep of 15 mm at 0.02 Hz over 110 mm at 0.1 Hz to 30 mm at 3 Hz - a
 its detection limit, the size that a score finds significant in half of all campaigns. Two hundred
 campaigns lack nothing; in others something acts that the catalogue has no name for, and the loop
 may take a name that is like it, but must not call it certain.
+
+What the table below says against the loop: two of 1145 campaigns failed. At three times the limit
+284 of 300 answers are right alone or in a class of three at most, but only 192 are one name that is
+right. At ten times the limit one of 227 answers that were called certain is wrong: Coulomb
+friction was called power-law damping. Of 45 campaigns with something outside the catalogue 14 were
+given a likely name, nine of them with the verdict ``effect added``; none was called certain.
 """
 
 # %%

@@ -65,6 +65,43 @@ def test_the_table_keeps_what_the_figures_need(load, tmp_path, monkeypatch):
     assert (said["right_at_3x"], said["false_additions"]) == (0.5, 0.0)
     assert said["outside_named_as_certain"] == 0.5
     assert said["right_at_10x"] is None
+    assert said["outside_given_a_name"] == 1.0
+    assert (said["one_name_and_right_at_3x"], said["certain_and_wrong_at_3x"]) == (0.5, 1)
+
+
+def test_the_readme_says_what_the_stored_table_holds(load):
+    """Also what speaks against the loop."""
+    rows = load("identification_rows")
+    table = rows.stored()
+    readme = " ".join((STUDIES.parent / "README.md").read_text(encoding="utf-8").split())
+
+    def cell(row_of, factor, part=True):
+        found = [row_of(row) for row in rows.named(table["rows"], factor)]
+        share = f", {100 * sum(found) / len(found):.0f} %" if part else ""
+        return f"{sum(found)} of {len(found)}{share}"
+
+    right = " | ".join(cell(rows.right, factor) for factor in rows.FACTORS)
+    assert f"| right, alone or in a class of at most three | {right} |" in readme
+    one = " | ".join(
+        cell(lambda row: rows.alone(row) and rows.right(row), factor) for factor in rows.FACTORS
+    )
+    assert f"| a single name, and it is right | {one} |" in readme
+    certain = [cell(lambda row: row["certain"], factor, factor > 1) for factor in rows.FACTORS]
+    assert f"| called certain | {' | '.join(certain)} |" in readme
+    wrong = [
+        sum(row["certain"] and not rows.right(row) for row in rows.named(table["rows"], factor))
+        for factor in rows.FACTORS
+    ]
+    assert "| called certain, and wrong | {} | {} | {}: ".format(*wrong) in readme
+    planned = f"{table['planned']:,}".replace(",", " ")
+    assert f"| campaigns that failed | {table['failed']} of {planned}" in readme
+    strange = rows.strange(table["rows"])
+    given = sum(bool(row["added"]) for row in strange)
+    added = sum(row["verdict"] == "effect added" for row in strange)
+    sure = sum(row["certain"] for row in strange)
+    assert f"| {given} of {len(strange)}; {added}; {sure} |" in readme
+    false = rows.plain(table["rows"])
+    assert f"nominal 1 % | {sum(bool(row['added']) for row in false)} of {len(false)} |" in readme
 
 
 @pytest.mark.statistical
