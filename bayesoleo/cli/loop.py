@@ -110,6 +110,7 @@ def close(
     effective_size: options.EffectiveSize = 1000,
     max_effects: options.MaxEffects = 4,
     effects: options.Effects = None,
+    without: options.Without = "",
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
@@ -137,6 +138,7 @@ def close(
       bayesoleo close shaker --model model.py:model --out results --quick
       bayesoleo close shaker --model f16n2d1 --drive force --seed 7
       bayesoleo close shaker --model f16n2d2 --effects mine.py:drag
+      bayesoleo close shaker --model f16n2d2 --without humming_force,unnamed
     """
     from bayesoleo.modelfile import load_model
 
@@ -152,6 +154,7 @@ def close(
         max_effects=max_effects,
         drive=drive,
         effects=effects,
+        without=without,
         nuisance=nuisance,
         error_model=error_model,
         between_runs=between_runs,
@@ -188,6 +191,7 @@ def check(
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
+    without: options.Without = "",
     as_json: options.Json = False,
 ) -> None:
     """Read a campaign and a model, say what would be done, and touch nothing.
@@ -202,7 +206,9 @@ def check(
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
 
-    chosen = options.settings(scheme=scheme, steps=steps, drive=drive, nuisance=nuisance)
+    chosen = options.settings(
+        scheme=scheme, steps=steps, drive=drive, nuisance=nuisance, without=without
+    )
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:
         shell.print_json(tables.plain(plan))

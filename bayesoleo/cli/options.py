@@ -178,6 +178,18 @@ Effects = Annotated[
 ]
 
 
+Without = Annotated[
+    str,
+    typer.Option(
+        "--without",
+        metavar="EFFECT,…",
+        show_default=False,
+        rich_help_panel=RUNNING,
+        help="Effects to leave out of the search; 'unnamed' leaves out functions without a name.",
+    ),
+]
+
+
 def settings(
     *,
     seed: int = 0,
@@ -193,13 +205,14 @@ def settings(
     error_model: str = "independent",
     between_runs: str = "",
     scheduler: str | None = None,
+    without: str = "",
 ) -> Settings:
     """Settings of the workflow from options.
 
     Raises
     ------
     InputError
-        If there is no such scheme or error model, or the file of effects cannot be used.
+        If there is no such scheme, error model or effect, or the file of effects cannot be used.
     """
     from bayesoleo.modelfile import load_effects
     from bayesoleo.posterior.density.error_models import check_word
@@ -224,6 +237,7 @@ def settings(
         nuisance=_words(nuisance),
         error_model=check_word(error_model),
         between_runs=_words(between_runs),
+        without=_words(without),
         command=shlex.join(["bayesoleo", *sys.argv[1:]]),
     )
 

@@ -53,6 +53,7 @@ def propose(
     jobs: options.Jobs = None,
     drive: options.Drive = None,
     effects: options.Effects = None,
+    without: options.Without = "",
     scheme: options.Scheme = "radau3",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
@@ -87,7 +88,7 @@ def propose(
 
     chosen = options.settings(
         seed=seed, jobs=jobs, drive=drive, effects=effects, scheme=scheme, steps=steps,
-        nuisance=nuisance,
+        nuisance=nuisance, without=without,
     )  # fmt: skip
     limits = dict(_limit(text) for text in limit or [])
     names = tuple(part.strip() for part in rivals.split(",") if part.strip())

@@ -215,6 +215,7 @@ def trace(
     seed: options.Seed = 0,
     jobs: options.Jobs = None,
     effects: options.Effects = None,
+    without: options.Without = "",
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
@@ -247,6 +248,7 @@ def trace(
         steps=steps,
         drive=drive,
         effects=effects,
+        without=without,
         nuisance=nuisance,
     )
     say, progress = shell.teller(quiet), shell.progress_shown(quiet)

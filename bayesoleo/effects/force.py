@@ -11,9 +11,16 @@ from bayesoleo.effects.effect import BY_RUN, Effect, Names
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import Scan
 from bayesoleo.effects.parts import Amplitude, Scales, Shape
-from bayesoleo.effects.places import is_quantity, moving_places, resisting_places, substitute
+from bayesoleo.effects.places import (
+    drives,
+    is_quantity,
+    measures,
+    moving_places,
+    resisting_places,
+    substitute,
+)
 from bayesoleo.model import Model
-from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN, symbol, within
+from bayesoleo.model.expressions import COSINE, SINE, TIME, symbol, within
 
 #: Name under which a model may declare the acceleration of gravity.
 GRAVITY = "gravity"
@@ -54,8 +61,9 @@ MASS = force_effect(
 
 
 def _declares_gravity(model: Model) -> Sequence[str]:
-    """Models that name it and use it."""
-    return (GRAVITY,) if is_quantity(model, GRAVITY) else ()
+    """Models that name it: an acceleration, not a force."""
+    named = is_quantity(model, GRAVITY) and measures(model, GRAVITY, "m/s**2")
+    return (GRAVITY,) if named else ()
 
 
 def _heavier(model: Model, target: str, names: Names) -> Model:
@@ -68,19 +76,14 @@ HARMONICS = 3
 
 
 def _locked(model: Model) -> Sequence[str]:
-    """Balances of forces of models that something drives."""
-    return tuple(resisting_places(model)) if _drive(model) else ()
-
-
-def _drive(model: Model) -> str:
-    """The input whose phase counts: the first one."""
-    return next((name for name in model.inputs if WITHIN not in name), "")
+    """Balances of forces of models that something drives: nothing hums or turns in a free decay."""
+    return tuple(resisting_places(model)) if drives(model) else ()
 
 
 def _turning(model: Model, target: str, names: Names) -> Model:
     """Chebyshev's polynomials in the cosine of the drive's phase are the cosines of its multiples;
     those of the second kind, times the sine, the sines."""
-    place, drive = resisting_places(model)[target], _drive(model)
+    place, drive = resisting_places(model)[target], drives(model)[0]
     cosine, sine = (within(part, drive) for part in (COSINE, SINE))
     c, s = symbol(cosine), symbol(sine)
     force = sp.Add(
@@ -165,11 +168,12 @@ HUMMING = Effect(
         Amplitude(part, "force", f"{letter}_r", f"{part} part of a hum, by run", by_run=True)
         for part, letter in (("cosine", "a"), ("sine", "b"))
     ),
-    places=lambda model: tuple(resisting_places(model)),
+    places=_locked,
     change=_humming,
     shapes=(Shape("frequency", "Hz", "f_h", "frequency of a hum", _HEARD),),
     source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
-    applies_to="balances of forces, in transient runs with a line that no input has",
+    applies_to="balances of forces of driven models, in transient runs with a line that no input"
+    " has",
     driven=True,
     kind="transient",
     shown=lambda scales: scales.hum is not None,

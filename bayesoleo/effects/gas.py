@@ -30,7 +30,7 @@ import sympy as sp
 
 from bayesoleo.effects.effect import BY_RUN, Effect, Names, free_name
 from bayesoleo.effects.parts import Amplitude
-from bayesoleo.effects.places import is_quantity, substitute
+from bayesoleo.effects.places import is_quantity, measures, substitute
 from bayesoleo.model import Dof, Model
 from bayesoleo.model.expressions import split_derivative, symbol, total_derivative
 
@@ -72,9 +72,9 @@ def _where(target: str, *more: str) -> Callable[[Model], Sequence[str]]:
     return lambda model: (target,) if has_gas(as_gas_spring(model), *more) else ()
 
 
-def _quantity(name: str) -> Callable[[Model], Sequence[str]]:
+def _quantity(name: str, unit: str) -> Callable[[Model], Sequence[str]]:
     """Whatever the model: what is stated may be wrong."""
-    return lambda model: (name,) if is_quantity(model, name) else ()
+    return lambda model: (name,) if is_quantity(model, name) and measures(model, name, unit) else ()
 
 
 # -- solubility ------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ EXTRA_VOLUME = Effect(
     title="More gas volume than stated (gauge, lines)",
     formula=r"V_0 + V_e",
     amplitudes=(Amplitude("extra_volume", "m**3", "V_e", "volume beyond the initial volume"),),
-    places=_quantity("initial_volume"),
+    places=_quantity("initial_volume", "m**3"),
     change=_replacing("initial_volume", "extra_volume", factor=False),
     source="Verbeek (1993), section 7.3",
     applies_to="gas springs",
@@ -230,7 +230,7 @@ PRESSURE_ERROR = Effect(
     title="Error of the initial pressure, the same in all runs",
     formula=r"p_0 (1 + \epsilon)",
     amplitudes=(Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),),
-    places=_quantity("initial_pressure"),
+    places=_quantity("initial_pressure", "Pa"),
     change=_replacing("initial_pressure", "initial_pressure_error", factor=True),
     source="Verbeek (1993), eq. 6.2: theta_5",
     applies_to="gas springs",
@@ -246,7 +246,7 @@ PRESSURE_ERROR_BY_RUN = Effect(
             "initial_pressure_by_run", "", r"\epsilon_r", "relative error of p_0", by_run=True
         ),
     ),
-    places=_quantity("initial_pressure"),
+    places=_quantity("initial_pressure", "Pa"),
     change=_replacing("initial_pressure", "initial_pressure_by_run", factor=True),
     source=BY_RUN,
     applies_to="gas springs",

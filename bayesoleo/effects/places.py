@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import sympy as sp
 
+from bayesoleo.effects.units import parse_unit
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import WITHIN, derivative_symbol, split_derivative
 from bayesoleo.model.initial import with_starts
@@ -17,21 +18,57 @@ def force_places(model: Model) -> dict[str, Coordinate]:
     """Places of a force-like effect by target.
 
     A target is the name of a second-order dof's equation, or of an output that follows an input (a
-    force law). Where an output follows several inputs the target is ``output/input``.
+    force law). Where an output follows several inputs the target is ``output/input``; an input that
+    is no motion to the output's force, such as a pressure to a force, is no place.
     """
     # An input that goes with another one is no motion of its own.
     coordinates = [item for item in model.coordinates() if WITHIN not in item.name]
     second = [item for item in coordinates if item.kind == "equation" and item.velocity is not None]
     laws = [item for item in coordinates if item.kind == "output"]
+    first = [item for item in coordinates if item.kind == "equation" and item.velocity is None]
     # Where a balance of forces exists the forces act there: an output that shows an input as well
     # (a compliant frame) is no second place, nor is the state of a memory or a temperature.
-    chosen = second or laws or list(coordinates)
+    chosen = second or laws or first
     shared = Counter((item.kind, item.target) for item in chosen)
     places = {}
     for item in chosen:
         alone = shared[item.kind, item.target] == 1
-        places[item.target if alone else f"{item.target}/{item.name}"] = item
+        if item.kind == "equation" or _is_motion(model, item):
+            places[item.target if alone else f"{item.target}/{item.name}"] = item
     return places
+
+
+def _is_motion(model: Model, place: Coordinate) -> bool:
+    """Whether an input is to an output what a motion is to its force: together they do work.
+
+    A pressure or a stress does work over a length, a volume or a strain. Where a unit is not
+    declared nobody knows; two channels in one unit, such as volts, may be raw readings of a pair.
+    """
+    force, motion = model.outputs[place.target].unit, model.inputs[place.name]
+    if not force or not motion:
+        return True
+    powers, moved = _dimensions(force), _dimensions(motion)
+    if powers == moved:
+        return True
+    if not (set(moved) <= {"[length]"} or moved == _dimensions("C")):
+        return False
+    for base, power in moved.items():
+        powers[base] = powers.get(base, 0) + power
+    for base, power in _dimensions("J").items():
+        powers[base] = powers.get(base, 0) - power
+    # Work; or that by length, area or volume; or by mass, where a law is of accelerations.
+    by_length, by_mass = powers.pop("[length]", 0), powers.pop("[mass]", 0)
+    return -3 <= by_length <= 0 and by_mass in (0, -1) and not any(powers.values())
+
+
+def _dimensions(unit: str) -> dict[str, float]:
+    """Powers of the base dimensions."""
+    return dict(parse_unit(unit).dimensionality)
+
+
+def drives(model: Model) -> tuple[str, ...]:
+    """Inputs that are channels of their own, the one that gives the clock first."""
+    return tuple(name for name in model.inputs if WITHIN not in name)
 
 
 def resisting_places(model: Model) -> dict[str, Coordinate]:
@@ -113,6 +150,15 @@ def is_quantity(model: Model, *names: str) -> bool:
     """Whether all names are declared in the model."""
     known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
     return known.issuperset(names)
+
+
+def measures(model: Model, name: str, unit: str) -> bool:
+    """Whether a declared quantity is in a unit of this kind, as far as units tell."""
+    declared = {**model.inputs, **{key: item.unit for key, item in model.dofs.items()}}
+    declared |= {key: item.unit for key, item in model.parameters.items()}
+    declared |= {key: item.unit for key, item in model.conditions.items()}
+    own = declared.get(name, "")
+    return not own or _dimensions(own) == _dimensions(unit)
 
 
 def substitute(model: Model, table: Mapping[sp.Symbol, sp.Expr]) -> Model:

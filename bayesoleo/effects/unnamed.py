@@ -187,10 +187,12 @@ class Spline:
 
 
 def balance_places(model: Model) -> dict[str, Coordinate]:
-    """Where an unnamed effect can act: as a force does, and in the equation of any other dof."""
+    """Where an unnamed effect can act: as a force does, in the equation of any other dof, and in a
+    law whose inputs are no motion."""
     places = force_places(model)
+    alone = not places and not model.dofs
     for item in model.coordinates():
-        if item.kind == "equation" and item.target not in places:
+        if item.target not in places and (item.kind == "equation" or alone):
             places[item.target] = item
     return places
 

@@ -172,7 +172,7 @@ def run_loop(
         Of any kind, if the model could not be estimated.
     """
     settings, say = task.settings, stages.say
-    for effect in settings.effects or ():
+    for effect in settings.searched if settings.effects else ():
         base = task.assembly.model() if effect.on_channels else task.assembly.native
         if effect not in catalogue() and not effect.places(base):
             say(f"effect {effect.id} has no place in this model: it needs {effect.applies_to}")
@@ -188,9 +188,10 @@ def run_loop(
             task.assembly,
             task.roles,
             settings.numerics,
-            effects=settings.effects,
+            effects=settings.searched,
             seed=settings.seed,
             max_effects=max_effects,
+            unnamed=settings.unnamed,
             known=known,
             keep=keep,
             say=say,

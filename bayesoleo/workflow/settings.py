@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 
-from bayesoleo.effects import Effect
+from bayesoleo.effects import Effect, catalogue
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.errors import InputError
 from bayesoleo.posterior.density.error_models import ERROR_MODELS
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.tracing.fitting.fit import Numerics
@@ -39,6 +42,9 @@ class Settings:
         channel that the rig controls, if the model can be driven by it.
     effects : tuple of Effect, optional
         Instead of the catalogue.
+    without : tuple of str
+        Ids of effects that are left out of the search, at all their places; ``unnamed`` leaves out
+        functions without a name.
     command : str
         Kept in the result.
     nuisance : tuple of {"conditions", "offset", "gain"}
@@ -66,6 +72,29 @@ class Settings:
     error_model: str = ERROR_MODELS[0]
     between_runs: tuple[str, ...] = ()
     scheduler: str | None = None
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        known = [effect.id for effect in self._offered] + [FAMILY]
+        for name in self.without:
+            if name not in known:
+                close = difflib.get_close_matches(name, known, 3)
+                hint = f"did you mean {' or '.join(close)}?" if close else "see bayesoleo effects"
+                raise InputError("unknown effect", key="without", value=name, hint=hint)
+
+    @property
+    def _offered(self) -> tuple[Effect, ...]:
+        return catalogue() if self.effects is None else self.effects
+
+    @property
+    def searched(self) -> tuple[Effect, ...]:
+        """The effects that are looked for."""
+        return tuple(effect for effect in self._offered if effect.id not in self.without)
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether a function without a name may be added."""
+        return FAMILY not in self.without
 
     @property
     def inference(self) -> Inference:

@@ -187,8 +187,6 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh, number of
         candidate effects, and what deserves a look in the records.
     """
-    from bayesoleo.effects import catalogue
-
     task = prepare(campaign, model, settings)
     driven = task.assembly.model()
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
@@ -204,7 +202,7 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         "steps": settings.steps or first_steps(driven, task.roles.fitted),
         "effects": sum(
             bool(effect.places(driven if effect.family == "sensor" else model))
-            for effect in (catalogue() if settings.effects is None else settings.effects)
+            for effect in settings.searched
         ),
         "findings": findings(task.reduced.records, task.campaign.units),
     }

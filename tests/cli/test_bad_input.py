@@ -124,6 +124,9 @@ def test_unknown_options_of_the_model(refused, campaign, model):
     assert "cannot be driven by 'stroke'; drive it by one of: force, displacement" in line
     line = refused("close", campaign, "--model", model, "--scheme", "radau4")
     assert "key --scheme: unknown scheme (got 'radau4'); did you mean radau3?" in line
+    for command in ("close", "trace", "propose", "check"):
+        line = refused(command, campaign, "--model", model, "--without", "play,viscous_dampng")
+        assert "key without: unknown effect (got 'viscous_dampng'); did you mean viscous" in line
 
 
 def test_unknown_effect(refused):

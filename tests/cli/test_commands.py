@@ -148,6 +148,8 @@ def test_check_touches_nothing(run, campaign, model, tmp_path):
     assert plan["unknowns"] == ["damping", "stiffness"]
     text = run("check", campaign, "--model", model).stdout
     assert "damping, stiffness" in text
+    less = run("check", campaign, "--model", model, "--without", "play, preload", "--json")
+    assert json.loads(less.stdout)["effects"] == plan["effects"] - 2
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -177,6 +179,7 @@ def test_close_hands_over_what_was_asked(run, campaign, model, made_up, monkeypa
     result = run(
         *("close", campaign, "-m", model, "--seed", 3, "--jobs", 1, "--quick"),
         *("--drive", "displacement", "--steps", 64, "--max-effects", 1),
+        *("--without", "humming_force,unnamed"),
     )
     assert result.exit_code == 0, result.output
     assert asked["path"] == campaign
@@ -189,6 +192,8 @@ def test_close_hands_over_what_was_asked(run, campaign, model, made_up, monkeypa
         1,
         1000,
     )
+    assert settings.without == ("humming_force", "unnamed")
+    assert not settings.unnamed
     assert "Stribeck_friction" in result.stdout
     assert "working" in result.stderr
 

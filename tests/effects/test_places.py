@@ -1,0 +1,106 @@
+"""Where effects can be: an effect that needs a drive has one, and a force has its motion."""
+
+from __future__ import annotations
+
+import pytest
+
+from bayesoleo.effects import catalogue
+from bayesoleo.effects.places import force_places
+from bayesoleo.effects.unnamed import balance_places
+from bayesoleo.model import Dof, Model, Output, Parameter
+
+
+def law(output: tuple[str, str], terms: str, **inputs: str) -> Model:
+    """An output that follows inputs; ``a`` and ``b`` are its parameters."""
+    name, unit = output
+    used = {letter: Parameter(1.0, sd=1.0) for letter in "ab" if letter in terms}
+    return Model("law", inputs=inputs, parameters=used, outputs={name: Output(terms, unit)})
+
+
+def oscillator(force: str = "") -> Model:
+    inputs = {"force": "N"} if force else {}
+    return Model(
+        "oscillator",
+        inputs=inputs,
+        dofs={"position": Dof("m")},
+        parameters={"stiffness": Parameter(100.0, "N/m", sd=10.0)},
+        equations={"position": f"ddot(position) + stiffness*position{force}"},
+        outputs={"displacement": Output("position", "m")},
+    )
+
+
+def offered(model: Model) -> set[str]:
+    return {effect.id for effect in catalogue() if effect.places(model)}
+
+
+def test_nothing_hums_or_turns_where_nothing_drives():
+    clocks = {"humming_force", "periodic_force"}
+    assert clocks <= offered(oscillator(" - force"))
+    free = offered(oscillator())
+    assert not clocks & free
+    assert {"coulomb_friction", "cubic_stiffness", "drifting_force"} <= free
+
+
+@pytest.mark.parametrize(
+    ("model", "places"),
+    [
+        (law(("force", "N"), "a*dot(x) + b*p", x="m", p="Pa"), ["force/x"]),
+        (law(("force", "N"), "a*dot(x) + b*i", x="m", i="A"), ["force/x"]),
+        (law(("torque", "N*m"), "a*dot(x) + b*t", x="rad", t="degC"), ["torque/x"]),
+        (law(("force", "N"), "a*x + b*y", x="m", y="mm"), ["force/x", "force/y"]),
+        (law(("force", "kN"), "a*x", x="mm"), ["force"]),
+        (law(("pressure", "Pa"), "a*x", x="m"), ["pressure"]),
+        (law(("pressure", "Pa"), "a*x", x="m**3"), ["pressure"]),
+        (law(("stress", "MPa"), "a*x", x="mm/mm"), ["stress"]),
+        (law(("restoring", "m/s**2"), "a*x", x="m"), ["restoring"]),
+        (law(("voltage", "V"), "a*x", x="C"), ["voltage"]),
+        # raw readings, and units that nobody stated
+        (law(("force", "V"), "a*x", x="V"), ["force"]),
+        (law(("force", ""), "a*x + b*y", x="m", y=""), ["force/x", "force/y"]),
+        # a velocity, a current and a force are no motion
+        (law(("force", "N"), "a*x", x="m/s"), []),
+        (law(("voltage", "V"), "a*x", x="A"), []),
+        (law(("shown", "m"), "a*x", x="N"), []),
+        (law(("force", "N"), "a*p", p="Pa"), []),
+    ],
+)  # fmt: skip
+def test_a_force_acts_on_a_motion(model, places):
+    assert list(force_places(model)) == places
+    for effect in catalogue():
+        if effect.family in ("damping", "friction", "stiffness", "contact", "force", "compliance"):
+            assert set(effect.places(model)) <= set(places), effect.id
+    # A curve without a name needs no motion, and an output is a channel anyway.
+    assert balance_places(model)
+    assert "sensor_offset" in offered(model)
+
+
+def test_the_first_order_keeps_what_needs_no_velocity():
+    thermal = Model(
+        "thermal",
+        inputs={"heat": "W"},
+        dofs={"temperature": Dof("K")},
+        parameters={"loss": Parameter(1.0, "W/K", sd=1.0)},
+        equations={"temperature": "dot(temperature) + loss*temperature - heat"},
+        outputs={"reading": Output("temperature", "K")},
+    )
+    found = offered(thermal)
+    assert {"cubic_stiffness", "constant_force"} <= found
+    assert not {"viscous_damping", "coulomb_friction", "mass_error"} & found
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong", "effect"),
+    [
+        ("gravity", "m/s**2", "N", "gravity_error"),
+        ("initial_volume", "m**3", "m", "extra_volume"),
+        ("initial_pressure", "Pa", "N", "initial_pressure_error"),
+    ],
+)
+def test_a_name_alone_is_not_the_quantity(name, right, wrong, effect):
+    def with_unit(unit: str) -> Model:
+        constant = {name: Parameter(1.0, unit, fixed=True)}
+        return oscillator(" - force").with_parameters(**constant)
+
+    assert effect in offered(with_unit(right))
+    assert effect in offered(with_unit(""))
+    assert effect not in offered(with_unit(wrong))
