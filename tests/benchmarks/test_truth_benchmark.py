@@ -25,3 +25,26 @@ def test_parts_are_modules_with_figures(truth):
     """A part that is named can be imported."""
     for name in truth.parts():
         assert (Path(__file__).parent / f"truth_{name}.py").is_file()
+
+
+@pytest.mark.slow
+def test_no_solver_is_silently_wrong_where_steps_could_pass_over_something(truth):
+    """A microsecond's lag behind a steep function, and a stop of 1e8, by all ways."""
+    found = truth.figures(["solvers"], fraction=0.1)
+    assert found["silently_wrong"] == 0
+    assert found["solves"] == 12
+    # What is said to be usable is so to ten times the tolerance or the estimate.
+    assert found["solves_ok"] >= 6
+    assert found["worst_error_ratio"] < 10
+
+
+def test_a_silent_error_is_one_beyond_what_was_asked_for_and_said(truth):
+    import numpy as np
+    import truth_solvers
+
+    wrong = truth_solvers.Solve(True, True, 1e-8, 2e-8, 3e-7)
+    assert wrong.silent
+    assert not truth_solvers.Solve(True, True, 1e-8, 4e-8, 3e-7).silent
+    assert not truth_solvers.Solve(False, True, 1e-8, 2e-8, 3e-7).silent
+    assert truth_solvers.Solve(True, True, 1e-8, np.nan, 3e-7).silent
+    assert truth_solvers.Solve(True, True, 1e-8, 1e-8, np.nan).silent

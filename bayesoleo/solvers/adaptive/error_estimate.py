@@ -1,4 +1,4 @@
-"""How far a periodic motion is from the solution, whichever solver found it.
+"""How far a motion is from the solution, whichever solver found it.
 
 The motion is put on a mesh of steps half as long, with an edge at every kink, and one step of
 Newton's method is taken there: what it changes is what the solver's own steps leave. A method sees
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.solvers.adaptive.crossings import Crossings
-from bayesoleo.solvers.adaptive.moving_edges import linearised_change, moved, unknowns
+from bayesoleo.solvers.adaptive.moving_edges import linearised_change, moved
 from bayesoleo.solvers.adaptive.switched import (
     Level,
     Motion,
@@ -31,7 +31,7 @@ from bayesoleo.solvers.adaptive.switched import (
     state_rows,
     switched,
 )
-from bayesoleo.solvers.periodic.solve import Equations
+from bayesoleo.solvers.periodic.solve import Boundary, Equations
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.status import Status
@@ -49,6 +49,8 @@ MAXIMUM_ROUNDS, MOST_STEPS = 10, 60_000
 SHARE = 0.02
 #: A kink this close to an edge, over the step and in cycles, takes its place.
 BESIDE, CLOSEST = 0.05, 1e-9
+#: So far before its end, over its length, a step is asked for what it has there.
+ONE_SIDE = 1e-6
 #: Places in a step at which motions are compared.
 COMPARED = 8
 #: Steps shorter than this part of the period are joined to the next.
@@ -91,8 +93,10 @@ def estimate_error(
     motion: Motion,
     mesh: Mesh,
     tolerance: float,
+    *,
+    initial: bool = False,
 ) -> ErrorEstimate:
-    """Estimate the error of a motion that is said to solve a periodic problem.
+    """Estimate the error of a motion that is said to solve a periodic or an initial value problem.
 
     Parameters
     ----------
@@ -108,6 +112,9 @@ def estimate_error(
         Steps by which it was found.
     tolerance : float
         Largest error wanted: below a tenth of it nothing more is resolved.
+    initial : bool
+        Whether the motion starts from a state that is given instead of returning to where it
+        began; phases are then parts of its time.
 
     Returns
     -------
@@ -119,18 +126,24 @@ def estimate_error(
         if kinks is not None:
             finest = _with_edges(finest, kinks)
         boundary = problem.on(method, finest, kinks)
-        x = unknowns(boundary, finest, motion)
+        x = _unknowns(boundary, method, finest, motion)
         level = Level(boundary, x, Status.CONVERGED, kinks, 0)
         look = _look(problem, level, p)
         if look is None:
             return NONE
-        found, missed = _estimate(problem, level, p, motion, look)
+        found, missed = _estimate(problem, level, p, motion, look, initial)
         if not np.isfinite(found.error) or missed <= PART * max(tolerance, found.error - missed):
             return found
         if finest.steps >= MOST_STEPS:
             return found
         finest = _cut(finest, look.shares)
     return found
+
+
+def _unknowns(boundary: Boundary, method: Tableau, mesh: Mesh, motion: Motion) -> Array:
+    """Unknowns of the scheme, shape (n, w), for a motion: at a kink, from the side of the step."""
+    inside = mesh.points(np.minimum(method.c, 1.0 - ONE_SIDE))
+    return boundary.scheme.from_motion(motion(mesh.edges[:-1])[None], motion(inside)[None])[0]
 
 
 def _apart(mesh: Mesh) -> Mesh:
@@ -257,10 +270,15 @@ def _with_inputs(equations: Equations, d: int, z: Array, u: Array, p: Array) -> 
 
 
 def _estimate(
-    problem: PeriodicProblem, level: Level, p: Array, motion: Motion, look: _Look
+    problem: PeriodicProblem,
+    level: Level,
+    p: Array,
+    motion: Motion,
+    look: _Look,
+    initial: bool,
 ) -> tuple[ErrorEstimate, float]:
     """The error by one step of Newton's method, and how much of it is missed between stages."""
-    dx, shift = linearised_change(problem, level, p, look.jumps)
+    dx, shift = linearised_change(problem, level, p, look.jumps, initial=initial)
     if not (np.isfinite(dx).all() and np.isfinite(shift).all()):
         return NONE, 0.0
     kept = state_rows(level.scheme.orders)

@@ -155,7 +155,12 @@ def _newton_step(problem: PeriodicProblem, level: Level, p: Array) -> _Step:
 
 
 def linearised_change(
-    problem: PeriodicProblem, level: Level, p: Array, missed: Array | None = None
+    problem: PeriodicProblem,
+    level: Level,
+    p: Array,
+    missed: Array | None = None,
+    *,
+    initial: bool = False,
 ) -> tuple[Array, Array]:
     """A step of Newton's method, and the response to what is added to the state after each step.
 
@@ -169,6 +174,8 @@ def linearised_change(
         Constants.
     missed : ndarray, shape (D, n), optional
         Added to the states at the ends of steps.
+    initial : bool
+        Hold the first state instead of closing the period.
 
     Returns
     -------
@@ -191,7 +198,7 @@ def linearised_change(
     if missed is not None:
         jumps[0, :, -1] = missed
     found, _, ok = scheme.linear(
-        gz[None], right, level.x[None], lane, boundary.step(n), jumps=jumps
+        gz[None], right, level.x[None], lane, boundary.step(n), initial=initial, jumps=jumps
     )
     changes = found[0][:, :, [0, *range(1 + count, 1 + count + more)]]
     if not ok[0]:

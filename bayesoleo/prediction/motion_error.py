@@ -1,0 +1,83 @@
+"""How far the motion of a run, as it is solved for, is from what its equations ask for.
+
+The mesh of a run is frozen, so that a log density is the same function everywhere; how good it is
+is asked for once, at the estimate.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.prediction.inputs import input_rows
+from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.solvers.adaptive.error_estimate import NONE, ErrorEstimate, estimate_error
+from bayesoleo.solvers.adaptive.switched import PeriodicProblem
+from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.collocation import Collocation
+from bayesoleo.solvers.schemes.mesh import equidistant
+from bayesoleo.solvers.schemes.tableau import tableau
+
+Array = NDArray[np.float64]
+
+#: Error over the swing below which nothing more is resolved: what no channel shows.
+TOLERANCE = 1e-6
+
+
+def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:
+    """Estimate the error of a run's anchored motion.
+
+    Parameters
+    ----------
+    run : RunPredictor
+        Of a periodic run or of a transient, anchored.
+    tolerance : float
+        Error over the swing below which it need not be known.
+
+    Returns
+    -------
+    ErrorEstimate
+        Its error is NaN where there is no motion, or no estimate of its error.
+    """
+    anchor, derived = run.anchor, run.kernels.derived
+    if anchor is None or not derived.dofs:
+        return NONE
+    initial = not run.record.periodic
+    problem = PeriodicProblem(
+        equations=run.kernels,
+        orders=derived.orders,
+        period=run.period,
+        inputs_at=lambda phase: input_rows(run.record, derived.inputs, phase),
+        conditions=len(derived.admissible),
+        active=len(derived.active),
+    )
+    scheme, step = run.scheme, run.boundary.step(run.steps)
+    method, mesh = tableau(DEFAULT_SCHEME), equidistant(run.steps)
+    if isinstance(scheme, Collocation):
+        method, mesh = scheme.method, scheme.mesh or mesh
+
+    def motion(phase: Array) -> Array:
+        if isinstance(scheme, Collocation):
+            plan: Any = scheme.plan(phase, run.steps, initial=initial)
+        else:
+            plan = scheme.plan(phase, run.steps)
+        return np.asarray(scheme.sample(anchor.x[None, :, :, None], plan, step)[0, :, 0])
+
+    return estimate_error(problem, method, anchor.p, motion, mesh, tolerance, initial=initial)
+
+
+def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:
+    """Outputs ``(ny, N)`` at the raw samples of the better motion that an estimate found."""
+    better, anchor = estimate.better, run.anchor
+    if better is None or anchor is None:
+        return None
+    position = run.record.phase if run.record.periodic else run.record.position
+    plan = better.scheme.plan(position, better.mesh.steps, initial=not run.record.periodic)
+    step = better.boundary.step(better.mesh.steps)
+    z = better.scheme.sample(better.x[None, :, :, None], plan, step)[:, :, 0]
+    y = np.empty((1, len(run.kernels.derived.outputs), position.size))
+    with np.errstate(all="ignore"):
+        run.kernels.output(z, run.sample_inputs, anchor.p[None], np.array([0]), y)
+    return y[0]
