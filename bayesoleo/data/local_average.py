@@ -55,21 +55,22 @@ class LocalAverage:
         return np.full(points, np.nan)
 
 
-def local_average(values: Array) -> LocalAverage:
+def local_average(values: Array, sigma: float | None = None) -> LocalAverage:
     """Average a signal over neighbouring samples.
 
     Parameters
     ----------
     values : ndarray, shape (N,)
         Signal at equidistant times.
+    sigma : float, optional
+        Standard deviation of a sample's noise, where it is known; by default from differences of
+        neighbours.
     """
     signal = np.asarray(values, dtype=float)
-    size = max(FEWEST_SAMPLES, signal.size // MOST_AVERAGES)
-    number = max(signal.size // size, 1)
-    block = np.minimum(np.arange(signal.size) // size, number - 1)
-    counts = np.bincount(block)
-    means = (np.bincount(block, signal) / counts)[block]
-    sigma = innovation_noise(signal)
+    number = int(_blocks(signal.size)[-1]) + 1
+    means = local_means(signal)
+    if sigma is None:
+        sigma = innovation_noise(signal)
     return LocalAverage(
         values=means,
         samples=signal.size,
@@ -78,3 +79,28 @@ def local_average(values: Array) -> LocalAverage:
         sigma=sigma,
         noise=sigma * float(np.sqrt(number / signal.size)),
     )
+
+
+def local_means(values: Array) -> Array:
+    """Mean over each sample's block of neighbours.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., N)
+
+    Returns
+    -------
+    ndarray, shape (..., N)
+    """
+    block = _blocks(values.shape[-1])
+    starts = np.flatnonzero(np.diff(block, prepend=-1))
+    sums = np.add.reduceat(values, starts, axis=-1)
+    means: Array = (sums / np.bincount(block))[..., block]
+    return means
+
+
+def _blocks(samples: int) -> NDArray[np.int64]:
+    """Number of the block that each sample lies in, shape (N,)."""
+    size = max(FEWEST_SAMPLES, samples // MOST_AVERAGES)
+    number = max(samples // size, 1)
+    return np.minimum(np.arange(samples) // size, number - 1)

@@ -120,19 +120,20 @@ def _of_run(
     fall = expected = noise = remainder = 0.0
     moved: Array | float = 0.0
     for b, output in enumerate(new.predictor.outputs):
-        weight = before.hold_errors.at(output, record.label).average.sigma ** -2
+        entry = before.hold_errors.at(output, record.label)
+        weight = entry.average.sigma**-2
         counts = weights(record)
         left = (record.samples[output] - new.y[b]) * counts
         change = (new.y[b] - old.y[b]) * counts
         size = weight * float(change @ change)
         fall += weight * float(np.sum(((left + change) ** 2 - left**2) * counts))
         expected += size
-        pulled = weight * (columns[b] @ change)
+        pulled = weight * entry.input_scale * (columns[b] @ change)
         moved = moved + pulled
         own = inflation * size + float(np.sum(np.square(pulled)))
         noise += inflation * size
         if record.periodic and not after.at_floor:
-            ratio = after.hold_errors.at(output, record.label).ratio
+            ratio = after.hold_errors.at(output, record.label).ratio_to_expected
             spread = max(ratio**2 - 1.0, 0.0) * own
             remainder += min(spread, weight**2 * surrogate_variance(change, left))
     return fall, expected, 4.0 * (noise + float(np.sum(np.square(moved))) + remainder)

@@ -94,9 +94,9 @@ class ClosedLoop:
 
 
 def _excess(state: State) -> float:
-    """Squared ratio to the noise beyond one, of held-out runs where there are any."""
+    """Squared ratio to what is expected beyond one, of held-out runs where there are any."""
     table = state.hold_errors if state.hold_errors.entries else state.fit_errors
-    return float(sum(max(entry.ratio**2 - 1.0, 0.0) for entry in table.entries))
+    return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
 
 
 def close_loop(
@@ -144,6 +144,7 @@ def close_loop(
     if known is None:
         known = _begun(assembly, roles, numerics, say)
         keep(known)
+    roles = replace(roles, measured=known.first.errors.record_noise)
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
@@ -204,11 +205,11 @@ def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:
 
 def _ratios(state: State) -> str:
     parts = [
-        f"{role} {output} {values['ratio_to_noise']:.2f}"
+        f"{role} {output} {values['ratio_to_expected']:.2f}"
         for role, table in state.by_role.items()
         for output, values in table.items()
     ]
-    return "ratio to noise: " + ", ".join(parts)
+    return "ratio to what is expected: " + ", ".join(parts)
 
 
 def _warnings(fit: Fit) -> list[str]:

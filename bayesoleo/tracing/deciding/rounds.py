@@ -233,7 +233,7 @@ def _stopping_reason(state: State, ranking: Sequence[Ranked], tests: float) -> s
     best = max((item.gain for item in ranking), default=0.0)
     if state.at_floor and best < FLOOR_SHARE:
         return (
-            f"nothing is missing: the residual is {worst:.2f} times its noise at most"
+            f"nothing is missing: the residual is {worst:.2f} times what is expected at most"
             f" and no effect explains more than {100 * best:.0f} % of the excess"
         )
     if not any(_may_be_significant(item, tests) for item in ranking):

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bayesoleo.machines import connected, each_done
 from bayesoleo.model import Model
+from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
-from bayesoleo.tracing.errors.errors_table import ErrorTable, error_table
+from bayesoleo.tracing.errors.errors_table import ErrorTable, compared
+from bayesoleo.tracing.errors.expected import Compared, expected_of_fitted, expected_of_held_out
 from bayesoleo.tracing.errors.floor import is_at_floor
 from bayesoleo.tracing.errors.holdout import Prediction, predict_fitted, predict_held_out
 from bayesoleo.tracing.fitting.assembly import Assembly
@@ -70,13 +72,13 @@ class State:
 
     @property
     def worst_ratio(self) -> float:
-        """Largest pooled ratio to the noise over roles and outputs."""
+        """Largest pooled ratio to what is expected over roles and outputs."""
         tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
-        return float(np.max([table.worst_ratio() for table in tables]))
+        return float(np.max([table.worst_ratio(key="ratio_to_expected") for table in tables]))
 
     @property
     def at_floor(self) -> bool:
-        """Whether fitted and held-out runs are all down to their noise."""
+        """Whether fitted and held-out runs are all down to what is expected of them."""
         return all(is_at_floor(table) for table in (self.fit_errors, self.hold_errors))
 
     @property
@@ -100,14 +102,31 @@ def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
         else predict_held_out(fit, roles.held_out)
     )
     jobs = fit.numerics.jobs
+    found = _compared(fitted, "fit", roles, jobs)
+    fit_errors, known = expected_of_fitted(fit, fitted, found)
+    if roles.strategy != "leave-one-run-out":
+        known = {"": known[""]} if known else {}
+    rows = thread_map(
+        lambda pair: expected_of_held_out(*pair, known),
+        list(zip(held_out, _compared(held_out, "hold-out", roles, jobs), strict=True)),
+        jobs,
+    )
     return State(
         assembly.with_values(fit.shared),
         fit,
         fitted,
         held_out,
-        error_table(fitted, {p.record.label: "fit" for p in fitted}, jobs=jobs),
-        error_table(held_out, {p.record.label: "hold-out" for p in held_out}, jobs=jobs),
+        ErrorTable(tuple(fit_errors)),
+        ErrorTable(tuple(entry for row in rows for entry in row)),
     )
+
+
+def _compared(
+    predictions: Sequence[Prediction], role: str, roles: Roles, jobs: int | None
+) -> list[Compared]:
+    """Errors by run, with the noise as it was measured first."""
+    by_label = {p.record.label: role for p in predictions}
+    return thread_map(lambda p: compared(p, by_label, roles.noise_of), predictions, jobs)
 
 
 def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,9 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.errors.holdout import Prediction
+from bayesoleo.tracing.errors.record_noise import borne_out, sample_noise
 from bayesoleo.tracing.fitting.masked import counted, of_those_counted, weights, without_masked
+from bayesoleo.tracing.fitting.roles import RecordNoise
 
 Array = NDArray[np.float64]
 
@@ -40,6 +42,18 @@ class RunError:
         Of the noise that does not repeat; ``None`` for a transient.
     rounding : float
         Part of the noise that comes from rounding to coarse steps and repeats in every period, SI.
+    input_scale : float
+        Part of the noise that the input's records claim which the residual bears out, as a factor.
+    expected_error : float, optional
+        What noise and the unknowns' posterior let ``repeating`` be, SI; by default the noise.
+    parameters : ndarray, shape (l, l)
+        What independent unit errors of the unknowns add to the squared ratio to the expected error:
+        a quadratic form. Empty for a run that was fitted.
+    own_share : float
+        Part of the squared expected error that is noise.
+    own_coefficients : float, optional
+        Equally noisy coefficients that this part scatters like; by default those of the output's
+        own noise.
     """
 
     run: str
@@ -50,6 +64,11 @@ class RunError:
     input_noise: float
     spectrum: NoiseSpectrum | None = None
     rounding: float = 0.0
+    input_scale: float = 1.0
+    expected_error: float | None = None
+    parameters: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    own_share: float = 1.0
+    own_coefficients: float | None = None
 
     @property
     def repeating(self) -> float:
@@ -82,8 +101,22 @@ class RunError:
 
     @property
     def ratio(self) -> float:
-        """``repeating / noise``: one where nothing is missing."""
+        """``repeating / noise``: one where nothing is missing and every parameter is known."""
         return self.repeating / self.noise
+
+    @property
+    def expected(self) -> float:
+        """Root of the noise squared plus what the parameters' posterior does to this run, SI.
+
+        A run that was fitted has lent some of its noise to the estimates, and is expected to leave
+        a little less than its noise.
+        """
+        return self.noise if self.expected_error is None else self.expected_error
+
+    @property
+    def ratio_to_expected(self) -> float:
+        """``repeating / expected``: one where nothing is missing."""
+        return self.repeating / self.expected
 
 
 @dataclass(frozen=True)
@@ -97,18 +130,34 @@ class ErrorTable:
         return next(e for e in self.entries if e.output == output and e.run == run)
 
     @property
+    def record_noise(self) -> dict[tuple[str, str], RecordNoise]:
+        """The noise of each output in each run, for later models of the same records."""
+        return {
+            (e.run, e.output): RecordNoise(e.average.sigma, e.input_noise) for e in self.entries
+        }
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """Outputs in their order."""
         return tuple(dict.fromkeys(entry.output for entry in self.entries))
 
-    def worst_ratio(self, role: str | None = None) -> float:
-        """Largest ratio over outputs of the ratio pooled over runs of a role."""
+    def worst_ratio(self, role: str | None = None, key: str = "ratio_to_noise") -> float:
+        """Largest ratio over outputs of the ratio pooled over runs of a role.
+
+        Parameters
+        ----------
+        role : str, optional
+            By default each.
+        key : {"ratio_to_noise", "ratio_to_expected"}
+            Which ratio.
+        """
         roles = {entry.role for entry in self.entries} if role is None else {role}
-        ratios = [self.pooled(r, o)["ratio_to_noise"] for r in roles for o in self.outputs]
+        ratios = [self.pooled(r, o)[key] for r in roles for o in self.outputs]
         return float(np.max(ratios))  # not the built-in: a run that could not be solved must show
 
     def pooled(self, role: str, output: str) -> dict[str, float]:
-        """Root mean squares over the runs of a role: ``rms``, ``repeating``, ``ratio_to_noise``."""
+        """Root mean squares over the runs of a role: ``rms``, ``repeating``, ``expected``,
+        ``ratio_to_noise``, ``ratio_to_expected``."""
         chosen = [e for e in self.entries if e.role == role and e.output == output]
 
         def mean(values: Sequence[float]) -> float:
@@ -117,11 +166,13 @@ class ErrorTable:
         return {
             "rms": mean([e.rms for e in chosen]),
             "repeating": mean([e.repeating for e in chosen]),
+            "expected": mean([e.expected for e in chosen]),
             "ratio_to_noise": mean([e.ratio for e in chosen]),
+            "ratio_to_expected": mean([e.ratio_to_expected for e in chosen]),
         }
 
     def by_run(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """As in the summary: output, run, then role, rms, repeating, noise and ratio."""
+        """As in the summary: output, run, then role, rms, repeating, noise, expected, ratios."""
         table: dict[str, dict[str, dict[str, Any]]] = {output: {} for output in self.outputs}
         for e in self.entries:
             table[e.output][e.run] = {
@@ -129,12 +180,14 @@ class ErrorTable:
                 "rms": e.rms,
                 "repeating": e.repeating,
                 "noise": e.noise,
+                "expected": e.expected,
                 "ratio_to_noise": e.ratio,
+                "ratio_to_expected": e.ratio_to_expected,
             }
         return table
 
     def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
-        """As in the summary: role, output, then rms, repeating and ratio."""
+        """As in the summary: role, output, then what :meth:`pooled` gives."""
         roles = dict.fromkeys(entry.role for entry in self.entries)
         return {
             role: {output: self.pooled(role, output) for output in self.outputs} for role in roles
@@ -142,7 +195,10 @@ class ErrorTable:
 
 
 def error_table(
-    predictions: Sequence[Prediction], roles: Mapping[str, str], *, jobs: int | None = None
+    predictions: Sequence[Prediction],
+    roles: Mapping[str, str],
+    *,
+    jobs: int | None = None,
 ) -> ErrorTable:
     """Compare predictions with what was measured.
 
@@ -159,33 +215,66 @@ def error_table(
     -------
     ErrorTable
     """
-    rows = thread_map(lambda prediction: _of_run(prediction, roles), predictions, jobs)
+    rows = thread_map(lambda p: compared(p, roles)[0], predictions, jobs)
     return ErrorTable(tuple(entry for row in rows for entry in row))
 
 
-def _of_run(prediction: Prediction, roles: Mapping[str, str]) -> list[RunError]:
+def compared(
+    prediction: Prediction,
+    roles: Mapping[str, str],
+    measured: Callable[[str, str], RecordNoise | None] = lambda output, label: None,
+) -> tuple[list[RunError], Array]:
+    """Errors of one run by output, and the input's noise in them.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    roles : mapping of str to str
+    measured : callable
+        The noise of an output in a run where it was measured before; it stays what it was.
+
+    Returns
+    -------
+    list of RunError
+    ndarray, shape (ny, k, N)
+        Change of the outputs by one standard deviation of each input coefficient, as far as the
+        residual bears it out, SI.
+    """
     record, predictor = prediction.record, prediction.predictor
     columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
+    left = [record.samples[o] - prediction.y[b] for b, o in enumerate(predictor.outputs)]
+    averages, spectra, before = [], [], list[RecordNoise | None]()
+    for output, rest in zip(predictor.outputs, left, strict=True):
+        residual = without_masked(record, rest)
+        before.append(measured(output, record.label))
+        averages.append(_average(record, output, residual, before[-1]))
+        spectra.append(_spectrum(record, residual, averages[-1]))
     spread = np.sqrt(np.mean(np.sum(columns**2, axis=1), axis=1))
-    entries = []
-    for b, output in enumerate(predictor.outputs):
-        measured = record.samples[output] - prediction.y[b]
-        residual = without_masked(record, measured)
-        average = _average(record, residual)
-        rms = float(np.sqrt(np.mean(measured[weights(record) > 0] ** 2)))
-        entries.append(
-            RunError(
-                record.label,
-                roles[record.label],
-                output,
-                rms,
-                average,
-                float(spread[b]),
-                _spectrum(record, residual, average),
-                rounding_in_average(record, output),
-            )
+    scale = borne_out(columns, [average.values for average in averages])
+    factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
+    entries = [
+        RunError(
+            record.label,
+            roles[record.label],
+            output,
+            float(np.sqrt(np.mean(left[b][weights(record) > 0] ** 2))),
+            averages[b],
+            float(factors[b] * spread[b]),
+            spectra[b],
+            rounding_in_average(record, output),
+            factors[b],
         )
-    return entries
+        for b, output in enumerate(predictor.outputs)
+    ]
+    return entries, columns * np.array(factors)[:, None, None]
+
+
+def _factor(scale: float, spread: float, known: RecordNoise | None) -> float:
+    """Part of the input's noise that counts: no more than was measured before, whatever a changed
+    model would make of it."""
+    if known is None or spread == 0:
+        return scale
+    return min(scale, known.input_noise / spread)
 
 
 def _spectrum(
@@ -198,8 +287,10 @@ def _spectrum(
     return noise_spectrum((residual - average.values) / part, record.periods)
 
 
-def _average(record: Record, residual: Array) -> PeriodicAverage | LocalAverage:
+def _average(
+    record: Record, output: str, residual: Array, before: RecordNoise | None
+) -> PeriodicAverage | LocalAverage:
     if not record.periodic:
-        return local_average(residual)
+        return local_average(residual, sample_noise(record, output, residual, before))
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     return of_those_counted(record, periodic_average(residual, step, record.frequency))

@@ -1,4 +1,16 @@
-"""Whether a residual has come down to its noise."""
+r"""Whether a residual has come down to what is expected of it.
+
+The squared ratio to the expected error is a sum of squares: of the noise's coefficients, which are
+many, and of what the unknowns' errors do, which may be one direction that rules all. Its mean is
+one; variance and skewness follow from the quadratic form, over runs that share their unknowns too,
+and a shifted :math:`\chi^2` variate with these three moments stands for it. Noise that is measured
+divides it, which makes it an F variate.
+
+References
+----------
+Buckley and Eagleson (1988), Australian Journal of Statistics 30A(1), 150-159: three moments.
+Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114.
+"""
 
 from __future__ import annotations
 
@@ -10,35 +22,70 @@ from scipy import stats
 
 from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
 
-#: A ratio to the noise below this is not worth an effect, however surely it is above one.
+#: A ratio to what is expected below this is not worth an effect, however surely it is above one.
 FLOOR_RATIO = 1.15
-#: Probability with which noise alone may exceed the limit where samples are few.
+#: Probability with which noise and the unknowns' errors alone may exceed the limit.
 FALSE_ALARM = 1e-3
 
 
 def limit(entries: Sequence[RunError], tests: int = 1) -> float:
-    """Ratio that noise alone hardly exceeds, at least :data:`FLOOR_RATIO`.
-
-    The squared ratio of noise is an F variate with the effective numbers of coefficients and of
-    free samples as degrees of freedom: where noise is coloured, few coefficients hold most of it.
+    """Ratio to what is expected that chance hardly exceeds, at least :data:`FLOOR_RATIO`.
 
     Parameters
     ----------
     entries : sequence of RunError
-        Over which the ratio is pooled.
+        Over which the squared ratio is averaged.
     tests : int
         Ratios that are looked at together.
     """
-    # The pooled squared ratio is a mean over entries: variances of F variates add up.
+    return max(FLOOR_RATIO, math.sqrt(_quantile(entries, FALSE_ALARM / tests)))
+
+
+def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
+    """Ratio to what is expected that chance hardly falls below.
+
+    Parameters
+    ----------
+    entries : sequence of RunError
+        Over which the squared ratio is averaged.
+    tests : int
+        Ratios that are looked at together.
+    """
+    return math.sqrt(max(_quantile(entries, 1.0 - FALSE_ALARM / tests), 0.0))
+
+
+def _quantile(entries: Sequence[RunError], above: float) -> float:
+    """Squared ratio that is exceeded with a probability."""
+    second, third = _moments(entries)
+    # Mean one, variance 2 second, third cumulant 8 third are those of 1 - b + b F, F of mean one.
+    number = max(second**3 / third**2, 1e-3)
+    share = second**2 / third
+    free = len(entries) ** 2 / sum(entry.own_share**2 / entry.free for entry in entries)
+    return 1.0 + share * (float(stats.f.isf(above, number, max(free, 1e-3))) - 1.0)
+
+
+def _moments(entries: Sequence[RunError]) -> tuple[float, float]:
+    """Sums of the second and third powers of the quadratic form's eigenvalues, for the mean."""
+    second = third = 0.0
+    together: dict[int, np.ndarray] = {}
+    for entry in entries:
+        own, count = entry.own_share, entry.own_coefficients or entry.coefficients
+        gram = entry.parameters
+        trace, square = float(np.trace(gram)), float(np.sum(gram * gram))
+        # Where the unknowns' errors lie in one coefficient of the noise it is more by its own.
+        second += own**2 / count + 2.0 * own * trace / count
+        third += own**3 / count**2 + 3.0 * (own**2 * trace / count**2 + own * square / count)
+        if gram.size:
+            together[len(gram)] = together.get(len(gram), 0.0) + gram
+    for gram in together.values():  # the same errors of the unknowns in all runs
+        second += float(np.sum(gram * gram))
+        third += float(np.sum((gram @ gram) * gram))
     size = len(entries)
-    coefficients = size**2 / sum(1.0 / entry.coefficients for entry in entries)
-    free = size**2 / sum(1.0 / entry.free for entry in entries)
-    noise = math.sqrt(float(stats.f.isf(FALSE_ALARM / tests, coefficients, free)))
-    return max(FLOOR_RATIO, noise)
+    return max(second / size**2, 1e-12), max(third / size**3, 1e-18)
 
 
 def is_at_floor(table: ErrorTable) -> bool:
-    """Whether every output, pooled over each role and in each run, is down to its noise.
+    """Whether every output, pooled over each role and in each run, is down to what is expected.
 
     A run that could not be solved is not.
     """
@@ -46,7 +93,7 @@ def is_at_floor(table: ErrorTable) -> bool:
     for role in {entry.role for entry in entries}:
         for output in table.outputs:
             chosen = [e for e in entries if e.role == role and e.output == output]
-            pooled = float(np.sqrt(np.mean([entry.ratio**2 for entry in chosen])))
+            pooled = float(np.sqrt(np.mean([entry.ratio_to_expected**2 for entry in chosen])))
             if not pooled < limit(chosen):
                 return False
-    return all(entry.ratio < limit([entry], len(entries)) for entry in entries)
+    return all(entry.ratio_to_expected < limit([entry], len(entries)) for entry in entries)

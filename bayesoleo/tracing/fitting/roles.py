@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,24 @@ from bayesoleo.prediction.records import Record
 
 #: Half a record needs two periods for an average of its own.
 FEWEST_PERIODS_TO_SPLIT = 4
+#: What is added to the label of half a run.
+FIRST_HALF, SECOND_HALF = "first half", "second half"
+
+
+@dataclass(frozen=True)
+class RecordNoise:
+    """The noise of one output in one run, as it was measured with the model as declared.
+
+    Parameters
+    ----------
+    sigma : float
+        Of a sample, SI.
+    input_noise : float
+        Part of the averaged residual's noise that comes from the inputs, SI.
+    """
+
+    sigma: float
+    input_noise: float
 
 
 @dataclass(frozen=True)
@@ -26,12 +44,20 @@ class Roles:
         How runs are held out.
     description : str
         The same as a sentence.
+    measured : mapping of (run, output) to RecordNoise
+        Noise is a property of the records: once it has been measured it stays.
     """
 
     fitted: tuple[Record, ...]
     held_out: tuple[Record, ...]
     strategy: str
     description: str
+    measured: Mapping[tuple[str, str], RecordNoise] = field(default_factory=dict)
+
+    def noise_of(self, output: str, label: str) -> RecordNoise | None:
+        """Of a run, or of the run that it is a half of; None where it was not measured yet."""
+        whole = label.removesuffix(f" ({FIRST_HALF})").removesuffix(f" ({SECOND_HALF})")
+        return self.measured.get((whole, output))
 
 
 def assign(records: Sequence[Record]) -> Roles:
@@ -80,7 +106,7 @@ def in_halves(roles: Roles) -> Roles | None:
         return None
     first, second = zip(*(halves(record) for record in roles.fitted), strict=True)
     text = "fitted to the first half of each run's periods, held out the second"
-    return Roles(first, second, "split periods", text)
+    return Roles(first, second, "split periods", text, roles.measured)
 
 
 def halves(record: Record) -> tuple[Record, Record]:
@@ -91,8 +117,8 @@ def halves(record: Record) -> tuple[Record, Record]:
         # A record may be a sample short of whole periods; so may its first half instead.
         middle -= 1
     return (
-        _part(record, slice(0, middle), half, "first half", "fit"),
-        _part(record, slice(middle, None), record.periods - half, "second half", "hold-out"),
+        _part(record, slice(0, middle), half, FIRST_HALF, "fit"),
+        _part(record, slice(middle, None), record.periods - half, SECOND_HALF, "hold-out"),
     )
 
 

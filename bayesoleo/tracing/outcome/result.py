@@ -309,6 +309,8 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
         schema.REPEATING: "repeating",
         schema.NOISE: "noise",
         schema.RATIO_TO_NOISE: "ratio",
+        schema.EXPECTED_ERROR: "expected",
+        schema.RATIO_TO_EXPECTED: "ratio_to_expected",
     }
     return {
         name: xr.Variable(
@@ -324,7 +326,7 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
             ),
             {
                 schema.LONG_NAME: name,
-                schema.UNITS: "1" if field == "ratio" else "SI unit of each output",
+                schema.UNITS: "1" if field.startswith("ratio") else "SI unit of each output",
             },
         )
         for name, field in names.items()

@@ -166,7 +166,8 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         entries = [errors[record.label, output] for output in fit.predictor.outputs]
         measured = fit.predictor.runs[r].measured
         sigma = [_sigma(e.sigma, m) for e, m in zip(entries, measured, strict=True)]
-        run = _run_base(fit, r, sigma, _spectra(entries))
+        borne_out = np.array([e.input_scale for e in entries])
+        run = _run_base(fit, r, sigma, borne_out, _spectra(entries))
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
         for entry, value in zip(entries, sigma, strict=True):
@@ -193,9 +194,15 @@ def _prior_terms(fit: Fit) -> tuple[Array, Array]:
 
 
 def _run_base(
-    fit: Fit, r: int, sigma: Sequence[float], spectra: tuple[NoiseSpectrum, ...]
+    fit: Fit,
+    r: int,
+    sigma: Sequence[float],
+    borne_out: Array,
+    spectra: tuple[NoiseSpectrum, ...],
 ) -> RunBase:
-    """One run at the present estimate, given the noise of a sample by output."""
+    """One run at the present estimate, given the noise of a sample by output, and how much of the
+    input's noise the residual bears out."""
+    from_input = input_columns(fit.predictor.runs[r], present_constants(fit, r))
     run, record = fit.predictor.runs[r], fit.records[r]
     names = fit.predictor.layout.names
     free = [names.index(name) for name in fit.problem.names]
@@ -205,7 +212,7 @@ def _run_base(
         np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
         (run.measured - fit.predictions[r].y).ravel(),
         flat(own),
-        flat(input_columns(run, present_constants(fit, r))),
+        flat(from_input * borne_out[:, None, None]),
         np.tile(replicate(record), len(sigma)),
         spectra,
     )

@@ -1,0 +1,106 @@
+"""The noise of a record: measured once, and never more than the residual bears out.
+
+What the noise of an input does to a prediction is computed by sending its spectrum through the
+model. A model that differentiates its input makes much of it, and the spectrum between the input's
+harmonics may hold a rig's real motion, to which the output answers, or a converter's steps, instead
+of noise. So it counts only as far as the residual has the power for it, band by band: a residual is
+the sum of what the model lacks and of noise, and nowhere smaller than either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo.data.smoothing import innovation_noise
+from bayesoleo.prediction.records import Record
+from bayesoleo.tracing.fitting.masked import without_masked
+from bayesoleo.tracing.fitting.roles import RecordNoise
+
+Array = NDArray[np.float64]
+
+#: Bands that each hold the same part of the power which the input's noise is said to have.
+BANDS = 8
+#: Probability with which true noise is taken for smaller than it is in any of them.
+FALSE_ALARM = 1e-3
+#: Columns whose overlap says how many independent coefficients a band holds.
+MOST_COLUMNS = 128
+#: A later model shows less noise in a transient only if it is less by this factor: differences of
+#: neighbours know the noise to a few per cent.
+CLEARLY_LESS = 0.9
+
+
+def borne_out(columns: Array, residuals: Sequence[Array]) -> float:
+    """Largest factor, at most one, by which the input's noise may be what the residual holds.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (ny, k, N)
+        Change of the outputs by one standard deviation of each input coefficient.
+    residuals : sequence of ndarray, shape (N,)
+        What the average over periods (or neighbouring samples) leaves of each output.
+
+    Returns
+    -------
+    float
+        One factor for all outputs of the run, because it is the input's; what it leaves in doubt by
+        chance is left in.
+    """
+    least = 1.0
+    for block, residual in zip(columns, residuals, strict=True):
+        if block.shape[0] == 0 or not (block.any() and np.isfinite(residual).all()):
+            continue
+        lines = scipy.fft.rfft(block, axis=1)
+        power, there = np.sum(np.abs(lines) ** 2, axis=0), np.abs(scipy.fft.rfft(residual)) ** 2
+        for band in _bands(power):
+            coefficients = _coefficients(lines[:, band])
+            low = float(stats.chi2.ppf(FALSE_ALARM / BANDS, coefficients)) / coefficients
+            ratio = float(there[band].sum() / power[band].sum())
+            least = min(least, ratio / max(low, 1e-300))
+    return float(np.sqrt(least))
+
+
+def _bands(power: Array) -> list[slice]:
+    """Stretches of lines with about the same part of the power each."""
+    total = np.cumsum(power)
+    edges = np.searchsorted(total, np.arange(1, BANDS) / BANDS * total[-1]) + 1
+    ends = np.unique(np.concatenate([[0], edges, [power.size]]))
+    found = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    return [band for band in found if power[band].sum() > 0.01 * total[-1]]
+
+
+def _coefficients(lines: NDArray[np.complex128]) -> float:
+    """Number of equally large independent coefficients that a band's power scatters like."""
+    size = np.sum(np.abs(lines) ** 2, axis=1)
+    chosen = np.argsort(-size)[:MOST_COLUMNS]
+    gram = (lines[chosen] @ lines[chosen].conj().T).real
+    return max(float(np.trace(gram) ** 2 / np.sum(gram**2)), 1.0)
+
+
+def sample_noise(
+    record: Record, output: str, residual: Array, before: RecordNoise | None = None
+) -> float:
+    """Standard deviation of the noise of a transient's sample, SI.
+
+    Differences of neighbours see whatever is not smooth as noise, be it the record's or what a
+    model predicts. Both the record and the residual hold the noise: it is no more than the smaller.
+
+    Parameters
+    ----------
+    record : Record
+    output : str
+    residual : ndarray, shape (N,)
+        Of the present model.
+    before : RecordNoise, optional
+        Where it was measured before.
+    """
+    shown = innovation_noise(residual)
+    if before is not None:
+        known = before.sigma
+        return shown if shown < CLEARLY_LESS * known else known
+    return min(shown, innovation_noise(without_masked(record, record.samples[output])))
