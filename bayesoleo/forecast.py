@@ -23,6 +23,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.runs.nuisance import uncertain_conditions
 from bayesoleo.estimation.shown import Shown, columns
 from bayesoleo.model import Model
+from bayesoleo.prediction.invented import without_invented
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.simulation import model_of, parameter_sets
@@ -126,6 +127,9 @@ def predict(
     known = draws_of(tree, draws, rng)
     used = model_of(tree) if model is None else model
     chosen = campaign.records if runs is None else [campaign.record(label) for label in runs]
+    # As inputs the channels count as far as they did in the fit.
+    given = [name for name, c in campaign.campaign.channels.items() if c.bandwidth is not None]
+    chosen, _ = without_invented(used, chosen, given)
     records = uncertain_conditions(used).complete(chosen)
     found = [_one_run(used, record, known, rng, level, scheme, steps, jobs) for record in records]
     data = _dataset(used, records, found)

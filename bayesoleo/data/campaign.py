@@ -50,6 +50,8 @@ class Run:
         SI unit of each condition.
     mask : tuple of (float, float)
         Stretches that do not count, from and to, s on the file's own clock.
+    bandwidths : mapping of str to float
+        Frequencies up to which channels count as inputs, Hz, where declared.
     """
 
     label: str
@@ -64,6 +66,7 @@ class Run:
     condition_units: Mapping[str, str] = field(default_factory=dict)
     condition_sd: Mapping[str, float] = field(default_factory=dict)
     mask: Stretches = ()
+    bandwidths: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def time_step(self) -> float:
@@ -235,6 +238,7 @@ def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder:
         condition_units=dict(declared.condition_units),
         condition_sd=dict(declared.condition_sd),
         mask=declared.mask,
+        bandwidths={n: c.bandwidth for n, c in channels.items() if c.bandwidth is not None},
     )
 
 

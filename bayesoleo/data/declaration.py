@@ -25,7 +25,7 @@ from bayesoleo.errors import CampaignError
 FORMAT = 1
 
 _TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
-_CHANNEL = ("column", "unit", "scale", "offset", "accuracy")
+_CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,9 @@ class Channel:
         cut it.
     accuracy : float, optional
         Systematic accuracy, two standard deviations, SI.
+    bandwidth : float, optional
+        Frequency up to which the channel counts as an input, Hz; infinite for all of it. Where it
+        is not given the channel's spectrum decides.
     """
 
     name: str
@@ -56,6 +59,7 @@ class Channel:
     scale: float = 1.0
     offset: float | str = 0.0
     accuracy: float | None = None
+    bandwidth: float | None = None
 
     def to_si(self, values: np.ndarray) -> np.ndarray:
         """SI samples of a run from what its file holds: scale, offset, unit, in this order."""
@@ -170,7 +174,13 @@ def _channel(name: str, table: Any) -> Channel:
         offset = get_value(table, f"{inside}.offset", float, "a number, or '-mean'", default=0.0)
     scale = get_value(table, f"{inside}.scale", float, "a number", default=1.0)
     accuracy = get_value(table, f"{inside}.accuracy", float, "a positive number", default=None)
-    for key, value in (("scale", scale != 0), ("accuracy", accuracy is None or accuracy > 0)):
+    hint = "the highest frequency in Hz that counts as an input, or inf"
+    bandwidth = get_value(table, f"{inside}.bandwidth", float, hint, default=None)
+    for key, value in (
+        ("scale", scale != 0),
+        ("accuracy", accuracy is None or accuracy > 0),
+        ("bandwidth", bandwidth is None or bandwidth > 0),
+    ):
         if not value:
             raise CampaignError("must not be zero or negative", file=FILE, key=f"{inside}.{key}")
     return Channel(
@@ -181,4 +191,5 @@ def _channel(name: str, table: Any) -> Channel:
         scale=scale,
         offset=offset,
         accuracy=None if accuracy is None else accuracy * unit.factor,
+        bandwidth=bandwidth,
     )

@@ -7,12 +7,16 @@ own noise cannot explain, and no others.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from bayesoleo.data.resolution import rounding_that_repeats, step_of
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.prediction.records import Harmonics
+from bayesoleo.prediction.spectrum import FEWEST_SAMPLES, lines_of, rounding_density
 
 Array = NDArray[np.float64]
 
@@ -24,6 +28,9 @@ FALSE_DISCOVERY_RATE = 1e-4
 #: Spectral bins between harmonics that are averaged for the noise at one harmonic, where the record
 #: has as many.
 NOISE_BINS = 48
+
+#: A floor of the harmonics this many times above what the periods scatter by repeats.
+REPEATING = 4.0
 
 
 def significant_harmonics(
@@ -53,13 +60,58 @@ def significant_harmonics(
         Significant orders with coefficients and variances, SI.
     """
     coefficients = basis.coefficients(values)
-    variances, bins = coefficient_variances(basis, values - basis.evaluate(coefficients))
+    rest = values - basis.evaluate(coefficients)
+    variances, bins = coefficient_variances(basis, rest)
     keep = significant_orders(coefficients, variances, bins, rate)
     return Harmonics(
         orders=basis.orders[keep].astype(np.int64),
         coefficients=coefficients[keep],
         variances=variances[keep],
+        limits=_limits(coefficients, variances, _rounding(basis, values, rest)),
     )
+
+
+def within_bandwidth(item: Harmonics, frequency: float, bandwidth: float | None) -> Harmonics:
+    """Harmonics of a channel with a declared bandwidth, which decides alone.
+
+    Parameters
+    ----------
+    item : Harmonics
+    frequency : float
+        Fundamental frequency, Hz.
+    bandwidth : float or None
+        Hz; None leaves the harmonics as they are.
+    """
+    return item if bandwidth is None else replace(item, limits=(bandwidth / frequency,))
+
+
+def _rounding(basis: HarmonicBasis, values: Array, rest: Array) -> Array:
+    """Mean power of the harmonics of those rounding errors that repeat, shape (K,)."""
+    quantum = step_of(values)
+    orders = basis.orders[1:].astype(float)
+    if quantum == 0.0:
+        return np.zeros(orders.size)
+    scatter = float(np.sqrt(np.mean(rest**2)))
+    repeats = 12.0 * (rounding_that_repeats(quantum, scatter) / quantum) ** 2
+    # With one sampling interval as the unit of time the fundamental is the basis's step.
+    return repeats * basis.step * rounding_density(orders * basis.step, values, 1.0, quantum)
+
+
+def _limits(
+    coefficients: NDArray[np.complex128], variances: Array, rounding: Array
+) -> tuple[float, ...]:
+    """Orders up to which one and two derivatives may be taken.
+
+    What repeats is no signal where it is rounding, or a floor that stands far above what the
+    periods scatter by and that the spectrum has fallen to.
+    """
+    power = np.maximum(0.5 * np.abs(coefficients[1:]) ** 2, 1e-300)
+    if power.size < FEWEST_SAMPLES // 2:
+        return ()
+    lines = lines_of(np.arange(1.0, power.size + 1), power, rounding)
+    if np.median(lines.floor / np.maximum(variances[1:], 1e-300)) < REPEATING:
+        return ()
+    return (np.inf, lines.cut(1), lines.cut(2))
 
 
 def significant_orders(

@@ -13,15 +13,16 @@ from bayesoleo.data.averaging import average_on
 from bayesoleo.data.campaign import Campaign, Run
 from bayesoleo.data.checked_table import choose
 from bayesoleo.data.gaps import bridged, masked
-from bayesoleo.data.harmonics import significant_harmonics
+from bayesoleo.data.harmonics import significant_harmonics, within_bandwidth
 from bayesoleo.data.period import Frequency, find_frequency
+from bayesoleo.data.resolution import step_of
 from bayesoleo.data.settling import sample_count, settled_start, whole_periods
 from bayesoleo.data.smoothing import innovation_noise
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.errors import CampaignError
 from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.band_limited import band_limited_channels, sample_noise
 from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.smoothing import smooth_signal
 
 Array = NDArray[np.float64]
 
@@ -154,7 +155,12 @@ def reduce_run(run: Run) -> Record:
         frequency=found.value,
         frequency_sd=found.sd,
         periods=int(np.floor(time.size * step + 0.5)),
-        harmonics={name: significant_harmonics(basis, channel) for name, channel in kept.items()},
+        harmonics={
+            name: within_bandwidth(
+                significant_harmonics(basis, channel), found.value, run.bandwidths.get(name)
+            )
+            for name, channel in kept.items()
+        },
         signal_noise={
             name: noisy * average_on(basis, channel).sigma for name, channel in kept.items()
         },
@@ -209,10 +215,15 @@ def _transient(run: Run) -> Record:
         frequency_sd=float("nan"),
         periods=0,
         harmonics={},
-        signal_noise={name: innovation_noise(x[~away]) for name, x in run.samples.items()},
-        smoothed={
-            name: smooth_signal(np.array(x), step)
-            for name, x in zip(run.samples, whole, strict=True)
+        signal_noise={
+            name: min(innovation_noise(x[~away]), sample_noise(values, step))
+            for (name, x), values in zip(run.samples.items(), whole, strict=True)
         },
+        smoothed=band_limited_channels(
+            dict(zip(run.samples, map(np.array, whole), strict=True)),
+            step,
+            {name: step_of(x[~away]) for name, x in run.samples.items()},
+            run.bandwidths,
+        ),
         kept=~away if away.any() else None,
     )

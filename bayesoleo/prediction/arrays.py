@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.errors import CampaignError
+from bayesoleo.prediction.band_limited import band_limited_channels, sample_noise
 from bayesoleo.prediction.records import TRANSIENT, Record
-from bayesoleo.prediction.smoothing import smooth_signal
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def transient_record(
                 "a channel needs one finite number for each time", run=label, column=name
             )
     step = float((time[-1] - time[0]) / (time.size - 1))
-    smoothed = {name: smooth_signal(values, step) for name, values in columns.items()}
+    smoothed = band_limited_channels(columns, step)
     return Record(
         label=label,
         group="",
@@ -76,7 +76,7 @@ def transient_record(
         time=time,
         samples=columns,
         harmonics={},
-        signal_noise={name: curve.noise for name, curve in smoothed.items()},
+        signal_noise={name: sample_noise(values, step) for name, values in columns.items()},
         conditions=dict(conditions or {}),
         smoothed=smoothed,
     )

@@ -11,7 +11,7 @@ from bayesoleo.errors import ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.model.switching import analytic_pieces
-from bayesoleo.prediction.inputs import harmonics_of
+from bayesoleo.prediction.inputs import harmonics_of, highest_derivatives
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.shooting.initial_value import Dynamics
 from bayesoleo.solvers.shooting.signals import Signal, periodic_signal
@@ -69,13 +69,17 @@ def dynamics_of(
 
 def _signal(record: Record, rows: tuple[tuple[str, int], ...]) -> Signal:
     """Fourier coefficients of input rows; the time itself, which no equation has, is left zero."""
-    used = [harmonics_of(record, name) for name, _ in rows if name != "time"]
-    count = 1 + max((int(item.orders.max(initial=0)) for item in used), default=0)
+    used = {
+        name: harmonics_of(record, name).for_derivative(highest)
+        for name, highest in highest_derivatives(rows).items()
+        if name != "time"
+    }
+    count = 1 + max((int(item.orders.max(initial=0)) for item in used.values()), default=0)
     table = np.zeros((len(rows), count), dtype=complex)
     for row, (name, derivative) in zip(table, rows, strict=True):
         if name == "time":
             continue
-        item = harmonics_of(record, name)
+        item = used[name]
         rates = (2j * np.pi * record.frequency * item.orders) ** derivative
         row[item.orders] = np.where((item.orders == 0) & (derivative > 0), 0, rates)
         row[item.orders] *= item.coefficients

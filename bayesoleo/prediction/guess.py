@@ -75,7 +75,8 @@ def _evaluate(
         channel, order = split_derivative(item)
         if channel in record.harmonics:
             assert item == derivative_symbol(channel, order)
-            motion = harmonics_of(record, channel).evaluate(phase, record.frequency, order)
+            item = harmonics_of(record, channel).for_derivative(order)
+            motion = item.evaluate(phase, record.frequency, order)
             columns.append(motion)
         else:
             columns.append(np.asarray(constants[channel]))

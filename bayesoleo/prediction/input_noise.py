@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.prediction.inputs import harmonics_of
+from bayesoleo.prediction.inputs import harmonics_of, highest_derivatives
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.smoothing import Smoothed
 from bayesoleo.solvers.status import Status
@@ -83,10 +83,11 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
     rows, record = run.kernels.derived.inputs, run.record
     if not record.periodic:
         return _drawn_changes(run, phase)
+    highest = highest_derivatives(rows)
     channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
     blocks = []
     for channel in channels:
-        item = harmonics_of(record, channel)
+        item = harmonics_of(record, channel).for_derivative(highest[channel])
         turn = (
             np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0))
             * np.sqrt(item.variances)[:, None]
@@ -113,10 +114,10 @@ def _errors(signal: Smoothed) -> tuple[Smoothed, ...]:
 def _drawn_changes(run: RunPredictor, position: Array) -> Array:
     """The same of a transient: draws of its inputs' errors."""
     rows, record = run.kernels.derived.inputs, run.record
-    blocks = []
+    highest, blocks = highest_derivatives(rows), []
     for channel in run.model.inputs:
         if any(row[0] == channel for row in rows):
-            draws = _errors(record.smoothed[channel])
+            draws = _errors(record.smoothed[channel].for_derivative(highest[channel]))
             block = np.zeros((len(rows), len(draws), position.size))
             for k, (name, derivative) in enumerate(rows):
                 if name == channel:

@@ -34,8 +34,18 @@ def harmonics_of(record: Record, channel: str) -> Harmonics:
     return record.harmonics[channel]
 
 
-def signal_of(record: Record, channel: str) -> Signal:
+def signal_of(record: Record, channel: str, highest: int = 0) -> Signal:
     """What a channel is as an input, periodic or not.
+
+    Parameters
+    ----------
+    record : Record
+        A run.
+    channel : str
+        Of it.
+    highest : int
+        The highest derivative that is taken of the channel: noise grows with it, so that less of
+        what is near the noise may stay.
 
     Raises
     ------
@@ -45,13 +55,21 @@ def signal_of(record: Record, channel: str) -> Signal:
     if channel not in record.signals:
         restricted = _restricted(record, channel)
         if restricted is not None:
-            return restricted
+            return restricted.for_derivative(highest)
         raise CampaignError(
             f"the model needs channel {channel!r}",
             run=record.label,
             hint=f"channels there are: {', '.join(record.signals) or 'none'}",
         )
-    return record.signals[channel]
+    return record.signals[channel].for_derivative(highest)
+
+
+def highest_derivatives(rows: tuple[tuple[str, int], ...]) -> dict[str, int]:
+    """The highest derivative that is taken of each channel of some rows."""
+    highest: dict[str, int] = {}
+    for channel, derivative in rows:
+        highest[channel] = max(derivative, highest.get(channel, 0))
+    return highest
 
 
 def _restricted(record: Record, name: str) -> Signal | None:
@@ -65,9 +83,11 @@ def _restricted(record: Record, name: str) -> Signal | None:
     if not record.periodic:
         return record.signals[channel]
     item = record.harmonics[channel]
-    kept = np.isin(item.orders, record.harmonics[other].orders)
+    like = record.harmonics[other]
+    kept = np.isin(item.orders, like.orders)
     return replace(
         item,
+        limits=like.limits,
         orders=item.orders[kept],
         coefficients=item.coefficients[kept],
         variances=item.variances[kept],
@@ -85,8 +105,9 @@ def _turning(item: Harmonics, part: str) -> Harmonics | None:
     return Harmonics(item.orders[first], quarter * c / size, variance / size**2)
 
 
-#: Rows computed before, by grid, channel and derivative; models of the same run share them.
-RowCache = dict[tuple[str, str, int], Array]
+#: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
+#: of the same run share them.
+RowCache = dict[tuple[str, str, int, int], Array]
 
 
 def input_rows(
@@ -113,14 +134,15 @@ def input_rows(
         Taken from and added to.
     """
     known = {} if cache is None else cache
+    highest = highest_derivatives(rows)
     table = np.empty((len(rows), phase.size))
     for k, (channel, derivative) in enumerate(rows):
         if channel == "time":
             table[k] = phase / record.rate
         else:
-            key = (grid, channel, derivative)
+            key = (grid, channel, derivative, highest[channel])
             if key not in known:
-                item = signal_of(record, channel)
+                item = signal_of(record, channel, highest[channel])
                 known[key] = item.evaluate(phase, record.rate, derivative)
             table[k] = known[key]
     return table

@@ -8,7 +8,7 @@ harmonics of a periodic channel, the smooth curve behind one of a transient.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,9 @@ class Signal(Protocol):
     def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
         """Value or time derivative at phases, shape (N,); see :class:`Harmonics`."""
 
+    def for_derivative(self, highest: int) -> Signal:
+        """The signal for a model that takes derivatives of it up to an order."""
+
 
 @dataclass(frozen=True)
 class Harmonics:
@@ -40,11 +43,33 @@ class Harmonics:
         Complex amplitudes, in the channel's SI unit; that of order 0 is real.
     variances : ndarray of float, shape (K,)
         Variance of the real part of each coefficient, equal to that of its imaginary part.
+    limits : tuple of float
+        Orders up to which the value counts as an input, and those up to which derivatives of rising
+        order may be taken: beyond, what repeats is rounding or noise of the sensor. The last holds
+        for all further ones; none where all harmonics count.
     """
 
     orders: NDArray[np.int64]
     coefficients: NDArray[np.complex128]
     variances: Array
+    limits: tuple[float, ...] = ()
+
+    def for_derivative(self, highest: int) -> Harmonics:
+        """The harmonics for a model that takes derivatives up to an order."""
+        if not self.limits:
+            return self
+        limit = self.limits[min(highest, len(self.limits) - 1)]
+        return self if self.orders[-1] <= limit else self.up_to(limit)
+
+    def up_to(self, order: float) -> Harmonics:
+        """The harmonics up to an order."""
+        kept = self.orders <= order
+        return replace(
+            self,
+            orders=self.orders[kept],
+            coefficients=self.coefficients[kept],
+            variances=self.variances[kept],
+        )
 
     def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
         """Value or time derivative of any order at phases in cycles, exactly.

@@ -218,7 +218,8 @@ def _measured(expression: sp.Expr, record: Record, channels: set[str]) -> sp.Exp
     for item in expression.free_symbols:
         channel, order = split_derivative(item)
         if channel in channels:
-            signal = signal_of(record, channel)
+            # One sample is no start: its noise is taken off as for a derivative.
+            signal = signal_of(record, channel, max(order, 1))
             values[item] = float(signal.evaluate(np.zeros(1), record.rate, order)[0])
     return expression.xreplace({item: sp.Float(value) for item, value in values.items()})
 

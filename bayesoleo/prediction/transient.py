@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.guess import Motion
-from bayesoleo.prediction.inputs import RowCache, input_rows
+from bayesoleo.prediction.inputs import RowCache, highest_derivatives, input_rows, signal_of
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import Anchor, RunPredictor, Samples
 from bayesoleo.prediction.start import InitialState
@@ -22,15 +22,25 @@ from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
 from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.integrate import halved, integrate, resolving
-from bayesoleo.solvers.transient.solve import solve_transient, transient_sensitivities
+from bayesoleo.solvers.transient.solve import (
+    solve_transient,
+    state_rows,
+    transient_sensitivities,
+)
 from bayesoleo.solvers.transient.state_space import StateSpace
 
 Array = NDArray[np.float64]
 
 #: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
 WHOLE = 128
-#: Samples of an input that a step spans at least: nothing faster is known of it.
-SAMPLES_A_STEP = 4
+#: Steps are not cut for the sake of inputs below so many samples of them, nor below this angle at
+#: the highest frequency that an input holds, which a method of fifth order follows to 1e-4.
+SAMPLES_A_STEP, ANGLE = 4, 0.75
+#: Steps of that angle beyond which a library's integrator, step by step, would take minutes.
+MOST_INTEGRATED = 5_000
+#: Where steps are chosen by the inputs alone they are halved until the motion changes by less than
+#: this part of its size, and are no more than so many.
+SETTLED, MOST_STEPS = 3e-5, 400_000
 #: Steps of equal length where equations have no explicit form for an integrator to choose by.
 FALLBACK = 512
 
@@ -84,6 +94,13 @@ class TransientRun(RunPredictor):
         )
         self.initial = InitialState(model, kernels, record)
         self._input_names = derived.inputs
+        highest = highest_derivatives(derived.inputs)
+        #: Channels as this model takes them; the time is none.
+        self.curves: dict[str, Any] = {
+            name: signal_of(record, name, order)
+            for name, order in highest.items()
+            if name != "time"
+        }
         self.space = StateSpace(
             kernels,
             derived.orders,
@@ -108,8 +125,8 @@ class TransientRun(RunPredictor):
         return other
 
     def _inputs(self, time: Array) -> Array:
-        if time.size == 1 and all(name in self.record.smoothed for name, _ in self._input_names):
-            now, known = float(time[0]), self.record.smoothed
+        if time.size == 1 and all(name in self.curves for name, _ in self._input_names):
+            now, known = float(time[0]), self.curves
             rows = [known[name].at_once(now, k) for name, k in self._input_names]
             # A column also where a model has no input.
             return np.array(rows, dtype=float).reshape(-1, 1)
@@ -137,11 +154,21 @@ class TransientRun(RunPredictor):
 
     def _choose(self, mesh: Mesh) -> None:
         """Keep a mesh for good, cut where the inputs change faster than its steps can follow."""
-        shortest = SAMPLES_A_STEP / (self.record.time.size - 1)
         self.chosen = resolving(
-            mesh, lambda position: self._inputs(position * self.period), self.method, shortest
+            mesh, lambda position: self._inputs(position * self.period), self.method, self._shortest
         )
         self._adopt(self.chosen)
+
+    @property
+    def _shortest(self) -> float:
+        """Part of the time below which steps are not cut for the sake of inputs."""
+        of_samples = SAMPLES_A_STEP / (self.record.time.size - 1)
+        return min([of_samples, *(ANGLE / angle for angle in self._angles() if angle > 0)])
+
+    def _angles(self) -> list[float]:
+        """Angle by which the highest frequency of each input turns in all the time."""
+        bands = [getattr(curve, "band", None) for curve in self.curves.values()]
+        return [2 * np.pi * band.upper * self.period for band in bands if band is not None]
 
     def found(self) -> dict[str, Any]:
         """As of a periodic run, and the mesh."""
@@ -180,6 +207,8 @@ class TransientRun(RunPredictor):
     def _first(self, p: Array, state: Array) -> Solution | Status:
         """The first solution, on a mesh of its own unless one was taken over."""
         rows: Motion = lambda position: self._known(position, state)  # noqa: E731
+        if self.chosen is None and max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED:
+            return self._by_inputs(p, state, rows)
         if self.chosen is None or not self.motions:
             found = integrate(self.space, p, state, self.period)
             if not found.status.ok and found.status is not Status.SINGULAR:
@@ -191,6 +220,42 @@ class TransientRun(RunPredictor):
         start = self._unknowns(rows)
         start[:, 0, : self.scheme.state_size] = state
         return solve_transient(self.boundary, p[None], start)
+
+    def _by_inputs(self, p: Array, state: Array, rows: Motion) -> Solution:
+        """The first solution on equal steps that follow the inputs: the longest that suffice."""
+        steps = int(np.ceil(1.0 / self._shortest))
+        solution, place = self._on_equal(steps, p, state, rows), np.linspace(0.0, 1.0, 16 * WHOLE)
+        while 2 * steps <= MOST_STEPS and solution.status[0] == Status.CONVERGED.value:
+            coarse, motion = solution, self._motion_of(solution)
+            solution = self._on_equal(2 * steps, p, state, motion)
+            if solution.status[0] == Status.CONVERGED.value:
+                states, finer = state_rows(self.kernels.derived.orders), self._motion_of(solution)
+                if _rests(finer(place)[states], motion(place)[states]):
+                    self._keep_equal(steps)
+                    return coarse
+            steps *= 2
+        return solution
+
+    def _keep_equal(self, steps: int) -> None:
+        self.chosen = equidistant(steps)
+        self._adopt(self.chosen)
+
+    def _on_equal(self, steps: int, p: Array, state: Array, rows: Motion) -> Solution:
+        """A solution on equal steps, which are kept."""
+        self._keep_equal(steps)
+        start = self._unknowns(rows)
+        start[:, 0, : self.scheme.state_size] = state
+        return solve_transient(self.boundary, p[None], start)
+
+    def _motion_of(self, solution: Solution) -> Motion:
+        """Rows of a solution on the present mesh at positions."""
+        scheme, steps, step = self.collocation, self.steps, self.boundary.step(self.steps)
+
+        def rows(position: Array) -> Array:
+            plan = scheme.plan(position, steps, initial=True)
+            return scheme.sample(solution.x[..., None], plan, step)[0, :, 0]
+
+        return rows
 
     def _unknowns(self, rows: Motion) -> Array:
         """The scheme's unknowns ``(1, n, w)`` of a motion."""
@@ -251,3 +316,9 @@ class TransientRun(RunPredictor):
             self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps)
         )
         return rows[0, first:last, 0]
+
+
+def _rests(now: Array, before: Array) -> bool:
+    """Whether rows ``(nz, N)`` of a motion have changed by next to nothing."""
+    size = np.abs(now).max(axis=1)
+    return bool((np.abs(now - before).max(axis=1) <= SETTLED * size).all())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from bayesoleo.data.units import parse_unit, same_quantity
 from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
+from bayesoleo.prediction.invented import Invented, without_invented
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import first_steps
@@ -114,7 +115,6 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     starts = not all(record.periodic for record in reduced.records)
     assembly = Assembly(model, drive, starts=starts)
     assembly, reduced = _with_nuisance(assembly, reduced, settings.nuisance)
-    roles = assign(reduced.records)
     driven = assembly.model()
     # Building a predictor of one step checks channels, conditions and priors of every run without
     # solving anything.
@@ -126,7 +126,42 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
             hint="give at least one a prior (sd=…, relative_sd=…, bounds=…) without fixed=True",
         )
     _check_units(driven, reduced.campaign)
-    return Task(reduced, roles, assembly, settings)
+    reduced = within_bands(reduced, driven)
+    return Task(reduced, assign(reduced.records), assembly, settings)
+
+
+def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:
+    """Cut inputs off where a model makes of them what its outputs do not show.
+
+    Parameters
+    ----------
+    reduced : ReducedCampaign
+    model : Model
+        In the drive in which it is solved.
+
+    Warns
+    -----
+    DataWarning
+        For each run in which that is so, with figures.
+    """
+    channels = reduced.campaign.channels
+    given = [name for name, channel in channels.items() if channel.bandwidth is not None]
+    records, invented = without_invented(model, reduced.records, given)
+    for item in invented:
+        warnings.warn(_about(item, reduced.campaign.units), DataWarning, stacklevel=2)
+    return ReducedCampaign(reduced.campaign, records) if invented else reduced
+
+
+def _about(item: Invented, units: Mapping[str, str]) -> str:
+    """What was cut off, as a sentence."""
+    inside, outside = units.get(item.channel, "(SI)"), units.get(item.output, "(SI)")
+    return (
+        f"run {item.run}: above {item.low:.4g} Hz the model makes {item.predicted:.2g} {outside} "
+        f"of {item.output} out of {item.held:.2g} {inside} of {item.channel} by derivative "
+        f"{item.derivative}, where {item.measured:.2g} {outside} were measured; as an input "
+        f"{item.channel} ends there. To decide otherwise write bandwidth = … in Hz under "
+        f"[channels.{item.channel}], inf for all of it"
+    )
 
 
 def _with_nuisance(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,3 +49,17 @@ def test_a_silent_error_is_one_beyond_what_was_asked_for_and_said(truth):
     assert not truth_solvers.Solve(False, True, 1e-8, 2e-8, 3e-7).silent
     assert truth_solvers.Solve(True, True, 1e-8, np.nan, 3e-7).silent
     assert truth_solvers.Solve(True, True, 1e-8, 1e-8, np.nan).silent
+
+
+@pytest.mark.slow
+def test_inputs_arrive(truth):
+    """On the first twentieth of the arrow, where it is small: the prediction is that of the
+    Runge-Kutta, and neither way of EMPS makes inertia of the encoder's noise."""
+    if not (Path(os.environ.get("BAYESOLEO_DATA", "")) / "measured" / "emps").is_dir():
+        pytest.skip("the measured sets are not here")
+    found = truth.figures(["inputs"], 0.05)
+    assert abs(found["arrow_mV"] - found["arrow_reference_mV"]) < 0.02
+    assert abs(found["multisine_mV"] - found["multisine_reference_mV"]) < 0.02
+    assert found["multisine_mV"] < 0.6
+    assert found["emps_periodic_N"] < 2.7
+    assert found["emps_transient_N"] < 2.7

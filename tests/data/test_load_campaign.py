@@ -41,12 +41,14 @@ def test_samples_cannot_be_changed(make_campaign):
 
 def test_scale_comes_before_offset(make_campaign):
     folder = make_campaign(
-        {'unit = "mm"': 'unit = "mm"\nscale = -2.0\noffset = 5.0\naccuracy = 0.26'}
+        {'unit = "mm"': 'unit = "mm"\nscale = -2.0\noffset = 5.0\naccuracy = 0.26\nbandwidth = 30'}
     )
     campaign = load_campaign(folder)
     expected = (-2.0 * table()[:, 1] + 5.0) * 1e-3
     np.testing.assert_allclose(campaign.runs[0].samples["displacement"], expected, atol=1e-8)
     assert campaign.channels["displacement"].accuracy == pytest.approx(0.26e-3)
+    assert campaign.channels["displacement"].bandwidth == 30.0
+    assert campaign.runs[0].bandwidths == {"displacement": 30.0}
 
 
 def test_mean_is_removed_after_the_cut(make_campaign):

@@ -53,6 +53,10 @@ class _Course:
         rows = self.courses(phase)
         return rows[self.k] if self.k < len(rows) else np.zeros(phase.size)
 
+    def for_derivative(self, highest: int) -> _Course:
+        """The same: it is computed, not measured."""
+        return self
+
     def at_once(self, time: float, derivative: int = 0) -> float:
         """At one time of a transient, s."""
         return float(self.evaluate(np.array([time * self.rate]), self.rate, derivative)[0])

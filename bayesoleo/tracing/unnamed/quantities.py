@@ -183,7 +183,7 @@ def _row(fit: Fit, r: int, item: sp.Symbol, phase: Array) -> Array:
         rows: Array = motions[name](phase)
         return rows[order]
     if name in fit.predictor.model.inputs:
-        return signal_of(run.record, name).evaluate(phase, run.record.rate, order)
+        return signal_of(run.record, name, order).evaluate(phase, run.record.rate, order)
     constants = run.kernels.derived.constants
     if name in constants:
         present = fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
