@@ -17,8 +17,10 @@ from bayesoleo.tracing.deciding.review import reviewed
 from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
+from bayesoleo.tracing.errors.same_noise import least_noise
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
+from bayesoleo.tracing.fitting.restart import better_start
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.significance import SAME
 
@@ -64,7 +66,8 @@ class ClosedLoop:
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
         if not self.effects:
-            return schema.NOTHING_MISSING if self.final.at_floor else schema.UNEXPLAINED
+            nothing = self.final.at_floor and not self.final.too_quiet
+            return schema.NOTHING_MISSING if nothing else schema.UNEXPLAINED
         if self.final.at_floor:
             return schema.EFFECT_ADDED
         explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
@@ -144,7 +147,10 @@ def close_loop(
     if known is None:
         known = _begun(assembly, roles, numerics, say)
         keep(known)
-    roles = replace(roles, measured=known.first.errors.record_noise)
+    # What a search that goes on has found counts as well.
+    for found in (known.first, known.state):
+        noise = least_noise(roles.measured, found.errors.record_noise)
+        roles = replace(roles, measured=noise)
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
@@ -156,6 +162,8 @@ def close_loop(
             outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
         if outcome.after is not None:
             state = eliminated(outcome.after, roles, numerics, notes, say)
+            noise = least_noise(roles.measured, state.errors.record_noise)
+            roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
         keep(known)
     rounds = reviewed(known.rounds, known.state, roles, numerics, effects, say)
@@ -166,6 +174,11 @@ def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Pr
     """The declared model, estimated."""
     notes = [] if roles.strategy == "declared" else [roles.description]
     state = fit_state(assembly, roles, numerics, progress=say)
+    if not state.at_floor:
+        say("more is left than expected: try other starts")
+        start = better_start(state.fit, numerics)
+        if start is not None:
+            state = fit_state(assembly, roles, numerics, start=start, progress=say)
     return Progress(state, state, notes=tuple(notes))
 
 
@@ -178,9 +191,11 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
         Ended; see :meth:`Progress.ended`.
     roles : Roles
     """
+    progress = progress.with_same_noise()
     state = progress.state
     notes = [*progress.notes, *_warnings(state.fit), *unnamed_notes(progress.rounds)]
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
+    notes += state.too_quiet
     if not state.at_floor:
         notes.append(
             "intervals count independent noise only: while an error remains that repeats, they are"

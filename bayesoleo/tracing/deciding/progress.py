@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.errors.same_noise import least_noise
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,27 @@ class Progress:
     def finished(self) -> bool:
         """Whether the last round accepted nothing, so that no other follows."""
         return bool(self.rounds) and self.rounds[-1].after is None
+
+    def with_same_noise(self) -> Progress:
+        """With the errors of all states held against the noise that was found last: it is that of
+        the records, and no round has another."""
+        noise = self.state.errors.record_noise
+        for entry in self.rounds:
+            noise = least_noise(noise, entry.before.errors.record_noise)
+        known: dict[int, State] = {}
+
+        def same(state: State) -> State:
+            return known.setdefault(id(state), state.with_noise(noise))
+
+        rounds = tuple(
+            replace(
+                entry,
+                before=same(entry.before),
+                after=None if entry.after is None else same(entry.after),
+            )
+            for entry in self.rounds
+        )
+        return replace(self, first=same(self.first), state=same(self.state), rounds=rounds)
 
     def after(self, outcome: Round, state: State, notes: list[str]) -> Progress:
         """With one more round."""

@@ -14,8 +14,9 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.tracing.errors.errors_table import ErrorTable, compared
 from bayesoleo.tracing.errors.expected import Compared, expected_of_fitted, expected_of_held_out
-from bayesoleo.tracing.errors.floor import is_at_floor
+from bayesoleo.tracing.errors.floor import is_at_floor, too_quiet
 from bayesoleo.tracing.errors.holdout import Prediction, predict_fitted, predict_held_out
+from bayesoleo.tracing.errors.same_noise import Noise, with_same_noise
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.roles import Roles
@@ -80,6 +81,19 @@ class State:
     def at_floor(self) -> bool:
         """Whether fitted and held-out runs are all down to what is expected of them."""
         return all(is_at_floor(table) for table in (self.fit_errors, self.hold_errors))
+
+    @property
+    def too_quiet(self) -> tuple[str, ...]:
+        """Where less is left than chance allows: a noise that was measured too large."""
+        return (*too_quiet(self.fit_errors), *too_quiet(self.hold_errors))
+
+    def with_noise(self, noise: Noise) -> State:
+        """The same errors held against a noise that was found with another model."""
+        return replace(
+            self,
+            fit_errors=with_same_noise(self.fit_errors, noise),
+            hold_errors=with_same_noise(self.hold_errors, noise),
+        )
 
     @property
     def unsolved(self) -> tuple[str, ...]:

@@ -24,6 +24,9 @@ from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
 
 #: A ratio to what is expected below this is not worth an effect, however surely it is above one.
 FLOOR_RATIO = 1.15
+#: One below this is a fault, if chance does not explain it: the noise was measured too large by a
+#: third.
+LEAST_RATIO = 0.75
 #: Probability with which noise and the unknowns' errors alone may exceed the limit.
 FALSE_ALARM = 1e-3
 
@@ -97,3 +100,23 @@ def is_at_floor(table: ErrorTable) -> bool:
             if not pooled < limit(chosen):
                 return False
     return all(entry.ratio_to_expected < limit([entry], len(entries)) for entry in entries)
+
+
+def too_quiet(table: ErrorTable) -> tuple[str, ...]:
+    """Sentences on outputs that leave less than chance allows, pooled over the runs of a role.
+
+    A residual below the noise says that the noise is not what was measured, not that all is well.
+    """
+    found = []
+    for role in dict.fromkeys(entry.role for entry in table.entries):
+        for output in table.outputs:
+            chosen = [e for e in table.entries if e.role == role and e.output == output]
+            numbers = table.pooled(role, output)
+            ratio = numbers["ratio_to_expected"]
+            if ratio < min(lowest(chosen), LEAST_RATIO):
+                found.append(
+                    f"{output}: the error of the {role} runs is {numbers['repeating']:.3g},"
+                    f" {ratio:.2f} times the expected {numbers['expected']:.3g}, and chance allows"
+                    f" {lowest(chosen):.2f} at least: the noise was measured too large"
+                )
+    return tuple(found)

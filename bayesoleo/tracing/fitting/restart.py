@@ -1,0 +1,67 @@
+"""Other starts for a fit that leaves more than is expected: a wrong optimum is no missing effect.
+
+Where a resonance lies between the frequencies that were driven, the sum of squares has an optimum
+on either side of each, and an estimate ends in the one that it starts near.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
+
+Array = NDArray[np.float64]
+
+#: Vectors drawn from the priors, and the best of them from which estimates start.
+DRAWS, STARTS = 256, 4
+#: Log density by which another optimum has to be better: less is what an estimate that ends early
+#: leaves.
+BETTER = 5.0
+
+
+def better_start(fit: Fit, numerics: Numerics) -> Array | None:
+    """Unknowns from which the estimate ends higher than it did.
+
+    Parameters
+    ----------
+    fit : Fit
+        That leaves more than is expected.
+    numerics : Numerics
+
+    Returns
+    -------
+    ndarray, shape (l,), or None
+        The better optimum; None where none of those that are reached from draws of the priors is.
+    """
+    best, height = None, fit.point.objective + BETTER
+    for start in _promising(fit):
+        found = fit_model(
+            fit.model,
+            fit.records,
+            replace(numerics, steps=fit.steps),
+            start=start,
+            tolerance=1e-4,
+            max_iterations=30,
+            share=fit.predictor,
+            check_mesh=False,
+        )
+        if found.point.status.ok and found.point.objective > height:
+            best, height = found.point.theta, found.point.objective
+    return best
+
+
+def _promising(fit: Fit) -> list[Array]:
+    """The most likely of many draws; unknowns of single runs stay where they were estimated."""
+    problem, rng = fit.problem, np.random.default_rng(0)
+    draws = np.repeat(fit.point.theta[None], DRAWS, axis=0)
+    for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
+        if name in fit.model.parameters:
+            draws[:, k] = prior.sample(rng, DRAWS)
+    sums = problem.misfit(draws).sum_of_squares.sum(axis=1)
+    counts = problem.counts.sum(axis=0)
+    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
+    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[:STARTS]
+    return [draws[k] for k in order if np.isfinite(cost[k])]
