@@ -26,6 +26,9 @@ from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
 
 #: Starts drawn from the priors that look for other modes than the estimate before sampling.
 STARTS = 4
+#: Points about the estimate and from the priors from which the sampler climbs itself: few, because
+#: an estimate from a start is the better way.
+CLIMBS = 8
 NOT_YET = "the posterior had not been sampled when this was written"
 
 
@@ -112,6 +115,7 @@ def draw(
         fingerprint=fingerprint,
         progress=progress,
         quick=settings.quick,
+        climbs=CLIMBS,
         scheduler=settings.scheduler,
     )
     return samples, density

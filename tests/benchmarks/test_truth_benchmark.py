@@ -63,3 +63,11 @@ def test_inputs_arrive(truth):
     assert found["multisine_mV"] < 0.6
     assert found["emps_periodic_N"] < 2.7
     assert found["emps_transient_N"] < 2.7
+
+
+@pytest.mark.slow
+def test_no_mode_is_missed_without_a_word(truth):
+    found = truth.figures(["modes"], fraction=0.1)
+    assert found["mode_runs"] == 10
+    assert found["mode_runs_reached"] > 0
+    assert found["modes_missed"] == 0

@@ -18,12 +18,13 @@ class Slow(Gaussian):
         return super().__call__(phi)
 
 
-def run(target, out: Path | None):
+def run(target, out: Path | None, climbs: int | None = None):
     """Sample with many small segments."""
     mixture = Mixture(np.zeros((1, 2)), np.eye(2)[None], np.zeros(1))
     return sample(
-        target, mixture, seed=11, out=out, quick=True, segment=3, fingerprint="x", progress=False
-    )
+        target, mixture, seed=11, out=out, quick=True, segment=3, fingerprint="x", progress=False,
+        climbs=climbs,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

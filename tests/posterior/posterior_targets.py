@@ -52,3 +52,29 @@ class BentRidge(Gaussian):
         straight = np.array(phi)
         straight[:, 1] -= 0.045 * phi[:, 0] ** 2
         return super().__call__(straight)
+
+
+class Bimodal(Gaussian):
+    """Normal about the origin, and about a second place, of another width and with a share."""
+
+    def __init__(self, dimension: int, distance: float, width: float, share: float, seed: int):
+        super().__init__(np.ones(dimension))
+        direction = np.random.default_rng(seed).standard_normal(dimension)
+        self.second = distance * direction / np.linalg.norm(direction)
+        self.width, self.share = width, share
+
+    def _heights(self, phi):
+        size = phi.shape[-1]
+        away = np.sum(((phi - self.second) / self.width) ** 2, axis=-1)
+        first = np.log(1 - self.share) - 0.5 * np.sum(phi**2, axis=-1)
+        return first, np.log(self.share) - size * np.log(self.width) - 0.5 * away
+
+    def in_second(self, phi):
+        """Whether points belong to the second mode."""
+        first, second = self._heights(phi)
+        return second > first
+
+    def __call__(self, phi):
+        self.evaluations += len(phi)
+        height = np.logaddexp(*self._heights(phi))
+        return height, np.column_stack([0.25 * height, 0.75 * height])

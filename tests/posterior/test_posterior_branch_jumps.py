@@ -24,10 +24,11 @@ class Jumping(Gaussian):
 
 def test_jumps_are_counted_and_outlive_a_restart(tmp_path):
     target = Jumping()
-    first = run(target, tmp_path)
+    # The search for other modes looks far beyond what is sampled: its jumps say nothing of that.
+    first = run(target, tmp_path, climbs=0)
     assert first.branch_jumps == target.branch_jumps > 0
     again = Jumping()
-    assert run(again, tmp_path).branch_jumps == first.branch_jumps
+    assert run(again, tmp_path, climbs=0).branch_jumps == first.branch_jumps
     assert again.branch_jumps == 0
     groups = to_datasets(first, (Normal(0, 1), Normal(0, 1)))
     assert groups["sample_stats"].attrs["branch_jumps"] == first.branch_jumps

@@ -190,7 +190,9 @@ class Fenced(Gaussian):
 
 def test_failures_are_kept_draw_by_draw():
     target = Fenced(np.ones(2))
-    samples = sample(target, normal_mixture(np.ones(2)), seed=1, quick=True, progress=False)
+    samples = sample(
+        target, normal_mixture(np.ones(2)), seed=1, quick=True, climbs=0, progress=False
+    )
     assert samples.draws[:, :, 0].max() <= 1.0
     assert samples.failures["inadmissible"] == target.failures["inadmissible"]
     by_reason = dict(zip(REASONS, samples.failed.T, strict=True))

@@ -185,6 +185,10 @@ class LogDensity:
                 total += run
         return self._mark_failures(total, by_run, status)
 
+    def dispersed(self, rng: np.random.Generator, count: int) -> Array:
+        """Draws of the unknowns' prior as coordinates, shape (count, p)."""
+        return self.unknowns.coordinates(self.unknowns.sample_prior(rng, count))
+
     def log_prior(self, phi: Array) -> Array:
         """Log prior density of the coordinates, shape (W,), Jacobian included."""
         block, eta = self.split(phi)

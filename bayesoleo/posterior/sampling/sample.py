@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 from bayesoleo.errors import InputError
 from bayesoleo.machines import connected
 from bayesoleo.posterior.approximation.mixture import Mixture
+from bayesoleo.posterior.approximation.mode_search import with_other_modes
 from bayesoleo.posterior.density.log_density import Density
 from bayesoleo.posterior.sampling.checkpoint import Store, open_store
 from bayesoleo.posterior.sampling.diagnostics import autocorrelation_time, nested_rhat
@@ -29,6 +30,10 @@ from bayesoleo.posterior.sampling.stopping import Quality, Schedule
 
 Array = NDArray[np.float64]
 
+#: Points from which other modes are looked for, and for a first look.
+CLIMBS, QUICK_CLIMBS = 32, 16
+#: Part of the evaluations allowed that this may take.
+SEARCHING = 0.25
 #: Evaluations of the log density at which a first look ends, good or not, but not before so many
 #: steps of each walker: minutes, where a motion takes milliseconds.
 QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
@@ -49,6 +54,7 @@ def sample(
     weights: MoveWeights | None = None,
     segment: int = 100,
     quick: bool = False,
+    climbs: int | None = None,
     scheduler: str | None = None,
 ) -> Samples:
     """Draw from a density until every quantity has the effective size asked for.
@@ -86,6 +92,11 @@ def sample(
     quick : bool
         Shorter warm-up, an effective size of at most 200 and not more than
         :data:`QUICK_EVALUATIONS`, for a first look.
+    climbs : int, optional
+        Points from which modes are looked for that the start does not have
+        (:mod:`~bayesoleo.posterior.approximation.mode_search`), by default :data:`CLIMBS`, or
+        :data:`QUICK_CLIMBS`; none where zero. Without them, walkers that all start in one mode
+        reach their effective size there, whatever else there is.
     scheduler : str, optional
         Other processes or machines that evaluate the density: ``local:4``, or the address of a Dask
         scheduler; see :func:`bayesoleo.machines.connected`. The draws are the same.
@@ -123,14 +134,17 @@ def sample(
     if quick:
         max_evaluations = min(max_evaluations, max(QUICK_EVALUATIONS, QUICK_STEPS * group.chains))
     schedule = _schedule(effective_size, max_evaluations, segment, quick)
-    print_of_run = _fingerprint(fingerprint, group, start, seed, schedule)
+    number = (QUICK_CLIMBS if quick else CLIMBS) if climbs is None else climbs
+    print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
     place = None if out is None else Path(out)
     with open_store(place, print_of_run) as store, connected(scheduler) as client:
         if client is not None:
             group = replace(group, log_density=SpreadDensity(log_density, client))
         bar = _Bar(schedule.effective_size, progress)
         try:
-            _warm_up(store, group, schedule, start, seed, bar)
+            if not store.segments:
+                store.append(_first(group, start, seed, number, schedule))
+            _warm_up(store, group, schedule, bar)
             if weights is None:
                 group = replace(group, weights=_tuned(store.segments))
             quality, short = _keep(store, group, schedule, bar)
@@ -146,7 +160,7 @@ def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool
 
 
 def _fingerprint(
-    given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule
+    given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule, climbs: int
 ) -> str:
     """Hash of all that the draws follow from; a larger effective size only continues them."""
     digest = hashlib.sha256()
@@ -161,6 +175,7 @@ def _fingerprint(
         schedule.warm_up,
         schedule.most_rounds,
         np.asarray(start.degrees).tolist(),
+        climbs,
     ]
     digest.update(json.dumps(settings).encode())
     for array in (start.centres, start.covariances, start.log_weights):
@@ -170,12 +185,21 @@ def _fingerprint(
     return digest.hexdigest()
 
 
-def _warm_up(
-    store: Store, group: Ensembles, schedule: Schedule, start: Mixture, seed: int, bar: _Bar
-) -> None:
+def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: Schedule) -> Segment:
+    """Walkers drawn from the start and from modes found beside it."""
+    spent = 0
+    # A climb takes some twenty rows and as many as there are coordinates, a dozen times.
+    climbs = min(climbs, int(SEARCHING * schedule.max_evaluations / (12 * (20 + start.dimension))))
+    if climbs > 0:
+        # A generator of its own: where nothing is found the draws are what they are without.
+        rng = np.random.default_rng([seed, climbs])
+        start, spent = with_other_modes(group.log_density, start, climbs, rng)
+    first = group.start(start, seed)
+    return replace(first, evaluations=first.evaluations + spent)
+
+
+def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar) -> None:
     """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau."""
-    if not store.segments:
-        store.append(group.start(start, seed))
     while not _is_warm(store.segments, schedule):
         rounds = sum(s.phase == "warm-up" for s in store.segments)
         steps = schedule.warm_up * 2**rounds
