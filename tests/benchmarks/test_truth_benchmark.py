@@ -71,3 +71,14 @@ def test_no_mode_is_missed_without_a_word(truth):
     assert found["mode_runs"] == 10
     assert found["mode_runs_reached"] > 0
     assert found["modes_missed"] == 0
+
+
+@pytest.mark.slow
+def test_true_effects_are_in_final_classes(truth):
+    """Two of the eighty: the marks are those of all; here, that figures are made of them."""
+    told: list[str] = []
+    found = truth.figures(["effects"], 0.025, told.append)
+    assert found["effect_campaigns"] == len(told) == 2
+    assert found["truth_in_class"] == 1.0
+    assert found["false_companions"] == 0.0
+    assert found["effect_longest_s"] < 60

@@ -5,15 +5,27 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from fitted_states import NUMERICS, options
+from small_campaigns import damper, damper_campaign
 
+from bayesoleo.effects import find_effect
 from bayesoleo.tracing.deciding import review
-from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.beam import followed
+from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.progress import Progress
+from bayesoleo.tracing.deciding.refit import refit
+from bayesoleo.tracing.deciding.rounds import Ranked, Round, rank
+from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.deciding.unnamed_round import (
     _several_in_one_balance,
     _stands_by_itself,
     with_unnamed,
 )
+from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.scoring.score import score_all
 
 
 def accepted(effect, same):
@@ -22,35 +34,111 @@ def accepted(effect, same):
     return Ranked(score, 1e-6, 0.9, True, same)
 
 
-def loop_of(*found):
-    """Rounds that accepted these, one that accepted none, and the final model."""
-    rounds = [Round(None, (item,), {}, item, None, "", 60.0) for item in found]
-    steps = [
-        SimpleNamespace(effect=SimpleNamespace(id=item.effect), target=item.target)
-        for item in found
+def progress_of(*found):
+    """Rounds that accepted these one after the other, one that accepted none, and their model."""
+    keys = [(item.effect, item.target) for item in found]
+
+    def state(count):
+        steps = [
+            SimpleNamespace(effect=SimpleNamespace(id=e, family="friction"), target=t)
+            for e, t in keys[:count]
+        ]
+        return SimpleNamespace(assembly=SimpleNamespace(steps=steps, added=tuple(keys[:count])))
+
+    rounds = [
+        Round(state(k), (item,), {}, item, state(k + 1), "", 60.0) for k, item in enumerate(found)
     ]
-    last = Round(None, (), {}, None, None, "nothing is missing", 60.0)
-    return [*rounds, last], SimpleNamespace(assembly=SimpleNamespace(steps=steps))
+    last = Round(state(len(found)), (), {}, None, None, "nothing is missing", 60.0)
+    return Progress(state(0), state(len(found)), (*rounds, last))
 
 
-def test_what_was_found_before_the_last_effect_keeps_its_true_rivals_only(monkeypatch):
+def test_what_was_found_before_the_last_effect_gets_the_class_that_it_has_beside_it(monkeypatch):
     first = accepted("cubic_stiffness", ("quintic_stiffness", "play"))
-    second = accepted("coulomb_friction", ("dahl_friction",))
-    rounds, final = loop_of(first, second)
-    monkeypatch.setattr(review, "_still_alike", lambda item, step, *_: ("play",))
-    told = review.reviewed(rounds, final, None, None, None, lambda _: None)
-    assert told[0].accepted.same == ("play",)
+    found = progress_of(first, accepted("coulomb_friction", ("dahl_friction",)))
+    estimate = object()
+    own = replace(first, same=("play", "preload"), refit=estimate)
+    place = SimpleNamespace(number=0, own=own, better=None)
+    monkeypatch.setattr(review, "place_of", lambda *_: place)
+    told = review.reviewed(found, None, None, None, lambda _: None).rounds
+    assert told[0].accepted.same == ("play", "preload")
+    assert told[0].accepted.beside is estimate
     assert told[0].ranking == (told[0].accepted,)
     # It was judged with everything else in: there is nothing to look at again.
-    assert told[1] is rounds[1]
-    assert told[2] is rounds[2]
+    assert told[1] is found.rounds[1]
+    assert told[2] is found.rounds[2]
 
 
 @pytest.mark.parametrize("same", [(), ("play",)])
 def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
-    rounds, final = loop_of(accepted("cubic_stiffness", same))
-    monkeypatch.setattr(review, "_still_alike", lambda *_: pytest.fail("asked again"))
-    assert review.reviewed(rounds, final, None, None, None, lambda _: None) == tuple(rounds)
+    found = progress_of(accepted("cubic_stiffness", same))
+    monkeypatch.setattr(review, "place_of", lambda *_: pytest.fail("asked again"))
+    assert review.reviewed(found, None, None, None, lambda _: None) is found
+
+
+NAMES = (
+    "coulomb_friction", "stroke_dependent_damping", "cubic_stiffness", "quintic_stiffness",
+    "quadratic_damping", "end_stop_upper", "hertzian_contact_upper", "constant_force",
+)  # fmt: skip
+EFFECTS = tuple(map(find_effect, NAMES))
+
+
+def cubic_and_friction(x, v, _):
+    return 1000 * x + 4e6 * x**3 + 200 * v + 5 * np.sign(v)
+
+
+def added_first(roles, name):
+    """A search that added one effect, whatever the others would have done."""
+    state = fit_state(Assembly(damper(cubic=False)), roles, NUMERICS)
+    base = state.base()
+    scores = score_all(base, options(state, NAMES), jobs=1)[0]
+    score = next(one for one in scores if one.option.key[0] == name)
+    result = refit(base, score, NUMERICS)
+    after = fit_state(result.assembly, roles, NUMERICS)
+    item = next(one for one in rank(scores, 40.0, {id(score): result}) if one.effect == name)
+    return Progress(state, after, (Round(state, (item,), {}, item, after, "", 40.0),))
+
+
+def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(tmp_path):
+    """A quintic spring is taken first on purpose: it is a cubic one that is there."""
+    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
+    begun = added_first(roles, "quintic_stiffness")
+    loop = close_loop(
+        Assembly(damper(cubic=False)), roles, NUMERICS, effects=EFFECTS, known=begun, max_effects=2
+    )
+    assert set(loop.effects) == {"cubic_stiffness", "coulomb_friction"}
+    told = [entry.reason for entry in loop.rounds if "stands instead of" in entry.reason]
+    assert len(told) == 1
+    assert "it stands instead of quintic_stiffness" in told[0]
+    assert "±" in told[0]
+    assert loop.final.at_floor
+
+
+def test_first_effects_that_were_nearly_as_good_are_followed():
+    names = ("near", "alike", "nearer", "far", "by_run")
+    worths = (95.0, 99.0, 97.0, 50.0, 120.0)
+    ranking = []
+    for name, worth in zip(names, worths, strict=True):
+        item = replace(accepted(name, ()), refit=SimpleNamespace(worth=worth, share=0.5))
+        item.score.option.candidate.family = "run-to-run" if name == "by_run" else "friction"
+        ranking.append(item)
+    taken = replace(accepted("taken", ("alike",)), refit=SimpleNamespace(worth=100.0, share=0.5))
+    added = [("taken", "stroke"), ("second", "stroke")]
+
+    def search(at_floor, found, first=taken):
+        state = SimpleNamespace(at_floor=at_floor, assembly=SimpleNamespace(added=tuple(found)))
+        opening = Round(None, (taken, *ranking), {}, first, None, "", 60.0)
+        return SimpleNamespace(rounds=(opening,), state=state)
+
+    def names_of(progress):
+        return [item.effect for item in followed(progress)]
+
+    assert names_of(search(True, added)) == ["nearer", "near"]
+    assert names_of(search(False, added[:1])) == ["nearer", "near"]
+    assert names_of(search(True, added[:1])) == [], "one effect led to the noise"
+    assert names_of(search(True, [])) == [] == names_of(search(True, [], None))
+    # What merely varies from run to run is a symptom: causes are followed beside it.
+    by_run = ranking[-1]
+    assert names_of(search(True, [("by_run", "stroke")], by_run)) == ["taken", "nearer"]
 
 
 def test_no_function_is_looked_for_where_noise_alone_is_left():

@@ -132,9 +132,22 @@ def test_a_fall_of_about_its_error_confirms_nothing():
     assert not fall.undecided, "a real effect of this size would have been confirmed"
     assert Fall(324.0, 300.0, 900.0).undecided
     assert Fall(8.03e4, 1.8e4, 7.1e4).confirms
-    both = fall + Fall(900.0, 400.0, 800.0)
-    assert (both.value, both.error, both.expected) == (1224.0, 500.0, 5800.0)
+
+
+def test_what_hardly_shows_an_effect_hardly_counts():
+    """A run that another missing effect swamps must not hide what quiet runs show."""
+    swamped, quiet = Fall(-2000.0, 9000.0, 400.0), Fall(500.0, 50.0, 480.0)
+    both = swamped.and_by(quiet)
     assert both.confirms
+    assert both.value == pytest.approx(500.0, rel=1e-3)
+    assert quiet.and_by(swamped) == both
+    # No other weights would show a real effect more surely.
+    power = both.expected / both.error
+    assert power == pytest.approx(np.hypot(400 / 9000, 480 / 50))
+    # Two that say as much count alike, and one that contradicts is heard.
+    against = Fall(-480.0, 50.0, 480.0)
+    assert quiet.and_by(against).value == pytest.approx(20.0)
+    assert not quiet.and_by(against).confirms
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,9 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
     refit = SimpleNamespace(fall=fall, inflation=1.0)
     option = SimpleNamespace(candidate=SimpleNamespace(family=family))
     score = SimpleNamespace(option=option)
-    accepted = SimpleNamespace(effect="play", same=same, refit=refit, score=score)
+    accepted = SimpleNamespace(
+        effect="play", target="stroke", same=same, refit=refit, beside=None, score=score
+    )
     after = SimpleNamespace(accepted=None, ranking=[SimpleNamespace(p_value=left)], tests=TESTS)
     added = [SimpleNamespace(accepted=accepted, ranking=[], tests=TESTS)] * effects
     final = SimpleNamespace(

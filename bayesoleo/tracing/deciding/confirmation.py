@@ -51,21 +51,19 @@ def confirmed(
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
     fall = fall_on_hold_out(*judged(state, after), result.inflation)
-    where = "hold-out runs"
+    where = f"hold-out runs: the weighted squared error falls by {fall}"
     halves = in_halves(roles) if fall.undecided else None
     if halves is not None:
         # What happens at the end of the stroke shows only in runs that get there.
         say(f"runs held out hardly show {item.effect}: confirm it on the other half of the periods")
         pair = _on_halves(state, after, halves, numerics)
-        fall = fall + fall_on_hold_out(*pair, result.inflation)
-        where = "hold-out runs, which hardly show it, and the second half of fitted ones"
+        other = fall_on_hold_out(*pair, result.inflation)
+        fall = fall.and_by(other)
+        where += f", which hardly shows it, and by {other} on the second half of fitted ones"
     if not fall.confirms:
-        return None, (
-            f"{item.effect} does not lower the error on {where}: the weighted squared error falls"
-            f" by {fall}, and {ENOUGH:.2f} standard errors are asked for (false alarms"
-            f" {100 * FALSE_ALARM:g} %)"
-        )
-    return after, f"{_explains(item)} and lowers the weighted squared error on {where} by {fall}"
+        asked = f"{ENOUGH:.2f} standard errors are asked for (false alarms {100 * FALSE_ALARM:g} %)"
+        return None, f"{item.effect} does not lower the error on {where}; {asked}"
+    return after, f"{_explains(item)} and lowers the error on {where}"
 
 
 def _on_fitted(result: Refit) -> str:

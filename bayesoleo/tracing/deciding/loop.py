@@ -11,6 +11,7 @@ from scipy import stats
 from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.beam import best_of_beam
 from bayesoleo.tracing.deciding.elimination import eliminated
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.review import reviewed
@@ -53,6 +54,11 @@ class ClosedLoop:
     notes: tuple[str, ...]
 
     @property
+    def added(self) -> tuple[tuple[str, str], ...]:
+        """Effects of the final model with their targets."""
+        return tuple(self.final.assembly.added)
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """Ids of the effects in the final model, in the order in which they were added."""
         return tuple(effect for effect, _ in self.final.assembly.added)
@@ -82,17 +88,19 @@ class ClosedLoop:
         resembles it would have left a significant remainder.
         """
         accepted = [item.accepted for item in self.rounds if item.accepted]
-        if len(accepted) != 1 or not self.effects or not self.final.at_floor:
+        accepted = [item for item in accepted if (item.effect, item.target) in self.added]
+        if len(self.added) != 1 or not accepted or not self.final.at_floor:
             return False
-        (found,), last = accepted, self.rounds[-1]
-        if found.same or found.effect not in self.effects or found.refit is None:
+        found, last = accepted[-1], self.rounds[-1]
+        estimate = found.beside or found.refit
+        if found.same or estimate is None:
             return False
         if found.score.option.candidate.family == FAMILY:
             return False  # a function without a name has none to be certain of
         if any(item.p_value < LEVEL for item in last.ranking):
             return False
         local = -np.expm1(np.log1p(-LEVEL) / last.tests)
-        fall = found.refit.fall / found.refit.inflation
+        fall = estimate.fall / estimate.inflation
         return bool((1.0 - SAME) * fall > stats.chi2.isf(local, 1))
 
 
@@ -147,16 +155,58 @@ def close_loop(
     if known is None:
         known = _begun(assembly, roles, numerics, say)
         keep(known)
-    # What a search that goes on has found counts as well.
-    for found in (known.first, known.state):
-        noise = least_noise(roles.measured, found.errors.record_noise)
-        roles = replace(roles, measured=noise)
+    search = Search(roles, numerics, effects, seed, max_effects, unnamed, keep, say)
+    known = searched(known, search)
+
+    def follow(other: Progress, most: int) -> Progress:
+        quiet = replace(search, max_effects=most, unnamed=False, keep=lambda _: None)
+        return searched(other, quiet)
+
+    roles = _with_noise(roles, known)
+    known = best_of_beam(known, roles, numerics, follow, max_effects, say)
+    return loop_of(known, roles)
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a search is done; see :func:`close_loop`."""
+
+    roles: Roles
+    numerics: Numerics
+    effects: Sequence[Effect] | None
+    seed: int
+    max_effects: int
+    unnamed: bool
+    keep: Callable[[Progress], None]
+    say: Say
+
+
+def searched(known: Progress, search: Search) -> Progress:
+    """A search carried on to its end, its final effects looked at again."""
+    for left in reversed(range(search.max_effects + 1)):
+        known = _rounds(known, search)
+        roles = _with_noise(search.roles, known)
+        known = reviewed(
+            known, roles, search.numerics, search.effects, search.say, replacing=left > 0
+        )
+        if known.finished:
+            break
+        search.keep(known)
+    return known
+
+
+def _rounds(known: Progress, search: Search) -> Progress:
+    """A search carried on until a round accepts nothing."""
+    numerics, say, max_effects = search.numerics, search.say, search.max_effects
+    roles = _with_noise(search.roles, known)
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         say(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = _limit(state.assembly.steps, len(rounds), max_effects)
-        outcome = examine(state, roles, numerics, effects=effects, seed=seed, limit=limit, say=say)
-        if outcome.after is None and unnamed and max_effects > 0:
+        outcome = examine(
+            state, roles, numerics, effects=search.effects, seed=search.seed, limit=limit, say=say
+        )
+        if outcome.after is None and search.unnamed and max_effects > 0:
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects
             outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
@@ -165,9 +215,17 @@ def close_loop(
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
-        keep(known)
-    rounds = reviewed(known.rounds, known.state, roles, numerics, effects, say)
-    return loop_of(replace(known, rounds=rounds), roles)
+        search.keep(known)
+    return known
+
+
+def _with_noise(roles: Roles, known: Progress) -> Roles:
+    """Runs with their noise as the models of a search have found it: what one that goes on has
+    found counts as well."""
+    for found in (known.first, known.state):
+        noise = least_noise(roles.measured, found.errors.record_noise)
+        roles = replace(roles, measured=noise)
+    return roles
 
 
 def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Progress:

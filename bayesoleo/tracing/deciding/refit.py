@@ -323,8 +323,12 @@ def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
 
 def compare(base: Base, fit: Fit) -> tuple[float, list[Array]]:
     """Part of the excess that a refitted model takes away, and how it changes the prediction of
-    each run, in noise units."""
-    before = after = 0.0
+    each run, in noise units.
+
+    What was measured beside the data counts with them: a model must not seem better for having
+    moved a constant off what is known of it.
+    """
+    before, after = _beside_data(base.fit), _beside_data(fit)
     changes = []
     for r, run in enumerate(base.runs):
         residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
@@ -332,3 +336,17 @@ def compare(base: Base, fit: Fit) -> tuple[float, list[Array]]:
         after += float(residual @ residual)
         changes.append(run.residual - residual)
     return (before - after) / base.fall_back, changes
+
+
+def _beside_data(fit: Fit) -> float:
+    """Sum of squares of what is measured beside the data: nuisance parameters and constants known
+    to a tolerance."""
+    return float(
+        sum(
+            ((value - prior.mean) / prior.sd) ** 2
+            for name, value, prior in zip(
+                fit.problem.names, fit.point.theta, fit.problem.priors, strict=True
+            )
+            if name in fit.problem.nuisances
+        )
+    )

@@ -1,101 +1,238 @@
-"""Classes of effects, looked at again once all that was missing has been found.
+"""Final effects looked at again, each beside all the others: what else could stand in its place,
+and whether something else does better there.
 
-While another effect is missing, its error blurs what two candidates would change, and they look
-alike. With everything else in the model, noise alone says how sure their difference is.
+While another effect is missing, its error blurs what two candidates would change: they look alike,
+or the nearer one seems better. With everything else in the model, noise alone says how sure their
+difference is. An effect that does better beside the others than the one that was added replaces it
+(sequential replacement; Miller 2002, Subset Selection in Regression, section 3.9).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-import numpy as np
-
-from bayesoleo.effects import Effect, catalogue
-from bayesoleo.tracing.deciding.refit import Refit, refit
-from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.parallel import thread_map
+from bayesoleo.tracing.deciding.confirmation import confirmed, judged
+from bayesoleo.tracing.deciding.elimination import dispersion, eliminated
+from bayesoleo.tracing.deciding.fall import fall_on_hold_out
+from bayesoleo.tracing.deciding.progress import Progress
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, refit
+from bayesoleo.tracing.deciding.rounds import IMITATORS, NEAR, Ranked, Round, name_among, rank
 from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting.assembly import Option, Step
+from bayesoleo.tracing.fitting.assembly import Step
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
-from bayesoleo.tracing.scoring.score import score_all
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import Score, score_all
+from bayesoleo.tracing.scoring.significance import without_twins
+
+#: Rivals of a final effect that are estimated beside the others.
+MOST_RIVALS = 5
 
 Say = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Place:
+    """A final effect's place in the model, and what could stand there.
+
+    Parameters
+    ----------
+    number : int
+        Of the round that added the effect, from zero.
+    without : State
+        The final model without the effect, on the fitted runs.
+    own : Ranked
+        The effect, estimated there, with its class.
+    rivals : tuple of Ranked
+        Others that were estimated, the best first.
+    """
+
+    number: int
+    without: State
+    own: Ranked
+    rivals: tuple[Ranked, ...]
+
+    @property
+    def better(self) -> Ranked | None:
+        """A rival that makes the data more than twenty times as likely, where there is one."""
+        for rival in self.rivals:
+            assert rival.refit is not None
+            assert self.own.refit is not None
+            scale = max(rival.refit.inflation, self.own.refit.inflation)
+            scale *= _dispersion(rival.refit, self.without)
+            gap = rival.refit.worth - self.own.refit.worth
+            if rival.imitates <= self.own.imitates and gap > AS_LIKELY * scale:
+                return rival
+        return None
+
+
+def _dispersion(result: Refit, without: State) -> float:
+    """Of what an estimate leaves."""
+    base = without.base()
+    return dispersion(replace(base, excess=base.excess - result.fall))
+
+
 def reviewed(
-    rounds: Sequence[Round],
-    final: State,
+    progress: Progress,
     roles: Roles,
     numerics: Numerics,
     effects: Sequence[Effect] | None,
     say: Say,
-) -> tuple[Round, ...]:
-    """Rounds whose accepted effects keep only those rivals that still look like them.
+    *,
+    replacing: bool = True,
+) -> Progress:
+    """A finished search whose final effects have the classes that they have beside each other.
 
     Parameters
     ----------
-    rounds : sequence of Round
-        As they were decided.
-    final : State
-        With all effects in.
+    progress : Progress
+        Finished.
     roles : Roles
     numerics : Numerics
     effects : sequence of Effect or None
         Instead of the catalogue.
     say : callable
         Told what is being done.
+    replacing : bool
+        Whether an effect may be replaced by one that does better.
+
+    Returns
+    -------
+    Progress
+        Finished, with new classes; or not finished any more, if an effect was replaced: with
+        another one there the search goes on.
     """
-    pool = catalogue() if effects is None else effects
-    steps = {(step.effect.id, step.target): step for step in final.assembly.steps[:-1]}
-    found = []
-    for item in rounds:
-        accepted = item.accepted
-        step = steps.get((accepted.effect, accepted.target)) if accepted else None
-        if accepted is None or step is None or not accepted.same:
-            found.append(item)
+    curve = any(step.effect.family == FAMILY for step in progress.state.assembly.steps)
+    for step in progress.state.assembly.steps:
+        number = _added_by(progress, step)
+        if number is None or step.effect.family == FAMILY:
             continue
-        say(f"look again at what was like {accepted.effect}")
-        ids = {accepted.effect, *(name.split(" @ ")[0] for name in accepted.same)}
-        alike = [effect for effect in pool if effect.id in ids]
-        same = _still_alike(accepted, step, final, roles, numerics, alike)
-        found.append(_with_class(item, accepted, replace(accepted, same=same)))
-    return tuple(found)
+        say(f"look again at what was like {step.effect.id}")
+        place = place_of(progress, step, number, roles, numerics, effects)
+        if place is None:
+            continue
+        better = place.better if replacing and not curve else None
+        if better is not None:
+            found = _replaced(progress, step, place, better, roles, numerics, say)
+            if found is not None:
+                return found
+        progress = _with_class(progress, place)
+    return progress
 
 
-def _still_alike(
-    accepted: Ranked,
+def _added_by(progress: Progress, step: Step) -> int | None:
+    """Number of the round that added a final effect, if it was beside others than there are now."""
+    key = step.effect.id, step.target
+    for number, item in reversed(list(enumerate(progress.rounds))):
+        if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
+            beside = set(item.before.assembly.added)
+            now = set(progress.state.assembly.added) - {key}
+            return None if beside == now else number
+    return None
+
+
+def place_of(
+    progress: Progress,
     step: Step,
-    final: State,
+    number: int,
     roles: Roles,
     numerics: Numerics,
-    effects: Sequence[Effect],
-) -> tuple[str, ...]:
-    """Of an effect's class those that explain as well what is left without it."""
-    without = fit_state(final.assembly.without(step), roles, numerics)
-    options = without.assembly.options(step.scales, effects)
-    wanted = [o for o in options if _called(o, accepted) in {"", *accepted.same}]
+    effects: Sequence[Effect] | None,
+) -> Place | None:
+    """What could stand in a final effect's place; None where that cannot be said."""
+    final, accepted = progress.state, progress.rounds[number].accepted
+    assert accepted is not None
+    less = final.assembly.without(step)
+    if len(less.steps) != len(final.assembly.steps) - 1:
+        return None  # others act on what it brought
+    fitted = replace(roles, held_out=(), strategy="none")
+    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
     base = without.base()
-    refits = [refit(base, score, numerics) for score in score_all(base, wanted, numerics.jobs)[0]]
-    own = next((r for r in refits if not _called(r.score.option, accepted)), None)
-    if own is None or not np.isfinite(own.share):
-        return accepted.same
-    alike = {_called(r.score.option, accepted) for r in refits if _rivals(own, r)}
-    return tuple(name for name in accepted.same if name in alike)
+    scales = scales_of(without.fit, less.drive, tuple(less.native.dofs))
+    scores = score_all(base, less.options(scales, effects), numerics.jobs)[0]
+    # The effect itself speaks for those that are it in other words.
+    order = sorted(scores, key=lambda score: score.option.key != (step.effect.id, step.target))
+    scores, _ = without_twins(order)
+    if not scores or scores[0].option.key != (step.effect.id, step.target):
+        return None
+    own, rivals = scores[0], _worth_estimating(scores[0], scores[1:], accepted.same)
+    chosen = [own, *rivals]
+    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
+    ranking = rank(scores, progress.rounds[number].tests, refits)
+    mine = next(item for item in ranking if item.score is own)
+    if mine.refit is None:
+        return None
+    others = [item for item in ranking if item.refit is not None and item is not mine]
+    others.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
+    return Place(number, without, mine, tuple(others))
 
 
-def _rivals(own: Refit, other: Refit) -> bool:
-    return other is not own and own.resembles(other)
+def _worth_estimating(own: Score, others: Sequence[Score], same: Sequence[str]) -> list[Score]:
+    """Those that score near an effect, the best first, and those that were in its class before."""
+    imitates = own.option.candidate.family in IMITATORS
+    near = [
+        score
+        for score in sorted(others, key=lambda score: -score.fall)
+        if score.fall > NEAR * own.fall
+        and (imitates or score.option.candidate.family not in IMITATORS)
+    ]
+    chosen = near[:MOST_RIVALS]
+    before = [one for one in others if name_among(own, one) in same and one not in chosen]
+    return [*chosen, *before[:MOST_RIVALS]]
 
 
-def _called(option: Option, accepted: Ranked) -> str:
-    """What a class calls an effect; nothing for the accepted one itself."""
-    effect, target = option.key
-    if effect != accepted.effect:
-        return effect
-    return "" if target == accepted.target else f"{effect} @ {target}"
+def _replaced(
+    progress: Progress,
+    step: Step,
+    place: Place,
+    better: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    say: Say,
+) -> Progress | None:
+    """The search with another effect in a place, if runs that were not used have nothing against
+    it."""
+    final = progress.state
+    before = fit_state(final.assembly.without(step), roles, numerics)
+    assert better.refit is not None
+    assert place.own.refit is not None
+    after, reason = confirmed(before, better, better.refit, roles, numerics, say)
+    if after is None or (final.at_floor and not after.at_floor):
+        return None
+    if _is_worse(final, after, better.refit.inflation):
+        return None
+    gained = better.refit.worth - place.own.refit.worth
+    reason += (
+        f"; it stands instead of {step.effect.id}, beside the others the weighted squared error is"
+        f" lower by {gained:.3g}, unknowns counted"
+    )
+    tests = progress.rounds[place.number].tests
+    ranking = (better, place.own, *(item for item in place.rivals if item is not better))
+    notes = [*progress.notes, f"{better.effect} replaced {step.effect.id}: {reason}"]
+    state = eliminated(after, roles, numerics, notes, say)
+    last = Round(before, ranking, {}, better, after, reason, tests)
+    rounds = (*progress.rounds[:-1], last)
+    return Progress(progress.first, state, rounds, tuple(notes))
 
 
-def _with_class(item: Round, old: Ranked, new: Ranked) -> Round:
-    ranking = tuple(new if one is old else one for one in item.ranking)
-    return replace(item, ranking=ranking, accepted=new)
+def _is_worse(one: State, other: State, inflation: float) -> bool:
+    """Whether runs that were not used speak against another model."""
+    if not one.hold_errors.entries:
+        return False
+    return fall_on_hold_out(*judged(other, one), inflation).confirms
+
+
+def _with_class(progress: Progress, place: Place) -> Progress:
+    """With the class of a final effect as it is beside the others."""
+    item = progress.rounds[place.number]
+    assert item.accepted is not None
+    new = replace(item.accepted, same=place.own.same, beside=place.own.refit)
+    ranking = tuple(new if one is item.accepted else one for one in item.ranking)
+    changed = replace(item, ranking=ranking, accepted=new)
+    rounds = (*progress.rounds[: place.number], changed, *progress.rounds[place.number + 1 :])
+    return replace(progress, rounds=rounds)

@@ -70,6 +70,9 @@ class Ranked:
         The extended model, where it was estimated.
     closest : tuple of (str, float)
         Of an unnamed effect: the named ones most like it, with the cosine between what they change.
+    beside : Refit or None
+        Its estimate beside the other effects of the final model, where these are others than when
+        it was added.
     """
 
     score: Score
@@ -79,6 +82,7 @@ class Ranked:
     same: tuple[str, ...]
     refit: Refit | None = None
     closest: tuple[tuple[str, float], ...] = ()
+    beside: Refit | None = None
 
     @property
     def effect(self) -> str:
@@ -167,12 +171,12 @@ def examine(
     base = state.base()
     scores, failed = _scored(base, options, numerics)
     tests = effective_tests(scores, seed)
-    ranking = _rank(scores, tests, {})
+    ranking = rank(scores, tests, {})
     stop = _stopping_reason(state, ranking, tests)
     if stop is not None or limit:
         return Round(state, ranking, failed, None, None, stop or limit, tests)
     refits = _refit_best(base, ranking, tests, numerics, say)
-    ranking = _rank(scores, tests, refits)
+    ranking = rank(scores, tests, refits)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, say)
     return Round(state, ranking, failed, accepted, after, reason, tests)
 
@@ -187,7 +191,17 @@ def _scored(
     return sorted(kept, key=lambda score: -score.share), failed | twins
 
 
-def _rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tuple[Ranked, ...]:
+def rank(scores: Sequence[Score], tests: float, refits: dict[int, Refit]) -> tuple[Ranked, ...]:
+    """Scores with what the search makes of them, those first that were estimated.
+
+    Parameters
+    ----------
+    scores : sequence of Score
+    tests : float
+        Effective number of independent tests.
+    refits : dict of int to Refit
+        By the ``id`` of the score.
+    """
     groups = classes(scores)
     ranked = []
     for k, score in enumerate(scores):
@@ -222,10 +236,14 @@ def _same(
         else:
             alike = j in group and not (own is not None and own.outdoes(other))
         if alike:
-            effect, target = other.option.key
-            same_id = effect == scores[k].option.candidate.effect
-            found.append(f"{effect} @ {target}" if same_id else effect)
+            found.append(name_among(scores[k], other))
     return tuple(dict.fromkeys(found))
+
+
+def name_among(own: Score, other: Score) -> str:
+    """What the class of an effect calls another one: by its place as well if the id is the same."""
+    effect, target = other.option.key
+    return f"{effect} @ {target}" if effect == own.option.key[0] else effect
 
 
 def _stopping_reason(state: State, ranking: Sequence[Ranked], tests: float) -> str | None:

@@ -124,7 +124,11 @@ def _decided(
 ) -> Round:
     """The round with the best function in that the runs not used confirm, or why there is none."""
     reasons, common = [outcome.reason], chances[-1].base
-    merit = partial(_merit, present=outcome.before.fit, reference=common)
+    # One name that leaves noise alone is no sum of names that a single law may be behind: then the
+    # more likely of the two stands.
+    alone = outcome.before.at_floor and len(outcome.before.assembly.steps) == 1
+    favour = 0.0 if alone else DECISIVE
+    merit = partial(_merit, present=outcome.before.fit, reference=common, favour=favour)
     for k in range(MOST_TRIED):
         answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
         for answer in _better(answers, merit):
@@ -233,15 +237,23 @@ def _goes_on(coarse: float, fine: float, p_value: float) -> bool:
     return p_value < FINER
 
 
-def _merit(own: Refit, *, instead: bool, inflation: float, present: Fit, reference: Base) -> float:
+def _merit(
+    own: Refit,
+    *,
+    instead: bool,
+    inflation: float,
+    present: Fit,
+    reference: Base,
+    favour: float = DECISIVE,
+) -> float:
     """What a function is worth beyond what was found so far; one that stands instead of names needs
-    none of them."""
+    none of them, and is favoured by so much."""
     gained = _fall(own.fit, reference) - _fall(present, reference)
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
     more = len(own.fit.problem.names) - len(present.problem.names)
     # What noise of one colour leaves scatters together: of so many values as many less are news.
     merit = gained / inflation - more * float(np.log(values))
-    return merit + DECISIVE if instead else merit
+    return merit + favour if instead else merit
 
 
 def _fall(fit: Fit, reference: Base) -> float:

@@ -1,0 +1,235 @@
+"""Other first effects carried forward, and final models compared.
+
+The effect that explains most by itself is not always part of the best model of several; and of two
+that are missing each alone may predict other runs worse than none. Where the search ended with more
+than one effect, left more than noise, or added no cause but what varies from run to run, the first
+effects that were nearly as good as the one that was taken are followed to their ends too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged
+from bayesoleo.tracing.deciding.elimination import dispersion
+from bayesoleo.tracing.deciding.fall import fall_on_hold_out
+from bayesoleo.tracing.deciding.progress import Progress
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, compare, schwarz_price
+from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.state import fit_state
+from bayesoleo.tracing.fitting.fit import Numerics
+from bayesoleo.tracing.fitting.roles import Roles
+
+#: First effects besides the one that was taken, and how much less they may explain, beyond the
+#: price of their unknowns, to be followed.
+MOST_FOLLOWED, TIED = 2, 0.1
+#: Names stand instead of a curve only if they are better by this much (Kass and Raftery 1995).
+DECISIVE = 10.0
+
+Say = Callable[[str], None]
+
+
+def best_of_beam(
+    progress: Progress,
+    roles: Roles,
+    numerics: Numerics,
+    follow: Callable[[Progress, int], Progress],
+    max_effects: int,
+    say: Say,
+) -> Progress:
+    """The best final model that the best few first effects lead to.
+
+    Parameters
+    ----------
+    progress : Progress
+        A finished search.
+    roles : Roles
+    numerics : Numerics
+    follow : callable (progress, most) -> Progress
+        Carries a search on to its end, with so many effects at most.
+    max_effects : int
+        Effects added at most.
+    say : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Progress
+        Finished. Effects of other final models that are about as likely stand in the classes of
+        those that are in their place here.
+    """
+    best = progress
+    for first in followed(progress):
+        if (first.effect, first.target) in best.state.assembly.added:
+            continue
+        say(f"follow {first.effect} as the first effect instead")
+        other = _followed(progress, first, roles, numerics, follow, max_effects, say)
+        if other is not None and other.state.assembly.added:
+            best = _better(best, other, say)
+    return best
+
+
+def followed(progress: Progress) -> list[Ranked]:
+    """First effects that were nearly as good as the one that was taken, the best first.
+
+    None where one effect alone led down to the noise. Those that the data could not tell from it
+    are looked at in its place by the review.
+    """
+    opening, final = progress.rounds[0], progress.state
+    taken = opening.accepted
+    alone = taken is not None and not taken.imitates and len(final.assembly.added) < 2
+    if final.at_floor and (taken is None or alone):
+        return []
+    pool = [
+        (item.refit.worth, item)
+        for item in opening.ranking
+        if item.refit is not None
+        and np.isfinite(item.refit.share)
+        and item.p_value < LEVEL
+        and not item.imitates
+        and item.score.option.candidate.family != FAMILY
+    ]
+    most = max((worth for worth, _ in pool), default=0.0)
+    seen = set(final.assembly.added)
+    alike = set() if taken is None else {taken.effect, *taken.same}
+    chosen: list[Ranked] = []
+    for worth, item in sorted(pool, key=lambda one: -one[0]):
+        names = {item.effect, f"{item.effect} @ {item.target}"}
+        if worth > (1.0 - TIED) * most and (item.effect, item.target) not in seen:
+            if not names & alike:
+                chosen.append(item)
+            alike |= names | set(item.same)
+    return chosen[:MOST_FOLLOWED]
+
+
+def _followed(
+    progress: Progress,
+    first: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    follow: Callable[[Progress, int], Progress],
+    max_effects: int,
+    say: Say,
+) -> Progress | None:
+    opening, result = progress.rounds[0], first.refit
+    assert result is not None
+    after, reason = confirmed(opening.before, first, result, roles, numerics, say)
+    provisional = after is None
+    if after is None:
+        if result.share < FAIR_SHARE or not result.excludes_null():
+            return None
+        after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+        reason += "; it is taken on trial, to be confirmed together with the next one"
+    present = len(progress.state.assembly.added)
+    few = progress.state.at_floor and not (opening.accepted and opening.accepted.imitates)
+    most = max(present, 2) if few else min(max(present + 1, 2), max_effects)
+    begun = Round(
+        opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
+    )
+    found = follow(Progress(progress.first, after, (begun,), progress.notes[:1]), most)
+    if provisional and not _together_confirmed(found):
+        return None
+    return found
+
+
+def _together_confirmed(found: Progress) -> bool:
+    """Whether effects of which the first was refused by itself are confirmed together."""
+    if len(found.state.assembly.added) < 2:
+        return False
+    return fall_on_hold_out(*judged(found.first, found.state), _inflation(found)).confirms
+
+
+def _better(best: Progress, other: Progress, say: Say) -> Progress:
+    """The better of two finished searches, with the other's effects in its classes if it is about
+    as likely."""
+    gap, scale = likelihood_gap(best, other)
+    if set(best.state.assembly.added) == set(other.state.assembly.added):
+        return best
+    if (best.state.at_floor and not other.state.at_floor) or _is_worse(best, other):
+        return best
+    curve = any(step.effect.family == FAMILY for step in best.state.assembly.steps)
+    symptom = _imitates(best) and not _imitates(other)
+    if gap > scale * (DECISIVE if curve else -AS_LIKELY if symptom else AS_LIKELY):
+        return _with_notes(best, other, gap, say)
+    if abs(gap) <= AS_LIKELY * scale and not curve:
+        return _with_classes(best, other)
+    return best
+
+
+def _imitates(found: Progress) -> bool:
+    """Whether a model has effects that take up a part of whatever is missing, and name no cause."""
+    return any(step.effect.family in IMITATORS for step in found.state.assembly.steps)
+
+
+def _with_notes(best: Progress, other: Progress, gap: float, say: Say) -> Progress:
+    """The other search, which says what it stands instead of."""
+    names, present = (
+        " and ".join(effect for effect, _ in one.state.assembly.added) or "no effect"
+        for one in (other, best)
+    )
+    say(f"{names} do better")
+    told = (
+        f"{names} stand instead of {present}: with unknowns counted (Schwarz 1978) the weighted"
+        f" squared error on fitted runs falls by {gap:.3g}"
+    )
+    return replace(other, notes=(*other.notes, told))
+
+
+def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
+    """By how much less the other final model leaves, unknowns counted, and the scale of that.
+
+    The scale is the dispersion of what the better one leaves times the inflation by the noise's
+    colour: one of them is a squared standard deviation.
+    """
+    base = one.first.base()
+    price, falls, worth = schwarz_price(base), [], []
+    for state in (one.state, other.state):
+        share, _ = compare(base, state.fit)
+        fall = share * base.fall_back if np.isfinite(share) else -np.inf
+        falls.append(fall)
+        worth.append(fall - price * len(state.fit.problem.names))
+    left = replace(base, excess=base.excess - max(falls))
+    return worth[1] - worth[0], dispersion(left) * max(map(_inflation, (one, other)))
+
+
+def _inflation(found: Progress) -> float:
+    """Largest variance of an added effect's unknowns over that in white noise."""
+    refits = [item.accepted.refit for item in found.rounds if item.accepted is not None]
+    return max((result.inflation for result in refits if result is not None), default=1.0)
+
+
+def _is_worse(best: Progress, other: Progress) -> bool:
+    """Whether runs that were not used speak against the other model."""
+    if not best.state.hold_errors.entries:
+        return False
+    return fall_on_hold_out(*judged(other.state, best.state), _inflation(best)).confirms
+
+
+def _with_classes(best: Progress, other: Progress) -> Progress:
+    """With the other model's effects in the classes of those that are in their place.
+
+    Effects that both models have stand in each other's place; the rest as they were added.
+    """
+    ours, theirs = best.state.assembly.added, other.state.assembly.added
+    left = [key for key in ours if key not in theirs]
+    more = [key for key in theirs if key not in ours]
+    rounds = list(best.rounds)
+    for k, key in enumerate(more):
+        if not left:
+            break
+        place = left[min(k, len(left) - 1)]
+        for number, item in enumerate(rounds):
+            accepted = item.accepted
+            if accepted is None or (accepted.effect, accepted.target) != place:
+                continue
+            name = key[0] if key[0] != place[0] else f"{key[0]} @ {key[1]}"
+            if name in accepted.same:
+                continue
+            new = replace(accepted, same=(*accepted.same, name))
+            ranking = tuple(new if one is accepted else one for one in item.ranking)
+            rounds[number] = replace(item, ranking=ranking, accepted=new)
+    return replace(best, rounds=tuple(rounds))
