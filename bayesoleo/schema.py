@@ -256,6 +256,29 @@ def of_errors(name: str) -> bool:
     return name.startswith(_ERROR_QUANTITIES)
 
 
+_RUN_WORDS: Final = (RUN, FREQUENCY, FREQUENCY_SD, PERIODS, ROLE, RUN_GROUP)
+_RESERVED: Final = {
+    "parameter": frozenset({CHAIN, DRAW, ENSEMBLE}),
+    "input": frozenset({RUN, SAMPLE, PHASE, CHAIN, DRAW}),
+    "output": frozenset({RUN, SAMPLE, PHASE, CHAIN, DRAW}),
+    "condition": frozenset(_RUN_WORDS),
+}
+
+
+def reserved(kind: str, name: str) -> bool:
+    """Whether a result calls something else by this name.
+
+    Parameters
+    ----------
+    kind : {"parameter", "input", "output", "condition"}
+        What is to be called so.
+    name : str
+    """
+    if kind == "parameter" and of_errors(name):
+        return True
+    return name in _RESERVED.get(kind, ())
+
+
 def by_run(parameter: str, run: str) -> str:
     """Name of a parameter that varies by run: ``offset[run 3]``."""
     return f"{parameter}[{run}]"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.data.bad_samples import impossible_sample
 from bayesoleo.data.checked_table import FILE, choose
 from bayesoleo.data.declaration import Channel, Declaration, read_declaration
 from bayesoleo.data.declared_run import RunDeclaration
@@ -297,6 +298,15 @@ def _samples(
         )
     if gap.any():  # what is masked does not count, so that any number will do
         values = bridged(values[None], gap)[0]
+    row, beyond = impossible_sample(values)
+    if row is not None:
+        raise CampaignError(
+            f"sample in row {part.start + row + 1}, at {time[row]:.6g} s, is {beyond} as far from"
+            " the median as the others",
+            column=channel.column,
+            value=float(values[row]),
+            hint="correct it, mask that time, or cut the run there with start or stop",
+        )
     if np.ptp(values) == 0:
         raise CampaignError(
             "channel is constant",

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesoleo.data.units import Unit, check_kind, parse_unit
 from bayesoleo.errors import CampaignError
+from bayesoleo.units import Unit, check_kind, parse_unit
 
 FILE = "campaign.toml"
 

@@ -19,8 +19,8 @@ from bayesoleo.data.checked_table import (
 )
 from bayesoleo.data.declared_run import RunDeclaration, read_runs
 from bayesoleo.data.rig import read_rig
-from bayesoleo.data.units import parse_unit
 from bayesoleo.errors import CampaignError
+from bayesoleo.units import parse_unit
 
 FORMAT = 1
 

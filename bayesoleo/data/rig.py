@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from bayesoleo.data.units import parse_unit
 from bayesoleo.errors import CampaignError
+from bayesoleo.units import parse_unit
 
 _PARTS = ("low", "high", "unit")
 _EXAMPLE = 'write { low = 1, high = 50, unit = "mm" }, or one of low and high'

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from bayesoleo.data.checked_table import FILE
 from bayesoleo.data.declaration import FORMAT
-from bayesoleo.data.units import parse_unit
 from bayesoleo.errors import CampaignError
+from bayesoleo.units import parse_unit
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,10 @@ from functools import cached_property
 import sympy as sp
 
 from bayesoleo.errors import ModelError
+from bayesoleo.model.declared_units import check_units
 from bayesoleo.model.expressions import derivative_symbol, parse, split_derivative, symbol
 from bayesoleo.model.parameter import Condition, Coordinate, Dof, Output, Parameter
+from bayesoleo.schema import reserved
 
 type Text = str | float | sp.Expr
 type Terms = Mapping[str, sp.Expr]
@@ -102,6 +104,7 @@ class Model:
             },
         )
         self._check_names()
+        check_units(self)
         put(self, "definitions", self._parse_definitions())
         put(self, "equations", self._parse_equations())
         put(self, "outputs", self._parse_outputs())
@@ -122,14 +125,22 @@ class Model:
             "condition": self.conditions,
             "definition": self.definitions,
         }
+        for kind, names in {**kinds, "output": self.outputs}.items():
+            for name in names:
+                if reserved(kind, name):
+                    raise ModelError(
+                        f"model {self.name!r}: {kind} {name!r} has a name that results use for"
+                        " something else",
+                        hint=f"rename it, for example own_{name}",
+                    )
         for kind, names in kinds.items():
             for name in names:
-                reserved = keyword.iskeyword(name) or name in ("time", "pi", "dot", "ddot")
-                if reserved or not name.isidentifier():
+                word = keyword.iskeyword(name) or name in ("time", "pi", "dot", "ddot")
+                if word or not name.isidentifier():
                     raise ModelError(
                         f"{kind} {name!r} is not usable as a name",
                         hint="reserved; add a letter or an underscore"
-                        if reserved
+                        if word
                         else "write letters, digits and underscores",
                     )
                 if name in seen:
@@ -342,6 +353,7 @@ class Model:
         if not self.parameters.keys() >= parameters.keys():
             other.__dict__.pop("structure", None)
         other._check_names()
+        check_units(other)
         return other
 
     def with_term(self, kind: str, target: str, name: str, expression: Text) -> Model:

@@ -17,7 +17,6 @@ from bayesoleo.data import (
     load_campaign,
     reduce_campaign,
 )
-from bayesoleo.data.units import parse_unit, same_quantity
 from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
@@ -26,6 +25,7 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import first_steps
 from bayesoleo.tracing.fitting.roles import Roles, assign
+from bayesoleo.units import parse_unit, same_quantity
 from bayesoleo.workflow.settings import Settings
 
 Say = Callable[[str], None]

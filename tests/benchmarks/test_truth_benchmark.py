@@ -22,6 +22,21 @@ def truth() -> Iterator[ModuleType]:
     sys.path[:] = path
 
 
+@pytest.mark.slow
+def test_coverage_of_a_few_campaigns(truth):
+    """Two of each kind: 52 intervals, most of which hold the truth.
+
+    Those of a campaign go together, so that a third of them may be off at once.
+    """
+    found = truth.figures(["tolerances"], 0.04)
+    assert found["coverage_campaigns"] == 12
+    assert found["coverage_parameters"] == 26
+    assert found["coverage_failed"] == 0
+    assert 0.6 < found["coverage"] <= 1.0
+    assert 0.6 < found["coverage_drawn"] <= 1.0
+    assert 0.0 <= found["coverage_worst"] <= 1.0
+
+
 def test_parts_are_modules_with_figures(truth):
     """A part that is named can be imported."""
     for name in truth.parts():

@@ -500,6 +500,7 @@ def make(
     effect: Effect | None = None,
     sensors: Sensors | None = None,
     model: Model | None = None,
+    within: float = 2.0,
 ) -> Made:
     """Draw a system and measure it.
 
@@ -524,6 +525,9 @@ def make(
         Changes the channels before noise is added.
     model : Model, optional
         Declared instead of the kind's own, over the same channels.
+    within : float
+        Standard deviations of the priors within which constants are drawn. Beyond two nobody would
+        trust the linearised statistics of any tool; the coverage of intervals is defined without.
 
     Returns
     -------
@@ -533,7 +537,7 @@ def make(
     truth_rng, plan_rng, noise_rng = (
         np.random.default_rng([seed, list(KINDS).index(kind), part]) for part in range(3)
     )
-    truth = _drawn(declared, truth_rng)
+    truth = _drawn(declared, truth_rng, within)
     system = which.system(truth)
     plan = plan if weak is None else replace(plan, weak=weak)
     runs = _runs(which, plan, plan_rng)
@@ -554,9 +558,8 @@ def make(
     return Made(kind, campaign, model or declared, truth, outputs, sizes, clean)
 
 
-def _drawn(model: Model, rng: np.random.Generator) -> dict[str, float]:
-    """Constants from their priors, within two standard deviations: beyond, nobody would trust the
-    linearised statistics of any tool."""
+def _drawn(model: Model, rng: np.random.Generator, within: float) -> dict[str, float]:
+    """Constants from their priors, within some standard deviations."""
     truth = {}
     for name, parameter in model.parameters.items():
         prior, value = parameter.prior, parameter.value
@@ -564,7 +567,7 @@ def _drawn(model: Model, rng: np.random.Generator) -> dict[str, float]:
             while True:
                 value = float(prior.sample(rng, 1)[0])
                 low, high = prior.support
-                if low < value < high and abs(value - prior.mean) < 2 * prior.sd:
+                if low < value < high and abs(value - prior.mean) < within * prior.sd:
                     break
         truth[name] = value
     return truth

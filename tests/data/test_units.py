@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesoleo.data.units import check_kind, parse_unit, same_quantity
 from bayesoleo.errors import CampaignError
+from bayesoleo.units import check_kind, parse_unit, same_quantity
 
 UNITS = [
     "mm",

@@ -17,6 +17,7 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
+from bayesoleo.tracing.fitting.other_starts import doubtful, from_other_starts
 
 Array = NDArray[np.float64]
 
@@ -153,7 +154,8 @@ def fit_model(
     numerics : Numerics
         Scheme, steps, threads.
     start : ndarray, shape (l,), optional
-        Where to start; by default at the nominal values.
+        Where to start; by default at the nominal values, and from draws of the priors as well where
+        these lead to an estimate that the priors hardly allow.
     tolerance : float
         Relative step at which the estimators stop.
     max_iterations : int
@@ -196,6 +198,16 @@ def fit_model(
             max_iterations=max_iterations,
             resolution=RESOLUTION,
         )
+        if start is None and doubtful(problem, point):
+            say("the estimate stands where the priors hardly allow it: other starts")
+            mbe, point = from_other_starts(
+                problem,
+                mbe,
+                point,
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                resolution=RESOLUTION,
+            )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         shift = 0.0  # without dofs there is no mesh

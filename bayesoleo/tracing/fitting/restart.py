@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
+from bayesoleo.tracing.fitting.other_starts import promising
 
 Array = NDArray[np.float64]
 
-#: Vectors drawn from the priors, and the best of them from which estimates start.
-DRAWS, STARTS = 256, 4
 #: Log density by which another optimum has to be better: less is what an estimate that ends early
 #: leaves.
 BETTER = 5.0
@@ -37,7 +36,7 @@ def better_start(fit: Fit, numerics: Numerics) -> Array | None:
         The better optimum; None where none of those that are reached from draws of the priors is.
     """
     best, height = None, fit.point.objective + BETTER
-    for start in _promising(fit):
+    for start in promising(fit.problem, fit.point.theta):
         found = fit_model(
             fit.model,
             fit.records,
@@ -51,17 +50,3 @@ def better_start(fit: Fit, numerics: Numerics) -> Array | None:
         if found.point.status.ok and found.point.objective > height:
             best, height = found.point.theta, found.point.objective
     return best
-
-
-def _promising(fit: Fit) -> list[Array]:
-    """The most likely of many draws; unknowns of single runs stay where they were estimated."""
-    problem, rng = fit.problem, np.random.default_rng(0)
-    draws = np.repeat(fit.point.theta[None], DRAWS, axis=0)
-    for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
-        if name in fit.model.parameters:
-            draws[:, k] = prior.sample(rng, DRAWS)
-    sums = problem.misfit(draws).sum_of_squares.sum(axis=1)
-    counts = problem.counts.sum(axis=0)
-    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
-    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[:STARTS]
-    return [draws[k] for k in order if np.isfinite(cost[k])]

@@ -68,6 +68,16 @@ class Inference:
                     value=name,
                     hint=f"choose from {', '.join(estimated)}",
                 )
+        for name in self.between_runs:
+            for taken in (schema.population_mean(name), schema.spread(name)):
+                if taken in model.parameters:
+                    raise ModelError(
+                        f"model {model.name!r}: parameter {taken!r} has the name of what scatters"
+                        f" between runs of {name!r}",
+                        key="between_runs",
+                        value=name,
+                        hint=f"rename {taken}",
+                    )
         chosen = {name: replace(model.parameters[name], by_run=True) for name in self.between_runs}
         return model.with_parameters(**chosen) if chosen else model
 

@@ -138,6 +138,28 @@ def parse_unit(name: str) -> Unit:
     return Unit(name, si_name, factor, shift)
 
 
+def in_si(name: str) -> str:
+    """The SI unit of the same kind, written as the unit is: ``N/m`` of ``N/mm``.
+
+    Parameters
+    ----------
+    name : str
+        A unit that is known.
+    """
+
+    def of_word(match: re.Match[str]) -> str:
+        return parse_unit(match.group()).si_name if _is_known(match.group()) else match.group()
+
+    unit = parse_unit(name)
+    text = re.sub(r"[A-Za-zµ°]+", of_word, name).replace("²", "**2")
+    try:
+        found = parse_unit(text)
+    except CampaignError:
+        return unit.si_name
+    good = found.si_name == unit.si_name and found.factor == 1.0 and found.shift == 0.0
+    return text if good else unit.si_name
+
+
 def _as_pint_writes(name: str) -> str:
     if name.strip() in ("", "1", "-"):
         return "dimensionless"
