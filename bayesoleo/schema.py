@@ -135,6 +135,13 @@ EFFECT_ADDED: Final = "effect added"
 UNEXPLAINED: Final = "unexplained remainder"
 VERDICTS: Final = (NOTHING_MISSING, EFFECT_ADDED, UNEXPLAINED)
 
+# Values of ``certainty``
+CERTAIN: Final = "certain"
+PROBABLE: Final = "probable"
+LIKENESS: Final = "likeness"
+NO_CAUSE: Final = "no cause"
+CERTAINTIES: Final = (CERTAIN, PROBABLE, LIKENESS, NO_CAUSE)
+
 # Root attributes
 FORMAT_ATTRIBUTE: Final = "bayesoleo_format"
 VERSION_ATTRIBUTE: Final = "bayesoleo_version"

@@ -94,7 +94,8 @@ def propose(
     names = tuple(part.strip() for part in rivals.split(",") if part.strip())
     declared, say = load_model(model), shell.teller(quiet)
     tree = workflow.propose(campaign, declared, chosen, rivals=names, limits=limits, say=say)
-    entries = json.loads(tree.attrs[schema.SUMMARY])["proposals"]
+    summary = json.loads(tree.attrs[schema.SUMMARY])
+    entries = summary["proposals"]
     if figure is not None:
         if schema.PROPOSAL not in tree.children:
             raise InputError("there is no run to draw", key="--figure", value=figure)
@@ -102,19 +103,19 @@ def propose(
     if as_json:
         shell.print_json(tables.plain({"proposals": entries}))
     else:
-        _print(entries)
+        _print(entries, summary.get("titles", {}))
 
 
-def _print(entries: list[dict[str, object]]) -> None:
+def _print(entries: list[dict[str, object]], titles: dict[str, str]) -> None:
     from bayesoleo.report.proposals import proposal_lines, proposal_table
 
     console = shell.console()
     if not entries:
         console.print("Nothing is left to be told apart: fewer than two candidates stand.")
     for entry in entries:
-        for line in proposal_lines(entry):
+        for line in proposal_lines(entry, titles):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
-        content = proposal_table(entry)
+        content = proposal_table(entry, titles)
         if content is not None:
             console.print()
             console.print(tables.table(content.head, content.rows, content.words))

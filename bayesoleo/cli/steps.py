@@ -259,7 +259,7 @@ def trace(
     console = shell.console()
     first = summary["rounds"][0]
     if first["candidates"]:
-        ranking = candidates(first)
+        ranking = candidates(first, summary.get("titles"))
         console.print(tables.table(ranking.head, ranking.rows[:SHOWN], words=ranking.words))
         if len(ranking.rows) > SHOWN:
             console.print(f"and {len(ranking.rows) - SHOWN} more", style="dim")

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from bayesoleo import schema
+from bayesoleo.effects.titles import called, listed
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import Scale, engineering
 
@@ -67,7 +68,8 @@ def proposal(tree: xr.DataTree, number: int = 0) -> Figure:
     axes.set_xlabel("frequency in Hz", fontsize=style.TEXT)
     drive = tree[schema.PROPOSAL].attrs["drive"]
     axes.set_ylabel(scale.label(f"amplitude of {drive}"), fontsize=style.TEXT)
-    rivals = ", ".join(json.loads(str(data["rivals"].values)))
+    titles = reading.summary(tree).get("titles", {})
+    rivals = listed([called(one, titles) for one in json.loads(str(data["rivals"].values))])
     handles = [
         Line2D([], [], color=style.INK, marker="o", ms=4, ls="", label="runs made"),
         Line2D([], [], color=style.BEFORE, marker="*", ms=11, ls="", label="best run"),

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from bayesoleo.effects.titles import titles_for
 from bayesoleo.plots import reading, style
 
 LEFT, TOP, BOTTOM, ROW, RIGHT = 2.9, 0.55, 0.6, 0.27, 2.0
@@ -47,7 +48,7 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     for row, candidate in enumerate(shown):
         _bar(axes, row, candidate, candidate is accepted, any(candidate is c for c in alike))
     axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
-    axes.set_yticks(range(len(shown)), [style.plain(name(c), 42) for c in shown])
+    axes.set_yticks(range(len(shown)), [style.plain(title(c), 42) for c in shown])
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
     largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)
@@ -59,10 +60,18 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     return figure
 
 
-def name(candidate: dict[str, Any]) -> str:
-    """Effect, and what it sits on where that is said."""
+def name(candidate: Mapping[str, Any]) -> str:
+    """Id of an effect, and what it sits on where that is said: how it is known, not called."""
     target = candidate.get("target")
     return f"{candidate['effect']} @ {target}" if target else str(candidate["effect"])
+
+
+def title(candidate: Mapping[str, Any]) -> str:
+    """What a candidate is called: its effect's title, and what it sits on where that is said."""
+    effect = str(candidate["effect"])
+    known = {effect: candidate["title"]} if candidate.get("title") else {}
+    text = titles_for([effect], known).get(effect, effect.replace("_", " "))
+    return f"{text} ({candidate['target']})" if candidate.get("target") else text
 
 
 def chosen(entry: Mapping[str, Any]) -> dict[str, Any] | None:

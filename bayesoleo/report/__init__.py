@@ -2,6 +2,7 @@
 
 from bayesoleo.report.page import render_report, write_report
 from bayesoleo.report.plain import write_plain_report
+from bayesoleo.report.sentences import headline
 from bayesoleo.report.terminal import print_summary
 
-__all__ = ["print_summary", "render_report", "write_plain_report", "write_report"]
+__all__ = ["headline", "print_summary", "render_report", "write_plain_report", "write_report"]

@@ -11,11 +11,12 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, whereabouts
-from bayesoleo.effects import catalogue
+from bayesoleo.effects.titles import called, listed
 from bayesoleo.errors import InputError
 from bayesoleo.plots.rankings import chosen, format_p, name
+from bayesoleo.report import sentences
 from bayesoleo.report.proposals import proposal_lines
-from bayesoleo.report.sentences import FLOOR, role_shown
+from bayesoleo.report.sentences import FLOOR, begin, role_shown
 from bayesoleo.report.tables import error_scale, format_short, parameters
 
 #: A harmonic or a coordinate is named if it holds this part of the excess.
@@ -112,15 +113,17 @@ def _named(shares: np.ndarray, words: list[str]) -> list[tuple[str, str]]:
 
 
 def _what(summary: Mapping[str, Any]) -> Iterator[str]:
+    titles = sentences.titles(summary)
     for entry in summary["rounds"]:
         added = chosen(entry)
         if added is None:
             continue
+        which = begin(called(name(added), titles))
         if added["effect"] not in summary["effects"]:
-            yield f"{name(added)} was added first, and removed again."
+            yield f"{which} was added first, and removed again."
             continue
         p = format_p(added["p_value"])
-        text = f"{name(added)}{_in_words(added['effect'])} explains {_share(added)} of the excess"
+        text = f"{which} explains {_share(added)} of the excess"
         text += (
             f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"
             if p
@@ -129,29 +132,37 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"{text}."
 
 
+#: How sure a name is, by the word of the summary.
+_SURE = {
+    schema.CERTAIN: (
+        "Certain: it was added alone, nothing else is significant beside it, no other effect"
+        " explains as much, and what is left is noise."
+    ),
+    schema.PROBABLE: (
+        "Probable: it explains the data best of what was tried, which is not all there is."
+    ),
+    schema.LIKENESS: (
+        "A likeness only: more than noise is left, so that something else acts as well, or instead."
+    ),
+    schema.NO_CAUSE: (
+        "No cause is named: curves without a name, what varies by run and what repeats with the"
+        " drive take up a part of whatever is missing."
+    ),
+}
+
+
 def _sure(summary: Mapping[str, Any]) -> str:
     """Whether the effect's name is certain, probable, or one of several; results that were stored
     without an answer have none."""
     if "certain" not in summary or not summary["effects"]:
         return ""
-    if summary["certain"]:
+    sure = sentences.certainty(summary)
+    alike = any(one["indistinguishable_from"] for one in sentences.accepted(summary))
+    if sure == schema.PROBABLE and alike:
         return (
-            "Certain: it was added alone, nothing else is significant beside it, no other effect"
-            " explains as much, and what is left is noise."
+            "Probable, as one of a class: these data cannot tell it from the effects named above."
         )
-    added = (chosen(entry) for entry in summary["rounds"])
-    alike = any(one["indistinguishable_from"] for one in added if one is not None)
-    if alike:
-        return "One of a class: these data cannot tell it from the effects named above."
-    if any(ratio > FLOOR for ratio, *_ in _ratios(summary["rounds"][-1])):
-        return "Open: more than noise is left, so that something else acts as well, or instead."
-    return "Probable: it explains the data best of what was tried, which is not all there is."
-
-
-def _in_words(effect: str) -> str:
-    """An effect's title in brackets; one that is not from the catalogue has its id only."""
-    titles = {item.id: item.title for item in catalogue()}
-    return f" ({titles[effect]})" if effect in titles else ""
+    return _SURE[str(sure)]
 
 
 def _share(candidate: Mapping[str, Any]) -> str:
@@ -167,9 +178,11 @@ def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
         added = chosen(entry)
         if added is None or added["effect"] not in summary["effects"]:
             continue
-        alike = added["indistinguishable_from"]
+        alike, titles = added["indistinguishable_from"], sentences.titles(summary)
+        own = called(name(added), titles)
         if alike:
-            yield f"These data cannot tell {name(added)} from {', '.join(alike)}."
+            others = listed([called(other, titles) for other in alike], " or ")
+            yield f"These data cannot tell {own} from {others}."
         apart = [
             c
             for c in entry["candidates"]
@@ -178,8 +191,9 @@ def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
         if apart:
             second = max(apart, key=lambda c: c["gain"])
             how = "estimated in its place" if second.get("estimated") else "by its score"
-            of = "the others" if alike else f"the {len(apart)} others instead of {name(added)}"
-            yield f"Of {of} {name(second)} comes nearest: {how} it explains {_share(second)}."
+            of = "the others" if alike else f"the {len(apart)} others instead of {own}"
+            which = called(name(second), titles)
+            yield f"Of {of} {which} comes nearest: {how} it explains {_share(second)}."
 
 
 def _large(summary: Mapping[str, Any]) -> str:
@@ -230,13 +244,14 @@ def _left(summary: Mapping[str, Any]) -> str:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         lead = "; the" if text else "The"
         share = f"{100 * best['gain']:.0f} %"
-        text += f"{lead} best remaining candidate, {name(best)}, would explain {share} of it"
+        which = called(name(best), sentences.titles(summary))
+        text += f"{lead} best remaining candidate, {which}, would explain {share} of it"
     return f"{text}." if text else ""
 
 
 def _next(summary: Mapping[str, Any]) -> Iterator[str]:
     for entry in summary.get("proposals", []):
-        yield " ".join(proposal_lines(entry)[1:2])
+        yield " ".join(proposal_lines(entry, sentences.titles(summary))[1:2])
 
 
 def _untried(summary: Mapping[str, Any]) -> str:

@@ -12,8 +12,10 @@ from typing import Any
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo.effects.titles import called
 from bayesoleo.errors import ResultsError
 from bayesoleo.plots import reading
+from bayesoleo.plots.rankings import chosen, name
 from bayesoleo.report import sections, sentences, tables
 from bayesoleo.report.case import case
 from bayesoleo.report.images import encode_formula
@@ -81,6 +83,7 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "attributes": tree.attrs,
         "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
         "headline": sentences.headline(summary),
+        "extended": sentences.added(summary),
         "unfinished": [*sentences.unfinished(summary), *drawing.failed],
         "role": sentences.role_shown(summary),
         "tiles": sentences.tiles(summary, units),
@@ -118,17 +121,26 @@ def _rounds(
     tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
 ) -> Iterator[dict[str, Any]]:
     """Table, figure and decision of every round."""
+    titles = sentences.titles(summary)
     for number, entry in enumerate(summary["rounds"]):
         yield {
-            "accepted": entry["accepted"],
-            "reason": sentences.reason(entry),
-            "table": tables.candidates(entry) if entry["candidates"] else None,
-            "failed": tables.failed(entry),
+            "accepted": _accepted(entry, titles),
+            "reason": sentences.reason(entry, titles),
+            "table": tables.candidates(entry, titles) if entry["candidates"] else None,
+            "failed": tables.failed(entry, titles),
             "figures": [
                 *drawing.of("the ranking", partial(sections.ranking_figure, tree, number)),
                 *drawing.of("the curve", partial(sections.unnamed_figure, tree, entry)),
             ],
         }
+
+
+def _accepted(entry: dict[str, Any], titles: dict[str, str]) -> str:
+    """What a round added, as it is called; nothing where it added nothing."""
+    if not entry["accepted"]:
+        return ""
+    added = chosen(entry)
+    return called(entry["accepted"] if added is None else name(added), titles)
 
 
 def _proposals(
@@ -137,8 +149,8 @@ def _proposals(
     """Sentences, table and figure for each set of effects that is left to be told apart."""
     for entry in summary.get("proposals", []):
         yield {
-            "lines": proposal_lines(entry),
-            "table": proposal_table(entry),
+            "lines": proposal_lines(entry, sentences.titles(summary)),
+            "table": proposal_table(entry, sentences.titles(summary)),
             "figures": drawing.of("the next run", partial(sections.proposal_figure, tree, entry)),
         }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayesoleo.effects.titles import called, listed
 from bayesoleo.plots.units import Scale, engineering
 from bayesoleo.report.tables import Table, format_short
 
@@ -12,14 +13,17 @@ from bayesoleo.report.tables import Table, format_short
 MOST_PAIRS = 3
 
 
-def proposal_lines(entry: Mapping[str, Any]) -> list[str]:
+def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> list[str]:
     """What one entry of the summary's ``proposals`` says, sentence by sentence.
 
     Parameters
     ----------
     entry : mapping
         As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
     """
+    entry = _with_titles(entry, titles or {})
     lines = [_question(entry)]
     if entry["runs"]:
         lines += _answer(entry)
@@ -33,7 +37,29 @@ def proposal_lines(entry: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def proposal_table(entry: Mapping[str, Any]) -> Table | None:
+def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:
+    """The entry with rivals as they are called."""
+
+    def words(names: Sequence[str]) -> list[str]:
+        return [called(one, titles) for one in names]
+
+    def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        return {**found, "pairs": [{**p, "rivals": words(p["rivals"])} for p in found["pairs"]]}
+
+    return {
+        **entry,
+        "rivals": words(entry["rivals"]),
+        "runs": [run(one) for one in entry["runs"]],
+        "repeat": run(entry["repeat"]),
+        "inseparable": [words(pair) for pair in entry["inseparable"]],
+    }
+
+
+def proposal_table(
+    entry: Mapping[str, Any], titles: Mapping[str, str] | None = None
+) -> Table | None:
     """The runs that would tell most, the best first, and the best one of those made.
 
     None where there is nothing to choose.
@@ -42,9 +68,12 @@ def proposal_table(entry: Mapping[str, Any]) -> Table | None:
     ----------
     entry : mapping
         As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
     """
     if not entry["runs"] or _all_alike(entry):
         return None
+    entry = _with_titles(entry, titles or {})
     scale = _scale(entry)
     unit = f" [{scale.unit}]" if scale.unit else ""
     pairs = entry["runs"][0]["pairs"]
@@ -84,10 +113,10 @@ def _scale(entry: Mapping[str, Any]) -> Scale:
 
 
 def _question(entry: Mapping[str, Any]) -> str:
-    names = _listed(entry["rivals"])
+    names = listed(entry["rivals"])
     if entry["question"] == "indistinguishable":
         first, *others = entry["rivals"]
-        return f"These data cannot tell {first}, which was added, from {_listed(others)}."
+        return f"These data cannot tell {first}, which was added, from {listed(others)}."
     if entry["question"] == "open":
         return f"Each of {names} might be what is missing."
     return f"To be told apart: {names}."
@@ -103,7 +132,7 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
     pairs = [pair for pair in best["pairs"] if pair["rivals"] not in apart]
     weakest = min(pair["sigma"] for pair in pairs)
     two = len(entry["rivals"]) == 2
-    whom = _listed(entry["rivals"], " from ") if two else "each pair of them"
+    whom = listed(entry["rivals"], " from ") if two else "each pair of them"
     if apart:
         whom = "the others"
     least = "" if two else "at least "
@@ -115,7 +144,7 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
     lines = [f"{text}."]
     for pair in apart:
         lines.append(
-            f"No run within the limits of the rig separates {_listed(pair, ' from ')} by one"
+            f"No run within the limits of the rig separates {listed(pair, ' from ')} by one"
             " standard deviation."
         )
     return lines
@@ -124,7 +153,3 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
 def _all_alike(entry: Mapping[str, Any]) -> bool:
     """Whether no pair is separated by any run, so that there is nothing to choose."""
     return len(entry["inseparable"]) == len(entry["runs"][0]["pairs"])
-
-
-def _listed(names: Sequence[str], last: str = " and ") -> str:
-    return last.join(part for part in (", ".join(names[:-1]), names[-1]) if part)

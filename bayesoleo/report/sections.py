@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from bayesoleo import plots, schema
 from bayesoleo.assessment.whereabouts import whereabouts
+from bayesoleo.effects.titles import called, listed
 from bayesoleo.errors import InputError
 from bayesoleo.plots import reading
 from bayesoleo.plots.residuals import Against
@@ -145,10 +146,11 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
     rounds = [int(number) for number in group[schema.ROUND].values]
     if entry["round"] not in rounds:
         return []
+    titles = reading.summary(tree).get("titles", {})
+    rivals = listed([called(one, titles) for one in entry["rivals"]])
     caption = (
         "Standard deviations by which a run would separate the least separated pair of "
-        f"{', '.join(entry['rivals'])}, at the mean position that is best for it. Where it is "
-        "blank the rig cannot go."
+        f"{rivals}, at the mean position that is best for it. Where it is blank the rig cannot go."
     )
     return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 

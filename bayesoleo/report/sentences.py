@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from bayesoleo import schema
-from bayesoleo.effects.unnamed import FAMILY
-from bayesoleo.plots.rankings import format_p, name
+from bayesoleo.effects.titles import PROPER, called, listed, titles_for, with_titles
+from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
 from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
@@ -17,6 +17,8 @@ from bayesoleo.tracing.deciding.rounds import LEVEL
 
 FLOOR = 1.15
 """A ratio of repeating error to noise below which a run is taken to be explained."""
+#: What an error comes down to where nothing is missing, and what it is measured by.
+FLOOR_WORDS, EXPECTED_WORDS = "its noise", "its noise"
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -25,18 +27,105 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 
 
 def headline(summary: Mapping[str, Any]) -> str:
-    """The verdict as a sentence."""
-    names = _told_apart(summary)
-    found = " and ".join([part for part in (", ".join(names[:-1]), *names[-1:]) if part])
-    lacked = "an effect" if len(summary["effects"]) == 1 else "effects"
-    if summary["verdict"] == schema.NOTHING_MISSING:
-        return "Nothing is missing: the model explains the measurements down to their noise."
-    if summary["verdict"] == schema.EFFECT_ADDED:
-        return f"The model lacked {lacked}: {found} found and added."
-    rest = _unexplained(summary["rounds"][-1])
-    if found:
-        return f"The model lacked {lacked}: {found} added, but an error remains{rest}."
-    return f"Something is missing{rest}."
+    """The result as a sentence, which begins with how sure it is."""
+    broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))
+    return f"Unfinished, the search broke off. {_said(summary)}" if broken else _said(summary)
+
+
+def _said(summary: Mapping[str, Any]) -> str:
+    sure, found = certainty(summary), added(summary)
+    was = "was" if len(summary["effects"]) == 1 else "were"
+    if sure is None:
+        if summary["verdict"] == schema.NOTHING_MISSING:
+            return f"Nothing is missing: the model explains the measurements down to {FLOOR_WORDS}."
+        return f"Something is missing: {_size_left(summary)}{_unexplained(summary)}."
+    down = f"the error is then down to {FLOOR_WORDS}"
+    if sure == schema.CERTAIN:
+        return f"Certain: {found} {was} missing; {down}."
+    if sure == schema.PROBABLE:
+        return f"Probable: {found} {was} missing; {down}.{_class(summary)}"
+    if sure == schema.NO_CAUSE:
+        return f"No cause is named: {found} {was} added; {down}.{_class(summary)}"
+    return (
+        f"A likeness only: {found} {was} added, and {_size_left(summary)}{_unexplained(summary)}."
+    )
+
+
+def certainty(summary: Mapping[str, Any]) -> str | None:
+    """How sure the names of the added effects are.
+
+    Of results that were stored without an answer it follows from what they hold.
+    """
+    if not summary["effects"]:
+        return None
+    if "certainty" in summary:
+        return str(summary["certainty"])
+    if summary["verdict"] == schema.UNEXPLAINED:
+        return schema.LIKENESS
+    return schema.CERTAIN if summary.get("certain") else schema.PROBABLE
+
+
+def titles(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Titles of effects by id, as far as the summary says them."""
+    return dict(summary.get("titles", {}))
+
+
+def added(summary: Mapping[str, Any]) -> str:
+    """What was added, by title, each with its place where that is known."""
+    effects = list(summary["effects"])
+    places = list(summary.get("targets", [])) or [""] * len(effects)
+    names = [
+        f"{one} @ {place}" if place else one for one, place in zip(effects, places, strict=True)
+    ]
+    return listed([called(name, titles(summary)) for name in names])
+
+
+def _class(summary: Mapping[str, Any]) -> str:
+    """What these data cannot tell from what was added."""
+    texts = []
+    for one in accepted(summary):
+        alike = [called(other, titles(summary)) for other in one["indistinguishable_from"]]
+        if alike:
+            own = "it" if len(summary["effects"]) == 1 else called(name(one), titles(summary))
+            texts.append(f"{own} from {listed(alike, ' or ')}")
+    if texts:
+        return f" These data cannot tell {'; '.join(texts)}."
+    if certainty(summary) == schema.NO_CAUSE or len(summary["effects"]) > 1:
+        return ""
+    return " Nothing else that was tried explains as much, but something that was not may."
+
+
+def accepted(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The candidates that were added and stayed, in order."""
+    found = (chosen(entry) for entry in summary["rounds"])
+    return [one for one in found if one is not None and one["effect"] in summary["effects"]]
+
+
+def ratio(errors: Mapping[str, Any]) -> float | None:
+    """Error over what is expected of it: the noise, and what is not known of the parameters."""
+    value = errors.get("ratio_to_expected", errors["ratio_to_noise"])
+    return None if value is None else float(value)
+
+
+def _size_left(summary: Mapping[str, Any]) -> str:
+    """How large the error is that remains: of an output over all runs of a role, or in one run
+    where that alone is too large."""
+    pooled = {
+        f"{output} on the {role} runs": ratio(errors)
+        for role, outputs in summary["error_after"].items()
+        for output, errors in outputs.items()
+    }
+    single = {
+        f"{output} in run {run}": ratio(errors)
+        for output, runs in summary["rounds"][-1]["error"].items()
+        for run, errors in runs.items()
+    }
+    for found in (pooled, single):
+        known = {where: value for where, value in found.items() if value is not None}
+        where = max(known, key=lambda one: known[one], default="")
+        if where and (known[where] > FLOOR or found is single):
+            return f"the error of {where} is {format_short(known[where])} times {EXPECTED_WORDS}"
+    return "an error is left"
 
 
 def unfinished(summary: Mapping[str, Any]) -> list[str]:
@@ -47,37 +136,24 @@ def unfinished(summary: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _told_apart(summary: Mapping[str, Any]) -> list[str]:
-    """What was added, by name; one that was added at several places with each of them."""
-    effects, names = list(summary["effects"]), list[str]()
-    for k, effect in enumerate(effects):
-        rounds = [item for item in summary["rounds"] if item.get("accepted") == effect]
-        # Of one that was taken out again at one place it is not known here which.
-        several = len(rounds) == effects.count(effect) > 1
-        place = f" @ {rounds[effects[:k].count(effect)]['accepted_target']}" if several else ""
-        names.append(_called(effect) + place)
-    return names
-
-
-def _called(effect: str) -> str:
-    """An effect's id; of one without a name it must not pass for a name."""
-    return f"one without a name ({effect})" if effect.startswith(f"{FAMILY}_") else effect
-
-
-def _unexplained(last: Mapping[str, Any]) -> str:
+def _unexplained(summary: Mapping[str, Any]) -> str:
     """What the catalogue has to say to an error that remains, as the end of a sentence."""
+    last = summary["rounds"][-1]
     open_ = [
         c
         for c in last["candidates"]
         if c["p_value"] is not None and c["p_value"] < LEVEL and c["gain"] >= LEAST_SHARE
     ]
+    if not last["candidates"]:
+        return ""
     if not open_:
-        return " that no effect in the catalogue explains"
+        return "; no effect in the catalogue explains it"
     best = max(open_, key=lambda candidate: candidate["gain"])
+    nearest = called(name(best), titles(summary))
     if any(c.get("estimated") for c in last["candidates"]):
-        return f", and no effect was confirmed; the nearest is {name(best)}"
+        return f"; no further effect was confirmed, the nearest is {nearest}"
     share = f"{100 * best['gain']:.0f} %"
-    return f"; {name(best)} would explain {share} of the excess, and was not tried"
+    return f"; {nearest} would explain {share} of the excess, and was not tried"
 
 
 def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:
@@ -105,15 +181,20 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
     return shown
 
 
-def reason(entry: Mapping[str, Any]) -> str:
-    """Why a round ended as it did, as a sentence; an id at its start stays as it is written."""
+def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:
+    """Why a round ended as it did, as a sentence.
+
+    Parameters
+    ----------
+    entry : mapping
+        A round of the summary.
+    known : mapping of str to str, optional
+        Titles of effects by id, for results that were stored with ids.
+    """
     text = entry["reason"].strip().rstrip(".")
-    if not text:
-        return ""
-    first = text.split()[0]
-    ids = {str(entry["accepted"])}
-    ids |= {str(c[key]) for c in entry["candidates"] for key in ("effect", "target")}
-    return f"{text if first in ids or '_' in first else text[0].upper() + text[1:]}."
+    ids = [str(c["effect"]) for c in entry["candidates"]]
+    text = with_titles(text, titles_for(ids, known or {}))
+    return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 def stability(summary: Mapping[str, Any]) -> str:
@@ -148,12 +229,22 @@ def remainder(summary: Mapping[str, Any]) -> list[str]:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         p = format_p(best["p_value"])
         share = f"{100 * best['gain']:.1f} %".replace("-", "−")
-        text = f"The best remaining candidate, {name(best)}, would explain {share} of the excess"
+        which = called(name(best), titles(summary))
+        text = f"The best remaining candidate, {which}, would explain {share} of the excess"
         lines.append(f"{text} ({p})." if p else f"{text}.")
     if last["reason"]:
-        reason = last["reason"].rstrip(".")
-        lines.append(f"The search ended because {reason}." if len(reason) > 1 else "")
+        lines.append(f"The search ended: {_small(reason(last, titles(summary)))}")
     return [line for line in lines if line]
+
+
+def begin(text: str) -> str:
+    """Text as the beginning of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
+def _small(sentence: str) -> str:
+    """A sentence after a colon: with a small first letter, but for names."""
+    return sentence if sentence.split()[0] in PROPER else sentence[0].lower() + sentence[1:]
 
 
 def _above_floor(output: str, runs: Mapping[str, Any]) -> str:

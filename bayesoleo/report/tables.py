@@ -11,8 +11,9 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo.effects.titles import called, listed, titles_for, with_titles
 from bayesoleo.plots import reading
-from bayesoleo.plots.rankings import chosen, format_p, name
+from bayesoleo.plots.rankings import chosen, format_p, title
 from bayesoleo.plots.units import Scale, engineering, format_number, format_value
 from bayesoleo.solvers.status import counted
 
@@ -48,6 +49,7 @@ class Table:
     """Head and rows of text; ``words`` leading columns hold words, the others numbers.
 
     Of many rows the first ``lead`` are shown, the rest when asked for; all of them if it is None.
+    Columns in ``code`` hold what is typed as it stands.
     """
 
     head: list[str]
@@ -55,6 +57,7 @@ class Table:
     words: int = 1
     marked: frozenset[int] = frozenset()
     lead: int | None = None
+    code: frozenset[int] = frozenset()
 
 
 def output_units(tree: xr.DataTree, summary: Mapping[str, Any]) -> dict[str, str]:
@@ -141,31 +144,46 @@ def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[s
     return tables
 
 
-def candidates(entry: Mapping[str, Any]) -> Table:
-    """All candidates of a round, the best first."""
+def candidates(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> Table:
+    """All candidates of a round, the best first; ids stand beside titles, for options ask for them.
+
+    Parameters
+    ----------
+    entry : mapping
+        A round of the summary.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
+    """
+    titles = titles or {}
     ranked = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
     rows = [
         [
-            name(candidate),
+            title(candidate),
+            candidate["effect"],
             candidate["family"],
             f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
             format_p(candidate["p_value"]).removeprefix("p ").removeprefix("= "),
             expected_text(candidate["expected"], candidate.get("expected_units")),
-            ", ".join(candidate["indistinguishable_from"]),
+            listed([called(other, titles) for other in candidate["indistinguishable_from"]], ", "),
         ]
         for candidate in ranked
     ]
-    head = ["effect", "family", "share", "p", "expected", "not distinguishable from"]
+    head = ["effect", "id", "family", "share", "p", "expected", "not distinguishable from"]
     accepted = chosen(entry)
     marked = frozenset(i for i, c in enumerate(ranked) if c is accepted)
     if not any(row[-1] for row in rows):
         head, rows = head[:-1], [row[:-1] for row in rows]
-    return Table(head, rows, 2, marked, LEADING_CANDIDATES)
+    return Table(head, rows, 3, marked, LEADING_CANDIDATES, code=frozenset({1}))
 
 
-def failed(entry: Mapping[str, Any]) -> Table | None:
+def failed(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> Table | None:
     """Candidates of a round that have no score, with the reason; None where all have one."""
-    rows = [[label, reason] for label, reason in entry.get("failed", {}).items()]
+    rows = []
+    for label, reason in entry.get("failed", {}).items():
+        effect, _, place = label.partition(" at ")
+        known = titles_for([effect], titles or {})
+        which = f"{known.get(effect, effect)} ({place})" if place else known.get(effect, effect)
+        rows.append([which, with_titles(reason, known)])
     return Table(["effect", "why it has no score"], sorted(rows), 2) if rows else None
 
 

@@ -10,6 +10,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from bayesoleo import schema
+from bayesoleo.effects.titles import called, listed
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report import sentences, tables
 from bayesoleo.report.proposals import proposal_lines
@@ -31,6 +32,7 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     console : rich.console.Console
         Where to print. Labels of users are printed as they are, not as markup.
     """
+    titles = sentences.titles(summary)
     console.print()
     console.print(Text(sentences.headline(summary), style=f"bold {COLOURS[summary['verdict']]}"))
     for line in sentences.unfinished(summary):
@@ -40,11 +42,11 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
         if entry["accepted"]:
             stayed = entry["accepted"] in summary["effects"]
             later = Text("" if stayed else "; it was taken out again later", style="dim")
-            console.print(_accepted(number, entry) + later)
+            console.print(_accepted(number, entry, titles) + later)
     for line in sentences.remainder(summary):
         console.print(Text(line, style="dim"))
     for entry in summary.get("proposals", []):
-        console.print(Text(" ".join(proposal_lines(entry)[:2]), style="dim"))
+        console.print(Text(" ".join(proposal_lines(entry, titles)[:2]), style="dim"))
     for line in _warnings(summary):
         console.print(Text(line, style="yellow"))
     files = summary.get("files", {})
@@ -73,21 +75,22 @@ def _errors(summary: Mapping[str, Any]) -> RichTable:
     return table
 
 
-def _accepted(number: int, entry: Mapping[str, Any]) -> Text:
+def _accepted(number: int, entry: Mapping[str, Any], titles: Mapping[str, str]) -> Text:
     """The effect that a round added, and what cannot be told from it."""
     added = chosen(entry)
     if added is None:
-        return Text(f"Round {number}: {entry['accepted']} added")
+        return Text(f"Round {number}: {called(entry['accepted'], titles)} added")
     p = format_p(added["p_value"])
     share = f"{100 * added['gain']:.0f} % of the excess"
-    text = Text.assemble(f"Round {number}: ", (name(added), "bold"), f" explains {share}")
+    which = called(name(added), titles)
+    text = Text.assemble(f"Round {number}: ", (which, "bold"), f" explains {share}")
     if p:
         text.append(f", {p}")
-    others = added["indistinguishable_from"]
+    others = [called(other, titles) for other in added["indistinguishable_from"]]
     if others:
-        text.append(f"; these data cannot tell it from {', '.join(others)}", style="dim")
+        text.append(f"; these data cannot tell it from {listed(others, ' or ')}", style="dim")
     near = added.get("closest", [])
     if near:
-        first = f"{near[0]['effect']} (cosine {near[0]['cosine']:.2f})"
+        first = f"{called(near[0]['effect'], titles)} (cosine {near[0]['cosine']:.2f})"
         text.append(f"; it has no name, and is most like {first}", style="dim")
     return text

@@ -13,7 +13,7 @@ from bayesoleo.data import findings
 from bayesoleo.errors import BayesoleoError
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, compare
-from bayesoleo.report import write_plain_report, write_report
+from bayesoleo.report import headline, write_plain_report, write_report
 from bayesoleo.storage import provenance, read_tree
 from bayesoleo.systems import equations, equations_latex
 from bayesoleo.tracing.deciding.loop import ClosedLoop
@@ -126,6 +126,7 @@ def result_tree(
     summary["notes"] = [*summary["notes"], *findings(task.reduced.records, task.campaign.units)]
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     summary[schema.UNFINISHED] = list(stages.failed)
+    summary["headline"] = headline(summary)
     return finish(task, groups, fit, summary), summary
 
 

@@ -194,7 +194,7 @@ def test_close_hands_over_what_was_asked(run, campaign, model, made_up, monkeypa
     )
     assert settings.without == ("humming_force", "unnamed")
     assert not settings.unnamed
-    assert "Stribeck_friction" in result.stdout
+    assert "Stribeck friction" in result.stdout
     assert "working" in result.stderr
 
 

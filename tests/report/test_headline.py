@@ -1,28 +1,122 @@
-"""The verdict as a sentence tells apart what was added at several places."""
+"""The first line says how sure it is, and calls effects by their titles."""
 
 from __future__ import annotations
 
+import itertools
+
+import pytest
+
 from bayesoleo import schema
+from bayesoleo.effects import catalogue
+from bayesoleo.effects.titles import called, in_sentence, with_titles
+from bayesoleo.report import sentences
 from bayesoleo.report.sentences import headline
 
 
-def told(effects, accepted):
-    rounds = [{"accepted": name, "accepted_target": place} for name, place in accepted]
-    summary = {"effects": effects, "rounds": rounds, "verdict": schema.EFFECT_ADDED}
-    return headline(summary)
+def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, **more):
+    """The headline of effects, each ``id @ target``."""
+    pairs = [name.split(" @ ") for name in names]
+    ranked = {name: [candidate(*name.split(" @ "), alike)] for name in names}
+    entries = [
+        {"accepted": effect, "accepted_target": place, "candidates": ranked[f"{effect} @ {place}"]}
+        for effect, place in pairs
+    ]
+    errors = {"ratio_to_noise": ratio, "repeating": 1.0, "rms": 1.0}
+    last = {"accepted": None, "candidates": [], "error": {"force": {"a": errors}}}
+    summary = {
+        "effects": [effect for effect, _ in pairs],
+        "targets": [place for _, place in pairs],
+        "rounds": [*entries, last],
+        "verdict": verdict,
+        "certainty": sure,
+        "error_after": {"hold-out": {"force": errors}},
+    }
+    return headline(summary | more)
 
 
-def test_an_effect_added_at_two_places_is_told_with_both():
-    text = told(
-        ["varies_by_run", "stribeck_friction", "varies_by_run"],
-        [("varies_by_run", "orifice"), ("stribeck_friction", "stroke"), ("varies_by_run", "area")],
+def candidate(effect, place, alike):
+    return {
+        "effect": effect, "target": place, "gain": 0.9, "p_value": 1e-9,
+        "indistinguishable_from": list(alike),
+    }  # fmt: skip
+
+
+def test_each_certainty_has_its_word():
+    one = ["coulomb_friction @ stroke"]
+    down = "was missing; the error is then down to"
+    assert told(one, schema.CERTAIN).startswith(f"Certain: Coulomb friction (stroke) {down}")
+    assert told(one, schema.PROBABLE).startswith(f"Probable: Coulomb friction (stroke) {down}")
+    assert "something that was not may" in told(one, schema.PROBABLE)
+    left = told(one, schema.LIKENESS, ratio=13.6)
+    assert left.startswith("A likeness only: Coulomb friction (stroke) was added, and the error of")
+    assert "force on the hold-out runs is 13.6 times" in left
+    none = told(["unnamed_stroke @ force"], schema.NO_CAUSE,
+                titles={"unnamed_stroke": "Unnamed: a smooth function of stroke"})  # fmt: skip
+    assert none.startswith("No cause is named: a smooth function of stroke (force) was added; ")
+
+
+def test_a_class_is_said_with_titles():
+    text = told(["coulomb_friction @ stroke"], schema.PROBABLE,
+                alike=["stribeck_friction", "coulomb_friction @ arm"])  # fmt: skip
+    assert text.endswith(
+        "These data cannot tell it from breakaway friction or Coulomb friction (arm)."
     )
-    names = "varies_by_run @ orifice, stribeck_friction and varies_by_run @ area"
-    assert text == f"The model lacked effects: {names} found and added."
 
 
-def test_a_place_that_is_not_sure_is_not_told():
-    accepted = [("varies_by_run", place) for place in ("orifice", "area", "volume")]
-    text = told(["varies_by_run", "varies_by_run"], accepted)
-    assert text == "The model lacked effects: varies_by_run and varies_by_run found and added."
-    assert "varies_by_run found" in told(["varies_by_run"], accepted[:1])
+def test_four_false_names_are_no_finding():
+    names = ["coulomb_friction @ x", "sensor_lag @ force", "cubic_stiffness @ x", "play @ x"]
+    text = told(names, schema.LIKENESS, ratio=13.6, verdict=schema.UNEXPLAINED)
+    assert text.startswith("A likeness only: Coulomb friction (x); lag of a sensor, channels")
+    assert " and play (x) were added, and the error of force" in text
+
+
+def test_a_search_that_broke_off_is_said_first():
+    broken = [{"stage": "search", "reason": "NameError: x"}]
+    text = told(["play @ x"], schema.PROBABLE, unfinished=broken)
+    assert text.startswith("Unfinished, the search broke off. Probable: play (x) was missing")
+    late = [{"stage": "posterior", "reason": "NameError: x"}]
+    assert told(["play @ x"], schema.PROBABLE, unfinished=late).startswith("Probable: ")
+
+
+def test_a_run_that_alone_is_too_large_is_named():
+    text = told([], None, ratio=1.1, verdict=schema.UNEXPLAINED)
+    assert text == "Something is missing: the error of force in run a is 1.10 times its noise."
+
+
+def test_what_is_expected_is_taken_before_the_noise():
+    assert sentences.ratio({"ratio_to_noise": 5.4, "ratio_to_expected": 0.9}) == 0.9
+    assert sentences.ratio({"ratio_to_noise": 5.4}) == 5.4
+
+
+@pytest.mark.parametrize("sure", [*schema.CERTAINTIES, None])
+def test_no_id_stands_where_a_title_belongs(sure):
+    """Of all effects of the catalogue, added and alike."""
+    ids = [effect.id for effect in catalogue() if "_" in effect.id]
+    for one, other in itertools.pairwise(ids):
+        names = [] if sure is None else [f"{one} @ stroke"]
+        verdict = schema.UNEXPLAINED if sure in (None, schema.LIKENESS) else schema.EFFECT_ADDED
+        text = told(names, sure, alike=[other], ratio=2.0, verdict=verdict)
+        assert "_" not in text
+
+
+def test_titles_read_as_parts_of_sentences():
+    names = [in_sentence(effect.title) for effect in catalogue()]
+    assert len(set(names)) == len(names)
+    assert not any("(" in name or ":" in name for name in names)
+    assert called("play @ arm", {}) == "play (arm)"
+    assert called("my_own_law", {}) == "my own law"
+    assert in_sentence("PWM force") == "PWM force"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("sensor_lag explains 4 %", "lag explains 4 %"),
+        ("sensor_lag @ force, and play", "lag (force), and play"),
+        ("sensor_lag_2 and my_sensor_lag", "sensor_lag_2 and my_sensor_lag"),
+        ("at sensor_lag[run 3]", "at sensor_lag[run 3]"),
+        ("stands instead of play and sensor_lag:", "stands instead of play and lag:"),
+    ],
+)
+def test_ids_in_sentences_become_titles(text, said):
+    assert with_titles(text, {"sensor_lag": "Lag", "play": "Play: no stiffness"}) == said

@@ -44,7 +44,7 @@ def without(tree, *names):
 
 def test_the_page_makes_its_case(page):
     for text in (
-        "The model lacked an effect: Stribeck_friction found and added.",
+        "Probable: Stribeck friction was missing; ",
         "9.04 → 1.06",
         "Figure 17.",
         "Residual of pressure against stroke",
@@ -125,15 +125,16 @@ def test_the_page_of_a_stored_result_is_the_same(two_runs, tmp_path):
 @pytest.mark.parametrize(
     ("effects", "text"),
     [
-        ([], "Something is missing that no effect in the catalogue explains."),
-        (["wall"], "The model lacked an effect: wall added, but an error remains"),
-        (["wall", "lag"], "The model lacked effects: wall and lag added, but an error remains"),
+        ([], "missing: the error of voltage on the fit runs is 2.50 times its noise."),
+        (["wall"], "A likeness only: wall was added, and the error of voltage on the fit runs is"),
+        (["wall", "lag"], "A likeness only: wall and lag were added, and the error of voltage"),
     ],
 )
 def test_an_unexplained_remainder_is_said(two_runs, effects, text):
     tree = two_runs.copy()
     summary = json.loads(tree.attrs["summary"])
     summary.update(verdict=schema.UNEXPLAINED, effects=effects)
+    summary["error_after"]["fit"]["voltage"]["ratio_to_noise"] = 2.5
     tree.attrs["summary"] = json.dumps(summary)
     assert text in render_report(tree)
 
@@ -141,10 +142,10 @@ def test_an_unexplained_remainder_is_said(two_runs, effects, text):
 @pytest.mark.parametrize(
     ("estimated", "p_value", "gain", "text"),
     [
-        (False, 1e-6, 0.89, "missing; cubic @ strut would explain 89 % of the excess, and was not"),
-        (True, 1e-6, 0.89, "missing, and no effect was confirmed; the nearest is cubic @ strut."),
-        (False, 0.2, 0.89, "missing that no effect in the catalogue explains."),
-        (False, 1e-6, 0.01, "missing that no effect in the catalogue explains."),
+        (False, 1e-6, 0.89, "; cubic (strut) would explain 89 % of the excess, and was not tried."),
+        (True, 1e-6, 0.89, "; no further effect was confirmed, the nearest is cubic (strut)."),
+        (False, 0.2, 0.89, "; no effect in the catalogue explains it."),
+        (False, 1e-6, 0.01, "; no effect in the catalogue explains it."),
     ],
 )
 def test_a_candidate_that_stands_open_is_not_denied(two_runs, estimated, p_value, gain, text):
@@ -175,10 +176,13 @@ def test_diagnostics_by_parameter_are_rounded_and_empty_rows_left_out(synthetic)
     assert rows["effective size asked for reached"] == "yes"
 
 
-def test_an_id_at_the_start_of_a_sentence_stays_as_written():
+def test_a_reason_begins_with_a_title_and_not_with_an_id():
     entry = {"accepted": None, "candidates": [{"effect": "play", "target": None}]}
-    assert reason(entry | {"reason": "play explains 4 %"}) == "play explains 4 %."
+    assert reason(entry | {"reason": "play explains 4 %"}) == "Play explains 4 %."
     assert reason(entry | {"reason": "no effect is significant"}) == "No effect is significant."
+    mine = {"accepted": None, "candidates": [{"effect": "my_law", "target": "stroke"}]}
+    told = reason(mine | {"reason": "my_law explains 4 %"}, {"my_law": "Law of mine (new)"})
+    assert told == "Law of mine explains 4 %."
 
 
 def test_a_tree_without_summary():

@@ -20,10 +20,10 @@ def test_error_effect_and_files(oleo):
     summary = json.loads(oleo.attrs["summary"])
     summary["files"] = {"report": "out/[red]report.html"}
     text = printed(summary)
-    assert "Stribeck_friction found and added." in text
+    assert "Probable: Stribeck friction was missing; " in text
     assert "63.9 → 7.48" in text
     assert "94 % of the excess, p < 0.001" in text
-    assert "cannot tell it from Dahl_friction" in text
+    assert "cannot tell it from Dahl friction" in text
     assert "out/[red]report.html" in text
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from bayesoleo import schema
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding.beam import best_of_beam
@@ -18,6 +17,7 @@ from bayesoleo.tracing.deciding.review import reviewed
 from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
+from bayesoleo.tracing.deciding.verdict import certainty_of, verdict_of
 from bayesoleo.tracing.errors.same_noise import least_noise
 from bayesoleo.tracing.fitting.assembly import Assembly, Step
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
@@ -25,9 +25,8 @@ from bayesoleo.tracing.fitting.restart import better_start
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.significance import SAME
 
-#: Part of the excess that added effects must explain for the loop to call the model's lack found:
-#: what is left is then less than a third of what there was, in size.
-MOSTLY = 0.9
+#: How a note begins that names parameters.
+ON_LIMIT = "at the limit of their prior's support"
 
 Say = Callable[[str], None]
 
@@ -45,6 +44,8 @@ class ClosedLoop:
     roles : Roles
     notes : tuple of str
         What a reader should know.
+    complete : bool
+        Whether the search came to its end.
     """
 
     rounds: tuple[Round, ...]
@@ -52,6 +53,7 @@ class ClosedLoop:
     final: State
     roles: Roles
     notes: tuple[str, ...]
+    complete: bool = True
 
     @property
     def added(self) -> tuple[tuple[str, str], ...]:
@@ -71,13 +73,12 @@ class ClosedLoop:
     @property
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
-        if not self.effects:
-            nothing = self.final.at_floor and not self.final.too_quiet
-            return schema.NOTHING_MISSING if nothing else schema.UNEXPLAINED
-        if self.final.at_floor:
-            return schema.EFFECT_ADDED
-        explained = 1.0 - _excess(self.final) / max(_excess(self.first), 1e-300)
-        return schema.EFFECT_ADDED if explained > MOSTLY else schema.UNEXPLAINED
+        return verdict_of(self.rounds, self.first, self.final)
+
+    @property
+    def certainty(self) -> str | None:
+        """How sure the names of the added effects are, in one word; None where none was added."""
+        return certainty_of(self.final, self.certain)
 
     @property
     def certain(self) -> bool:
@@ -87,6 +88,8 @@ class ClosedLoop:
         tell it from all others of the catalogue, and it is large enough that one which merely
         resembles it would have left a significant remainder.
         """
+        if not self.complete:
+            return False
         accepted = [item.accepted for item in self.rounds if item.accepted]
         accepted = [item for item in accepted if (item.effect, item.target) in self.added]
         if len(self.added) != 1 or not accepted or not self.final.at_floor:
@@ -102,12 +105,6 @@ class ClosedLoop:
         local = -np.expm1(np.log1p(-LEVEL) / last.tests)
         fall = estimate.fall / estimate.inflation
         return bool((1.0 - SAME) * fall > stats.chi2.isf(local, 1))
-
-
-def _excess(state: State) -> float:
-    """Squared ratio to what is expected beyond one, of held-out runs where there are any."""
-    table = state.hold_errors if state.hold_errors.entries else state.fit_errors
-    return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
 
 
 def close_loop(
@@ -259,7 +256,9 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
             "intervals count independent noise only: while an error remains that repeats, they are"
             " too narrow"
         )
-    return ClosedLoop(progress.rounds, progress.first, state, roles, tuple(notes))
+    return ClosedLoop(
+        progress.rounds, progress.first, state, roles, tuple(notes), not progress.broken
+    )
 
 
 def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:
@@ -292,7 +291,7 @@ def _warnings(fit: Fit) -> list[str]:
             f"the estimate of the final model did not converge: {fit.point.status.message}"
         )
     if fit.point.on_limit:
-        found.append(f"at the limit of their prior's support: {', '.join(fit.point.on_limit)}")
+        found.append(f"{ON_LIMIT}: {', '.join(fit.point.on_limit)}")
     if not fit.shift <= 0.1:
         found.append(
             f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd"

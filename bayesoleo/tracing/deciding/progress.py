@@ -21,12 +21,15 @@ class Progress:
         Those that are finished.
     notes : tuple of str
         What a reader should know so far.
+    broken : bool
+        Whether it ended before a round found nothing more.
     """
 
     first: State
     state: State
     rounds: tuple[Round, ...] = ()
     notes: tuple[str, ...] = ()
+    broken: bool = False
 
     @property
     def finished(self) -> bool:
@@ -69,4 +72,4 @@ class Progress:
         if self.finished:
             return self
         last = Round(self.state, (), {}, None, None, reason, 1.0)
-        return replace(self, rounds=(*self.rounds, last))
+        return replace(self, rounds=(*self.rounds, last), broken=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -23,6 +23,7 @@ from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
 from bayesoleo.tracing.outcome.predictive import PHASES, predictive_group
 from bayesoleo.tracing.outcome.shapes import shape_group
+from bayesoleo.tracing.outcome.summary import titles_of, told
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ def loop_groups(
             [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
         ),
         schema.RESIDUAL: _residuals(loop),
-        schema.DISCOVERY: _discovery(loop.rounds),
+        schema.DISCOVERY: _discovery(loop.rounds, titles_of(loop)),
     }
     shape = shape_group(loop)
     if shape is not None:
@@ -254,7 +255,7 @@ def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
     }
 
 
-def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
+def _discovery(rounds: Sequence[Round], titles: Mapping[str, str]) -> xr.Dataset:
     keys = list(dict.fromkeys(_key(item) for entry in rounds for item in entry.ranking))
     shape = (len(rounds), len(keys))
     numbers = {name: np.full(shape, np.nan) for name in (schema.GAIN, schema.P_VALUE, schema.Z)}
@@ -285,7 +286,8 @@ def _discovery(rounds: Sequence[Round]) -> xr.Dataset:
     data[schema.ACCEPTED_TARGET] = xr.Variable(
         schema.ROUND, np.array([e.accepted.target if e.accepted else "" for e in rounds])
     )
-    data[schema.REASON] = xr.Variable(schema.ROUND, np.array([e.reason for e in rounds]))
+    reasons = [told(entry.reason, titles) for entry in rounds]
+    data[schema.REASON] = xr.Variable(schema.ROUND, np.array(reasons))
     first = rounds[0].before
     coords = {
         schema.ROUND: np.arange(1, len(rounds) + 1),

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo.effects.titles import titles_for, with_titles
 from bayesoleo.posterior import Samples
-from bayesoleo.tracing.deciding.loop import ClosedLoop
+from bayesoleo.tracing.deciding.loop import ON_LIMIT, ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State
 
@@ -33,10 +34,10 @@ def summarise(
     dict
         Checked against the schema.
     """
-    final, stability = loop.final, loop.final.stability
+    final, stability, titles = loop.final, loop.final.stability, titles_of(loop)
     summary = {
         **about,
-        "rounds": [_round(item) for item in loop.rounds],
+        "rounds": [_round(item, titles) for item in loop.rounds],
         "effects": list(loop.effects),
         "targets": list(loop.targets),
         "parameters": _parameters(final, samples),
@@ -44,6 +45,8 @@ def summarise(
         "error_after": final.by_role,
         "verdict": loop.verdict,
         "certain": loop.certain,
+        "certainty": loop.certainty,
+        "titles": titles,
         "hold_out": loop.roles.description,
         "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
         "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
@@ -53,7 +56,7 @@ def summarise(
             "posterior": None if samples is None else samples.branch_jumps,
         },
         "notes": [
-            *loop.notes,
+            *(told(note, titles) for note in loop.notes),
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
             *_input_noise_notes(final),
@@ -65,13 +68,30 @@ def summarise(
     return clean
 
 
-def _round(item: Round) -> dict[str, Any]:
+def titles_of(loop: ClosedLoop) -> dict[str, str]:
+    """Title of every effect that a loop names, by id."""
+    ranked = [item for entry in loop.rounds for item in entry.ranking]
+    steps = [item.score.option.assembly.steps[-1] for item in ranked]
+    own = {step.effect.id: step.effect.title for step in (*steps, *loop.final.assembly.steps)}
+    alike = (name for item in ranked for name in (*item.same, *(n for n, _ in item.closest)))
+    return titles_for([*own, *alike], own)
+
+
+def told(text: str, titles: Mapping[str, str]) -> str:
+    """A sentence about effects with their titles in place of their ids.
+
+    A note on parameters stays as it is: an effect's parameter may be called like the effect.
+    """
+    return text if text.startswith(ON_LIMIT) else with_titles(text, titles)
+
+
+def _round(item: Round, titles: Mapping[str, str]) -> dict[str, Any]:
     return {
         "error": item.before.errors.by_run(),
         "candidates": [_candidate(ranked) for ranked in item.ranking],
         "accepted": item.accepted.effect if item.accepted else None,
         "accepted_target": item.accepted.target if item.accepted else None,
-        "reason": item.reason,
+        "reason": told(item.reason, titles),
         "failed": dict(item.failed),
     }
 
@@ -84,6 +104,7 @@ def _candidate(ranked: Ranked) -> dict[str, Any]:
     near = [{"effect": effect, "cosine": cosine} for effect, cosine in ranked.closest]
     return {
         "effect": candidate.effect,
+        "title": score.option.assembly.steps[-1].effect.title,
         "target": candidate.target,
         "family": candidate.family,
         "gain": ranked.gain,
