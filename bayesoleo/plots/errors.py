@@ -15,11 +15,13 @@ from bayesoleo import schema
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
+#: What errors are divided by.
+_OF = {schema.RATIO_TO_EXPECTED: "expected", schema.RATIO_TO_NOISE: "noise"}
 LEFT, TOP, BOTTOM, ROW = 2.4, 0.85, 0.6, 0.3
 
 
 def error(tree: xr.DataTree) -> Figure:
-    """Repeating error over its noise for each run, before and after, one column for each output.
+    """Repeating error over what is expected for each run, before and after, a column each output.
 
     Parameters
     ----------
@@ -65,10 +67,10 @@ def _column(
     two: bool,
 ) -> None:
     """One output."""
-    ratios = [run[schema.RATIO_TO_NOISE] for runs in (first, last) for run in runs.values()]
-    key = schema.RATIO_TO_NOISE if any(ratio is not None for ratio in ratios) else schema.RMS
-    values = [run[key] for runs in (first, last) for run in runs.values() if run[key]]
-    factor, text = 1.0, "repeating error / noise"
+    entries = [run for runs in (first, last) for run in runs.values()]
+    key = _ratio_key(entries)
+    values = [run[key] for run in entries if run[key]]
+    factor, text = 1.0, f"repeating error / {_OF.get(key, '')}"
     if key == schema.RMS:
         scale = engineering(_unit(tree, output), max(values, default=0.0))
         factor, text = scale.factor, scale.label("rms")
@@ -83,6 +85,14 @@ def _column(
         _dumbbell(axes, row, pair[0], pair[1], two)
     _logarithmic(axes, factor * np.array(values or [1.0]))
     axes.set_xlabel(text, fontsize=style.TEXT)
+
+
+def _ratio_key(entries: list[dict[str, Any]]) -> str:
+    """What is shown: the ratio to what is expected, else to the noise, else the rms."""
+    for key in _OF:
+        if any(entry.get(key) is not None for entry in entries):
+            return key
+    return schema.RMS
 
 
 def _dumbbell(axes: Axes, row: int, before: float | None, after: float | None, two: bool) -> None:

@@ -16,8 +16,9 @@ from bayesoleo.errors import InputError
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report import sentences
 from bayesoleo.report.proposals import proposal_lines
-from bayesoleo.report.sentences import FLOOR, begin, role_shown
+from bayesoleo.report.sentences import begin, role_shown
 from bayesoleo.report.tables import error_scale, format_short, parameters
+from bayesoleo.report.yardstick import FLOOR, ratio, too_large, words
 
 #: A harmonic or a coordinate is named if it holds this part of the excess.
 WORTH_NAMING = 0.2
@@ -60,27 +61,26 @@ def case(
 
 
 def _wrong(summary: Mapping[str, Any]) -> str:
-    runs = _ratios(summary["rounds"][0])
-    if not runs:
+    errors = _errors(summary["rounds"][0])
+    if not errors:
         return "No run repeats, so that there is no noise to hold the error against."
-    worst, output, run = max(runs)
-    above = len({label for ratio, _, label in runs if ratio > FLOOR})
-    of = f"{above} of {len({label for _, _, label in runs})} runs"
-    what = (
-        f"the largest is the error of {output} in run {run}, {format_short(worst)} times its noise"
-    )
+    worst, output, run = max((ratio(error) or 0.0, output, run) for error, output, run in errors)
+    above = len({run for error, _, run in errors if too_large(error)})
+    times = f"{format_short(worst)} times {words(summary)}"
+    what = f"the largest is the error of {output} in run {run}, {times}"
     if not above:
-        return f"No: no error that repeats is above {FLOOR} times its noise; {what}."
-    return f"In {of} an error repeats that is more than {FLOOR} times its noise; {what}."
+        return f"No: no error repeats beyond what chance allows; {what}."
+    of = f"{above} of {len({run for *_, run in errors})} runs"
+    return f"In {of} an error repeats that is larger than chance allows; {what}."
 
 
-def _ratios(entry: Mapping[str, Any]) -> list[tuple[float, str, str]]:
-    """Ratio to the noise, output and run, of those that have one."""
+def _errors(entry: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], str, str]]:
+    """Errors that have a ratio, with output and run."""
     return [
-        (error["ratio_to_noise"], output, run)
+        (error, output, run)
         for output, runs in entry["error"].items()
         for run, error in runs.items()
-        if error["ratio_to_noise"] is not None
+        if ratio(error) is not None
     ]
 
 
@@ -136,13 +136,14 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
 _SURE = {
     schema.CERTAIN: (
         "Certain: it was added alone, nothing else is significant beside it, no other effect"
-        " explains as much, and what is left is noise."
+        " explains as much, and what is left is expected."
     ),
     schema.PROBABLE: (
         "Probable: it explains the data best of what was tried, which is not all there is."
     ),
     schema.LIKENESS: (
-        "A likeness only: more than noise is left, so that something else acts as well, or instead."
+        "A likeness only: more is left than expected, so that something else acts as well, or"
+        " instead."
     ),
     schema.NO_CAUSE: (
         "No cause is named: curves without a name, what varies by run and what repeats with the"
@@ -226,20 +227,18 @@ def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
             format_short(scale.factor * e[key]) for e in (first, last) if e[key] is not None
         )
         text = f"{output} {before} → {after} {scale.unit}".rstrip()
-        ratios = [format_short(e["ratio_to_noise"]) for e in (first, last)]
-        texts.append(
-            text + (f" ({' → '.join(ratios)} times the noise)" if last["ratio_to_noise"] else "")
-        )
+        ratios = " → ".join(format_short(ratio(e)) for e in (first, last))
+        texts.append(f"{text} ({ratios} times {words(summary)})" if ratio(last) else text)
     said = summary.get("hold_out", "")
     return f"On the {role} runs: {', '.join(texts)}{f' ({said})' if said else ''}."
 
 
 def _left(summary: Mapping[str, Any]) -> str:
     last = summary["rounds"][-1]
-    ratios, text = _ratios(last), ""
-    if ratios:
-        worst, output, run = max(ratios)
-        text = f"At most {format_short(worst)} times the noise, of {output} in run {run}"
+    errors, text = _errors(last), ""
+    if errors:
+        worst, output, run = max((ratio(e) or 0.0, output, run) for e, output, run in errors)
+        text = f"At most {format_short(worst)} times {words(summary)}, of {output} in run {run}"
     if last["candidates"]:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         lead = "; the" if text else "The"

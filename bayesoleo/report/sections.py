@@ -18,7 +18,7 @@ from bayesoleo.plots import reading
 from bayesoleo.plots.residuals import Against
 from bayesoleo.report.images import Image, encode_figure
 from bayesoleo.report.proposals import proposal_table
-from bayesoleo.report.sentences import FLOOR
+from bayesoleo.report.yardstick import FLOOR, words
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
 def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
     """The candidates of one round."""
     caption = (
-        f"Candidates of round {number + 1}: the share of the excess over the noise that each would "
+        f"Candidates of round {number + 1}: the share of the excess error that each would "
         "explain, and the probability of such a share if it were not there."
     )
     entry = reading.summary(tree)["rounds"][number]
@@ -170,9 +170,9 @@ def unnamed_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
 
 def error_figure(tree: xr.DataTree) -> list[Shown]:
     """The error of each run."""
+    of = words(reading.summary(tree)).replace("its noise", "the noise of its average")
     caption = (
-        "Repeating error of each run over the noise of its average, on a logarithmic axis. At 1 "
-        "nothing is missing."
+        f"Repeating error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
     )
     return _drawn([(lambda: plots.error(tree), caption)])
 

@@ -12,13 +12,9 @@ from bayesoleo.effects.titles import PROPER, called, listed, titles_for, with_ti
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
+from bayesoleo.report.yardstick import ratio, too_large, words
 from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
 from bayesoleo.tracing.deciding.rounds import LEVEL
-
-FLOOR = 1.15
-"""A ratio of repeating error to noise below which a run is taken to be explained."""
-#: What an error comes down to where nothing is missing, and what it is measured by.
-FLOOR_WORDS, EXPECTED_WORDS = "its noise", "its noise"
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -37,9 +33,11 @@ def _said(summary: Mapping[str, Any]) -> str:
     was = "was" if len(summary["effects"]) == 1 else "were"
     if sure is None:
         if summary["verdict"] == schema.NOTHING_MISSING:
-            return f"Nothing is missing: the model explains the measurements down to {FLOOR_WORDS}."
+            return (
+                f"Nothing is missing: the model explains the measurements down to {words(summary)}."
+            )
         return f"Something is missing: {_size_left(summary)}{_unexplained(summary)}."
-    down = f"the error is then down to {FLOOR_WORDS}"
+    down = f"the error is then down to {words(summary)}"
     if sure == schema.CERTAIN:
         return f"Certain: {found} {was} missing; {down}."
     if sure == schema.PROBABLE:
@@ -101,30 +99,24 @@ def accepted(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [one for one in found if one is not None and one["effect"] in summary["effects"]]
 
 
-def ratio(errors: Mapping[str, Any]) -> float | None:
-    """Error over what is expected of it: the noise, and what is not known of the parameters."""
-    value = errors.get("ratio_to_expected", errors["ratio_to_noise"])
-    return None if value is None else float(value)
-
-
 def _size_left(summary: Mapping[str, Any]) -> str:
     """How large the error is that remains: of an output over all runs of a role, or in one run
     where that alone is too large."""
     pooled = {
-        f"{output} on the {role} runs": ratio(errors)
+        f"{output} on the {role} runs": errors
         for role, outputs in summary["error_after"].items()
         for output, errors in outputs.items()
     }
     single = {
-        f"{output} in run {run}": ratio(errors)
+        f"{output} in run {run}": errors
         for output, runs in summary["rounds"][-1]["error"].items()
         for run, errors in runs.items()
     }
     for found in (pooled, single):
-        known = {where: value for where, value in found.items() if value is not None}
+        known = {where: ratio(errors) or 0.0 for where, errors in found.items()}
         where = max(known, key=lambda one: known[one], default="")
-        if where and (known[where] > FLOOR or found is single):
-            return f"the error of {where} is {format_short(known[where])} times {EXPECTED_WORDS}"
+        if where and known[where] and (too_large(found[where]) or found is single):
+            return f"the error of {where} is {format_short(known[where])} times {words(summary)}"
     return "an error is left"
 
 
@@ -165,8 +157,8 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
         first = summary["error_before"].get(role, {}).get(output, last)
         key = "rms" if last["repeating"] is None else "repeating"
         scale = error_scale(units.get(output, ""), (first, last))
-        ratio = [format_short(e["ratio_to_noise"]) for e in (first, last)]
-        known = last["ratio_to_noise"] is not None
+        ratios = [format_short(ratio(e)) for e in (first, last)]
+        known = ratio(last) is not None
         shown.append(
             {
                 "title": f"{output}, {role} runs",
@@ -174,7 +166,9 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
                 "after": _number(last[key], scale),
                 "unit": scale.unit,
                 "what": "repeating error" if key == "repeating" else "rms error",
-                "ratio": f"{' → '.join(ratio) if two else ratio[1]} × the noise" if known else "",
+                "ratio": f"{' → '.join(ratios) if two else ratios[1]} × {words(summary)}"
+                if known
+                else "",
                 "change": _change(first[key], last[key]) if two else "",
             }
         )
@@ -224,7 +218,7 @@ def stability(summary: Mapping[str, Any]) -> str:
 def remainder(summary: Mapping[str, Any]) -> list[str]:
     """What is still unexplained, sentence by sentence."""
     last = summary["rounds"][-1]
-    lines = [_above_floor(output, runs) for output, runs in last["error"].items()]
+    lines = [_above_floor(output, runs, words(summary)) for output, runs in last["error"].items()]
     if last["candidates"]:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         p = format_p(best["p_value"])
@@ -247,21 +241,17 @@ def _small(sentence: str) -> str:
     return sentence if sentence.split()[0] in PROPER else sentence[0].lower() + sentence[1:]
 
 
-def _above_floor(output: str, runs: Mapping[str, Any]) -> str:
-    """How many runs of an output lie above their noise, and the worst of them."""
-    ratios = {
-        run: e["ratio_to_noise"] for run, e in runs.items() if e["ratio_to_noise"] is not None
-    }
+def _above_floor(output: str, runs: Mapping[str, Any], than: str) -> str:
+    """In how many runs the error of an output is larger than chance allows, and the worst."""
+    ratios = {run: ratio(e) or 0.0 for run, e in runs.items() if ratio(e) is not None}
     if not ratios:
         return f"No run has a noise floor for {output}: only the rms of the residual is known."
     worst = max(ratios, key=lambda run: ratios[run])
-    above = sum(ratio > FLOOR for ratio in ratios.values())
-    largest = f"the largest ratio is {format_short(ratios[worst])}, in {worst}"
-    of = f"of {len(ratios)} runs"
-    lead = "no run" if above == 0 else f"{above} {of}"
+    above = sum(too_large(runs[run]) for run in ratios)
+    lead = "No run" if above == 0 else f"{above} of {len(ratios)} runs"
     verb = "has" if above <= 1 else "have"
-    text = f"{lead} {verb} a repeating {output} error above {FLOOR} times its noise; {largest}."
-    return text[0].upper() + text[1:]
+    largest = f"the largest is {format_short(ratios[worst])} times {than}, in {worst}"
+    return f"{lead} {verb} a repeating {output} error beyond what chance allows; {largest}."
 
 
 def _number(value: float | None, scale: Scale) -> str:

@@ -15,6 +15,7 @@ from bayesoleo.effects.titles import called, listed, titles_for, with_titles
 from bayesoleo.plots import reading
 from bayesoleo.plots.rankings import chosen, format_p, title
 from bayesoleo.plots.units import Scale, engineering, format_number, format_value
+from bayesoleo.report.yardstick import ratio
 from bayesoleo.solvers.status import counted
 
 KNOWN_CONSTANTS = (
@@ -102,17 +103,19 @@ def error_by_role(summary: Mapping[str, Any], units: Mapping[str, str]) -> Table
     """Error before and after, pooled over the hold-out and over the fitted runs."""
     before, after = summary["error_before"], summary["error_after"]
     two = len(summary["rounds"]) > 1
+    known = _expected_known(after)
     rows = []
     for role in (schema.HOLD_OUT, schema.FIT):
         for output, first in before.get(role, {}).items():
             last = after.get(role, {}).get(output, first)
             scale = error_scale(units.get(output, ""), (first, last))
             pairs = [arrow(first[k], last[k], scale.factor, two) for k in ("rms", "repeating")]
-            noise = noise_of(last)
-            floor = format_short(None if noise is None else scale.factor * noise)
-            ratio = arrow(first["ratio_to_noise"], last["ratio_to_noise"], two=two)
-            rows.append([role, output, *pairs, floor, scale.unit, ratio])
-    head = ["runs", "output", "rms", "repeating", "noise", "unit", "repeating / noise"]
+            floors = [noise_of(last), *([last.get("expected")] if known else [])]
+            shown = [format_short(None if v is None else scale.factor * v) for v in floors]
+            ratios = arrow(ratio(first), ratio(last), two=two)
+            rows.append([role, output, *pairs, *shown, scale.unit, ratios])
+    head = ["runs", "output", "rms", "repeating", "noise", *_expected_head(known), "unit"]
+    head.append(_ratio_head(known))
     return Table(head, rows, 2, frozenset(i for i, row in enumerate(rows) if row[0] != schema.FIT))
 
 
@@ -120,6 +123,8 @@ def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[s
     """Error before and after of every run, a table for each output."""
     rounds = summary["rounds"]
     two = len(rounds) > 1
+    known = _expected_known(summary["error_after"])
+    keys = ["rms", "repeating", "noise", *_expected_head(known)]
     tables = {}
     for output, first in rounds[0]["error"].items():
         last = rounds[-1]["error"].get(output, first)
@@ -127,21 +132,26 @@ def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[s
         rows = []
         for run in sorted(first, key=lambda label: first[label]["role"] == schema.HOLD_OUT):
             a, b = first[run], last.get(run, first[run])
-            pairs = [arrow(a[k], b[k], scale.factor, two) for k in ("rms", "repeating", "noise")]
-            ratio = arrow(a["ratio_to_noise"], b["ratio_to_noise"], two=two)
-            rows.append([run, a["role"], *pairs, ratio])
+            pairs = [arrow(a.get(k), b.get(k), scale.factor, two) for k in keys]
+            rows.append([run, a["role"], *pairs, arrow(ratio(a), ratio(b), two=two)])
         unit = f" [{scale.unit}]" if scale.unit else ""
-        head = [
-            "run",
-            "role",
-            f"rms{unit}",
-            f"repeating{unit}",
-            f"noise{unit}",
-            "repeating / noise",
-        ]
+        head = ["run", "role", *(f"{key}{unit}" for key in keys), _ratio_head(known)]
         marked = frozenset(i for i, row in enumerate(rows) if row[1] == schema.HOLD_OUT)
         tables[output] = Table(head, rows, 2, marked)
     return tables
+
+
+def _expected_known(errors: Mapping[str, Any]) -> bool:
+    """Whether a result says what is expected of its errors."""
+    return any("expected" in entry for outputs in errors.values() for entry in outputs.values())
+
+
+def _expected_head(known: bool) -> list[str]:
+    return ["expected"] if known else []
+
+
+def _ratio_head(known: bool) -> str:
+    return "repeating / expected" if known else "repeating / noise"
 
 
 def candidates(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> Table:

@@ -79,6 +79,6 @@ def test_nothing_wrong_is_said_so(answers, two_runs):
     quiet["rounds"], quiet["effects"] = quiet["rounds"][:1], []
     quiet["rounds"][0]["accepted"] = None
     found = dict(case(quiet, {}, two_runs))
-    assert found["Was anything wrong?"].startswith("No: no error that repeats is above 1.15")
+    assert found["Was anything wrong?"].startswith("No: no error repeats beyond what chance allows")
     assert "What is it?" not in found
     assert "Does it hold on data not used?" not in found

@@ -9,7 +9,7 @@ import pytest
 from bayesoleo import schema
 from bayesoleo.effects import catalogue
 from bayesoleo.effects.titles import called, in_sentence, with_titles
-from bayesoleo.report import sentences
+from bayesoleo.report import yardstick
 from bayesoleo.report.sentences import headline
 
 
@@ -84,8 +84,8 @@ def test_a_run_that_alone_is_too_large_is_named():
 
 
 def test_what_is_expected_is_taken_before_the_noise():
-    assert sentences.ratio({"ratio_to_noise": 5.4, "ratio_to_expected": 0.9}) == 0.9
-    assert sentences.ratio({"ratio_to_noise": 5.4}) == 5.4
+    assert yardstick.ratio({"ratio_to_noise": 5.4, "ratio_to_expected": 0.9}) == 0.9
+    assert yardstick.ratio({"ratio_to_noise": 5.4}) == 5.4
 
 
 @pytest.mark.parametrize("sure", [*schema.CERTAINTIES, None])

@@ -14,6 +14,7 @@ from bayesoleo.posterior import Samples
 from bayesoleo.tracing.deciding.loop import ON_LIMIT, ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.errors.floor import limit
 
 
 def summarise(
@@ -41,8 +42,8 @@ def summarise(
         "effects": list(loop.effects),
         "targets": list(loop.targets),
         "parameters": _parameters(final, samples),
-        "error_before": loop.first.by_role,
-        "error_after": final.by_role,
+        "error_before": _by_role(loop.first),
+        "error_after": _by_role(final),
         "verdict": loop.verdict,
         "certain": loop.certain,
         "certainty": loop.certainty,
@@ -87,13 +88,34 @@ def told(text: str, titles: Mapping[str, str]) -> str:
 
 def _round(item: Round, titles: Mapping[str, str]) -> dict[str, Any]:
     return {
-        "error": item.before.errors.by_run(),
+        "error": _by_run(item.before),
         "candidates": [_candidate(ranked) for ranked in item.ranking],
         "accepted": item.accepted.effect if item.accepted else None,
         "accepted_target": item.accepted.target if item.accepted else None,
         "reason": told(item.reason, titles),
         "failed": dict(item.failed),
     }
+
+
+def _by_run(state: State) -> dict[str, dict[str, dict[str, Any]]]:
+    """Errors of single runs, each with the ratio that chance hardly exceeds."""
+    table = state.errors.by_run()
+    for own in (state.fit_errors, state.hold_errors):
+        for entry in own.entries:
+            if any(entry is shown for shown in state.errors.entries):
+                table[entry.output][entry.run]["limit"] = limit([entry], len(own.entries))
+    return table
+
+
+def _by_role(state: State) -> dict[str, dict[str, dict[str, Any]]]:
+    """Pooled errors, each with the ratio that chance hardly exceeds."""
+    found: dict[str, dict[str, dict[str, Any]]] = dict(state.by_role)
+    for table in (state.fit_errors, state.hold_errors):
+        for role in {entry.role for entry in table.entries}:
+            for output in table.outputs:
+                chosen = [e for e in table.entries if (e.role, e.output) == (role, output)]
+                found[role][output]["limit"] = limit(chosen)
+    return found
 
 
 def _candidate(ranked: Ranked) -> dict[str, Any]:
