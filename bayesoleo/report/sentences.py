@@ -12,7 +12,7 @@ from bayesoleo.effects.titles import PROPER, called, listed, titles_for, with_ti
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
-from bayesoleo.report.yardstick import ratio, too_large, words
+from bayesoleo.report.yardstick import ratio, too_large, too_small, words
 from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
 from bayesoleo.tracing.deciding.rounds import LEVEL
 
@@ -36,7 +36,8 @@ def _said(summary: Mapping[str, Any]) -> str:
             return (
                 f"Nothing is missing: the model explains the measurements down to {words(summary)}."
             )
-        return f"Something is missing: {_size_left(summary)}{_unexplained(summary)}."
+        lead = "No verdict" if _only_too_small(summary) else "Something is missing"
+        return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
     down = f"the error is then down to {words(summary)}"
     if sure == schema.CERTAIN:
         return f"Certain: {found} {was} missing; {down}."
@@ -112,12 +113,26 @@ def _size_left(summary: Mapping[str, Any]) -> str:
         for output, runs in summary["rounds"][-1]["error"].items()
         for run, errors in runs.items()
     }
+    if _only_too_small(summary):
+        where = min(
+            (one for one in pooled if too_small(pooled[one])),
+            key=lambda one: ratio(pooled[one]) or 0.0,
+        )
+        times = f"{format_short(ratio(pooled[where]))} times {words(summary)}"
+        return f"the error of {where} is {times}, less than chance allows: its noise is overstated"
     for found in (pooled, single):
         known = {where: ratio(errors) or 0.0 for where, errors in found.items()}
         where = max(known, key=lambda one: known[one], default="")
         if where and known[where] and (too_large(found[where]) or found is single):
             return f"the error of {where} is {format_short(known[where])} times {words(summary)}"
     return "an error is left"
+
+
+def _only_too_small(summary: Mapping[str, Any]) -> bool:
+    """Whether no error is too large, but one is smaller than chance allows."""
+    pooled = [e for outputs in summary["error_after"].values() for e in outputs.values()]
+    single = [e for runs in summary["rounds"][-1]["error"].values() for e in runs.values()]
+    return any(map(too_small, pooled)) and not any(map(too_large, (*pooled, *single)))
 
 
 def unfinished(summary: Mapping[str, Any]) -> list[str]:
@@ -130,6 +145,8 @@ def unfinished(summary: Mapping[str, Any]) -> list[str]:
 
 def _unexplained(summary: Mapping[str, Any]) -> str:
     """What the catalogue has to say to an error that remains, as the end of a sentence."""
+    if _only_too_small(summary):
+        return ""
     last = summary["rounds"][-1]
     open_ = [
         c

@@ -24,6 +24,12 @@ def too_large(errors: Mapping[str, Any]) -> bool:
     return found is not None and found > (errors.get("limit") or FLOOR)
 
 
+def too_small(errors: Mapping[str, Any]) -> bool:
+    """Whether an error is smaller than chance allows, so that its noise was measured too large."""
+    found = ratio(errors)
+    return found is not None and found < (errors.get("lowest") or 0.0)
+
+
 def words(summary: Mapping[str, Any]) -> str:
     """What the errors of a summary are multiples of."""
     runs = next(iter(summary["rounds"][-1].get("error", {}).values()), {})

@@ -13,7 +13,7 @@ from bayesoleo.report import yardstick
 from bayesoleo.report.sentences import headline
 
 
-def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, **more):
+def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowest=0.0, **more):
     """The headline of effects, each ``id @ target``."""
     pairs = [name.split(" @ ") for name in names]
     ranked = {name: [candidate(*name.split(" @ "), alike)] for name in names}
@@ -21,7 +21,7 @@ def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, **mor
         {"accepted": effect, "accepted_target": place, "candidates": ranked[f"{effect} @ {place}"]}
         for effect, place in pairs
     ]
-    errors = {"ratio_to_noise": ratio, "repeating": 1.0, "rms": 1.0}
+    errors = {"ratio_to_noise": ratio, "repeating": 1.0, "rms": 1.0, "lowest": lowest}
     last = {"accepted": None, "candidates": [], "error": {"force": {"a": errors}}}
     summary = {
         "effects": [effect for effect, _ in pairs],
@@ -81,6 +81,12 @@ def test_a_search_that_broke_off_is_said_first():
 def test_a_run_that_alone_is_too_large_is_named():
     text = told([], None, ratio=1.1, verdict=schema.UNEXPLAINED)
     assert text == "Something is missing: the error of force in run a is 1.10 times its noise."
+
+
+def test_less_error_than_chance_allows_is_no_finding():
+    text = told([], None, ratio=0.16, verdict=schema.UNEXPLAINED, lowest=0.8)
+    assert text.startswith("No verdict: the error of force on the hold-out runs is 0.160 times")
+    assert text.endswith("less than chance allows: its noise is overstated.")
 
 
 def test_what_is_expected_is_taken_before_the_noise():

@@ -88,7 +88,7 @@ class ClosedLoop:
         tell it from all others of the catalogue, and it is large enough that one which merely
         resembles it would have left a significant remainder.
         """
-        if not self.complete:
+        if not self.complete or self.final.too_quiet:
             return False
         accepted = [item.accepted for item in self.rounds if item.accepted]
         accepted = [item for item in accepted if (item.effect, item.target) in self.added]

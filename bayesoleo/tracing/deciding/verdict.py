@@ -34,12 +34,8 @@ def verdict_of(rounds: Sequence[Round], first: State, final: State) -> str:
     first, final : State
         The model as declared, and with all effects.
     """
-    if not final.assembly.added:
-        # Less error than chance allows is a fault of the noise, and proves nothing.
-        nothing = final.at_floor and not final.too_quiet
-        return schema.NOTHING_MISSING if nothing else schema.UNEXPLAINED
-    if final.at_floor:
-        return schema.EFFECT_ADDED
+    if _as_expected(final):
+        return schema.EFFECT_ADDED if final.assembly.added else schema.NOTHING_MISSING
     found = explained_by_physics(rounds, first, final) > MOSTLY
     return schema.EFFECT_ADDED if found else schema.UNEXPLAINED
 
@@ -57,11 +53,17 @@ def certainty_of(final: State, certain: bool) -> str | None:
     steps = final.assembly.steps
     if not steps:
         return None
-    if not final.at_floor:
+    if not _as_expected(final):
         return schema.LIKENESS
     if all(step.effect.family in NO_CAUSE for step in steps):
         return schema.NO_CAUSE
     return schema.CERTAIN if certain else schema.PROBABLE
+
+
+def _as_expected(final: State) -> bool:
+    """Whether all errors are what is expected: less than chance allows is a fault of the noise, and
+    proves nothing."""
+    return final.at_floor and not final.too_quiet
 
 
 def explained_by_physics(rounds: Sequence[Round], first: State, final: State) -> float:

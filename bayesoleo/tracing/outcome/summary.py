@@ -14,7 +14,7 @@ from bayesoleo.posterior import Samples
 from bayesoleo.tracing.deciding.loop import ON_LIMIT, ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State
-from bayesoleo.tracing.errors.floor import limit
+from bayesoleo.tracing.errors.floor import LEAST_RATIO, limit, lowest
 
 
 def summarise(
@@ -108,13 +108,14 @@ def _by_run(state: State) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _by_role(state: State) -> dict[str, dict[str, dict[str, Any]]]:
-    """Pooled errors, each with the ratio that chance hardly exceeds."""
+    """Pooled errors, each with the ratios that chance hardly exceeds or falls below."""
     found: dict[str, dict[str, dict[str, Any]]] = dict(state.by_role)
     for table in (state.fit_errors, state.hold_errors):
         for role in {entry.role for entry in table.entries}:
             for output in table.outputs:
                 chosen = [e for e in table.entries if (e.role, e.output) == (role, output)]
-                found[role][output]["limit"] = limit(chosen)
+                least = min(lowest(chosen), LEAST_RATIO)
+                found[role][output] |= {"limit": limit(chosen), "lowest": least}
     return found
 
 
