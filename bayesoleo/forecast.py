@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -18,7 +18,9 @@ from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo.assessment import Score, score_draws
+from bayesoleo.assessment.series import judged_errors
 from bayesoleo.data import ReducedCampaign
+from bayesoleo.data.local_average import local_means
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.runs.nuisance import uncertain_conditions
 from bayesoleo.estimation.shown import Shown, columns
@@ -29,6 +31,9 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.simulation import model_of, parameter_sets
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status, count, counted
+from bayesoleo.tracing.errors.errors_table import compared
+from bayesoleo.tracing.errors.holdout import Prediction
+from bayesoleo.tracing.fitting.masked import weights
 
 Array = NDArray[np.float64]
 
@@ -40,6 +45,11 @@ _NUMBERS = {
     "rms": ("root mean square of what was measured less the mean of the prediction", True),
     "bias": ("mean of it", True),
     "expected_rms": ("root mean square that the prediction expects", True),
+    "repeating": ("root mean square of what repeats of the error of the estimate", True),
+    "noise": ("standard error of that", True),
+    "expected_error": ("what noise and the unknowns let it be", True),
+    "ratio_to_noise": ("repeating over noise", False),
+    "ratio_to_expected": ("repeating over what is expected", False),
     "log_score": ("mean log density of a sample, higher is better", False),
     "coverage": ("part of the samples inside the interval", False),
     "pit_distance": ("distance of the probability integral transform from uniform", False),
@@ -105,7 +115,9 @@ def predict(
     -------
     Shown
         By ``(output, run)``: ``rms``, ``bias``, ``expected_rms``, ``log_score``, ``coverage``,
-        ``pit_distance``; ``failed(run)``, the draws without a solution, which are left out;
+        ``pit_distance``; ``repeating``, ``noise``, ``expected_error`` and the ratios to both, as in
+        the search, and of a run that the result holds those of its verdict; ``failed(run)``, the
+        draws without a solution, which are left out;
         ``pit(output, run, bin)``, a histogram that is flat where the prediction is calibrated;
         ``time(run, point)``, and ``mean``, ``low``, ``high`` and ``measured``
         ``(output, run, point)`` over the first period, or the whole of a transient.
@@ -132,6 +144,9 @@ def predict(
     chosen, _ = without_invented(used, chosen, given)
     records = uncertain_conditions(used).complete(chosen)
     found = [_one_run(used, record, known, rng, level, scheme, steps, jobs) for record in records]
+    found = [
+        _as_judged(tree, record, run, used) for record, run in zip(records, found, strict=True)
+    ]
     data = _dataset(used, records, found)
     data.attrs = {"level": level, "draws": draws, "model": used.name}
     return Shown(data, forecast_text(data))
@@ -185,6 +200,7 @@ class _Run:
     low: Array
     high: Array
     scores: Sequence[Score]
+    errors: Sequence[Mapping[str, float]]
     failed: Mapping[str, int]
 
 
@@ -235,7 +251,58 @@ def _one_run(
         for b, name in enumerate(predictor.outputs)
     ]
     failed = {key: n for key, n in count(found.status).items() if key != "converged"}
-    return _Run(mean, spread, mean - half, mean + half, scores, failed)
+    errors = _errors(predictor, record, theta, y)
+    return _Run(mean, spread, mean - half, mean + half, scores, errors, failed)
+
+
+def _errors(
+    predictor: Predictor, record: Record, theta: Array, draws: Array
+) -> list[dict[str, float]]:
+    """The error of the estimate by output, against its noise and against what draws ``(m, ny, N)``
+    of the unknowns add to it."""
+    at_estimate = predictor.simulate(theta[None], 0)
+    values = dict(zip(predictor.layout.names, map(float, theta), strict=True))
+    status = Status(int(at_estimate.status[0]))
+    one = Prediction(record, at_estimate.y[0], values, 0, status, predictor)
+    entries, _ = compared(one, {record.label: record.role})
+    changes = (draws - at_estimate.y[0]) * weights(record)
+    if not record.periodic:
+        changes = local_means(changes)
+    moved = np.mean(changes**2, axis=(0, 2))
+    found = []
+    for entry, square in zip(entries, moved, strict=True):
+        expected = float(np.hypot(entry.noise, np.sqrt(square)))
+        found.append(
+            {
+                "repeating": entry.repeating,
+                "noise": entry.noise,
+                "expected_error": expected,
+                "ratio_to_noise": entry.ratio,
+                "ratio_to_expected": entry.repeating / expected,
+            }
+        )
+    return found
+
+
+def _as_judged(tree: xr.DataTree, record: Record, run: _Run, model: Model) -> _Run:
+    """With the errors that the search of the result has found on the very same samples: there is
+    one answer. It knows more: what each run said of its own parameters."""
+    if schema.OBSERVED_DATA not in tree.children:
+        return run
+    observed = tree[schema.OBSERVED_DATA].to_dataset()
+    errors = []
+    for output, computed in zip(model.outputs, run.errors, strict=True):
+        same = output in observed and record.label in observed[schema.RUN].values
+        if same:
+            there = observed[output].sel({schema.RUN: record.label}).values
+            here = record.samples[output]
+            same = (
+                np.array_equal(there[: here.size], here)
+                and not np.isfinite(there[here.size :]).any()
+            )
+        known = judged_errors(tree, output, record.label) if same else {}
+        errors.append({key: known.get(key, value) for key, value in computed.items()})
+    return replace(run, errors=errors)
 
 
 def _sd_of(output: str, known: Known, record: Record) -> Array:
@@ -267,6 +334,7 @@ def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> 
                 "log_score": score.log_score,
                 "coverage": score.coverage,
                 "pit_distance": score.distance,
+                **run.errors[b],
             }
             for key, value in numbers.items():
                 tables[key][b, r] = value
@@ -318,7 +386,7 @@ def forecast_text(data: xr.Dataset) -> str:
     """
     level = f"{100 * float(data.attrs['level']):.3g} %"
     head = ["output", "run", "rms", "expected", "bias", "unit", "log score"]
-    head += [f"within {level}", "PIT off"]
+    head += [f"within {level}", "PIT off", "over noise", "over expected"]
     rows = []
     for output in data[schema.OUTPUT].values:
         for run in data[schema.RUN].values:
@@ -329,6 +397,8 @@ def forecast_text(data: xr.Dataset) -> str:
                 f"{one['log_score']:.3g}",
                 f"{100 * one['coverage']:.1f} %",
                 f"{one['pit_distance']:.3f}",
+                f"{one['ratio_to_noise']:.2f}",
+                f"{one['ratio_to_expected']:.2f}",
             ]
             rows.append([str(output), str(run), *cells])
     lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]

@@ -45,6 +45,7 @@ _NUMBERS = {
     "lack_of_fit": "mean square that repeats over that of its noise",
     "lack_of_fit_p": "its probability",
     "ratio_to_noise": "root of the lack of fit",
+    "ratio_to_expected": "repeating error over what noise and the parameters' posterior let expect",
     "outliers": "number of outliers",
     "outlier_limit": "robust standard deviations beyond which a sample is one",
 }
@@ -74,8 +75,10 @@ def assess(
         The group ``assessment``. By ``(output, run)``: ``rms``, ``mean``; ``runs_z``, the test on
         runs of signs; ``skewness``, ``kurtosis``, ``normality``; ``memory``, ``same_phase``;
         ``lack_of_fit`` (pure error between periods), ``ratio_to_noise``; ``outliers``, each with
-        its probability ``_p`` where it has one. ``share`` and ``share_p`` ``(output, run,
-        variable)``: the part of the residual's variance that a variable explains.
+        its probability ``_p`` where it has one. Of a result of ``close`` or ``trace`` also
+        ``ratio_to_expected``, and ``lack_of_fit_p`` is then its probability. ``share`` and
+        ``share_p`` ``(output, run, variable)``: the part of the residual's variance that a variable
+        explains.
         ``outlier_time``, ``outlier_score`` ``(output, run, rank)``. ``correlogram`` and
         ``noise_correlogram`` ``(output, run, lag)`` over two periods. ``share_of_runs``,
         ``share_of_runs_p``, ``share_of_groups``, ``share_of_groups_p`` ``(output)``: do mean
@@ -118,17 +121,33 @@ def _numbers(series: Series) -> dict[str, float]:
         "outlier_limit": limit,
     }
     missing = dict.fromkeys(
-        ("same_phase", "lack_of_fit", "lack_of_fit_p", "ratio_to_noise"), np.nan
+        ("same_phase", "lack_of_fit", "lack_of_fit_p", "ratio_to_noise", "ratio_to_expected"),
+        np.nan,
     )
+    missing |= _judged(series)
     if average is None:
         return found | missing
     size = average.repeating, average.sigma, average.samples, average.number
     fit = tests.lack_of_fit(*size, series.input_noise, tests.memory(noise, 2))
-    return found | {
+    own = {
         "same_phase": tests.same_phase(*size),
         "lack_of_fit": fit.statistic,
         "lack_of_fit_p": fit.p_value,
         "ratio_to_noise": float(np.sqrt(fit.statistic)),
+    }
+    return found | missing | own | _judged(series)
+
+
+def _judged(series: Series) -> dict[str, float]:
+    """What the search said of the same residual: there is one answer."""
+    known = series.judged
+    if not known:
+        return {}
+    return {
+        "ratio_to_noise": known["ratio_to_noise"],
+        "ratio_to_expected": known["ratio_to_expected"],
+        "lack_of_fit": known["ratio_to_noise"] ** 2,
+        "lack_of_fit_p": known["chance"],
     }
 
 
@@ -278,7 +297,7 @@ def correlograms(series: Series) -> tuple[Array, Array]:
 def assessment_text(data: xr.Dataset) -> str:
     """One line a series; a star marks what chance alone hardly gives."""
     head = ["output", "run", "rms", "unit", "runs z", "skew", "kurt.", "memory", "same phase"]
-    head += ["over noise", "outliers", "depends on"]
+    head += ["over noise", "over expected", "outliers", "depends on"]
     rows = []
     for output in data[schema.OUTPUT].values:
         for run in data[schema.RUN].values:
@@ -310,7 +329,7 @@ def _cells(one: xr.Dataset, series: int) -> list[str]:
     if sure.size:
         k = int(sure[np.argmax(share[sure])])
         best = f"{one['variable'].values[k]} ({100 * share[k]:.2g} %)"
-    ratio = number["ratio_to_noise"]
+    ratio, expected = number["ratio_to_noise"], number["ratio_to_expected"]
     return [
         f"{number['rms']:.3g}",
         str(one[schema.UNIT].values) or "1",
@@ -320,6 +339,7 @@ def _cells(one: xr.Dataset, series: int) -> list[str]:
         f"{number['memory']:.1f}",
         f"{number['same_phase']:.2f}" if np.isfinite(number["same_phase"]) else "–",
         marked(f"{ratio:.2f}", number["lack_of_fit_p"]) if np.isfinite(ratio) else "–",
+        f"{expected:.2f}" if np.isfinite(expected) else "–",
         f"{number['outliers']:.0f}",
         best,
     ]

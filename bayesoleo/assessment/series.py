@@ -19,6 +19,15 @@ from bayesoleo.prediction.input_noise import input_columns
 
 Array = NDArray[np.float64]
 
+_JUDGED = (
+    schema.REPEATING,
+    schema.NOISE,
+    schema.EXPECTED_ERROR,
+    schema.RATIO_TO_NOISE,
+    schema.RATIO_TO_EXPECTED,
+    schema.CHANCE,
+)
+
 
 @dataclass(frozen=True)
 class Series:
@@ -39,6 +48,9 @@ class Series:
         Of the variables.
     input_noise : float
         What the noise of the inputs does to the residual averaged over periods, rms, SI.
+    judged : mapping of str to float
+        What the search of a stored result made of it: ``ratio_to_noise``, ``ratio_to_expected`` and
+        ``chance``, the probability of the latter; empty elsewhere.
     """
 
     run: str
@@ -52,6 +64,7 @@ class Series:
     variables: Mapping[str, Array]
     units: Mapping[str, str] = field(default_factory=dict)
     input_noise: float = 0.0
+    judged: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def periodic(self) -> bool:
@@ -211,8 +224,40 @@ def series_of_tree(tree: xr.DataTree, stage: str | None = None) -> list[Series]:
     for run in residual[schema.RUN].values:
         groups = {"r": residual, "o": observed, "c": constant}
         one = {key: data.sel(run=run) for key, data in groups.items()}
-        found += [_of_tree(one, str(run), output, stage) for output in outputs]
+        for output in outputs:
+            series = _of_tree(one, str(run), output, stage)
+            found.append(replace(series, judged=judged_errors(tree, output, str(run), stage)))
     return found
+
+
+def judged_errors(
+    tree: xr.DataTree, output: str, run: str, stage: str = "after"
+) -> dict[str, float]:
+    """How a search has held the error of one output in one run against noise and expectation.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Of ``close`` or ``trace``; of anything else nothing is known.
+    output, run : str
+    stage : {"before", "after"}
+        With the model as declared, or with what was added.
+
+    Returns
+    -------
+    dict of str to float
+        ``repeating``, ``noise``, ``expected_error``, ``ratio_to_noise``, ``ratio_to_expected`` and
+        ``chance``; empty where the result does not hold them.
+    """
+    if schema.DISCOVERY not in tree.children:
+        return {}
+    table = tree[schema.DISCOVERY].to_dataset()
+    if schema.CHANCE not in table or output not in table[schema.OUTPUT].values:
+        return {}
+    if run not in table[schema.RUN].values:
+        return {}
+    one = table.isel({schema.ROUND: 0 if stage == "before" else -1}).sel(output=output, run=run)
+    return {name: float(one[name]) for name in _JUDGED}
 
 
 def _of_tree(one: Mapping[str, xr.Dataset], run: str, output: str, stage: str) -> Series:

@@ -13,8 +13,10 @@ import xarray as xr
 from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
 
 from bayesoleo import schema, workflow
+from bayesoleo.assessment import assess
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import BayesoleoError, InputError
+from bayesoleo.forecast import predict
 from bayesoleo.storage import read_tree
 from bayesoleo.systems import system
 from bayesoleo.workflow import Settings
@@ -147,6 +149,39 @@ def test_discovery_holds_every_round_and_candidate(closed):
             there = found.to_dataset().isel(round=k).sel(output="force", run=run)
             assert float(there[schema.RMS]) == pytest.approx(error["rms"])
             assert float(there[schema.RATIO_TO_NOISE]) == pytest.approx(error["ratio_to_noise"])
+
+
+def test_loop_prediction_and_assessment_have_the_same_figures(closed, campaign):
+    """One error against one noise and one expectation, whoever is asked."""
+    tree, out = closed
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    told = summary["rounds"][-1]["error"]["force"]
+    assessed = assess(tree)
+    foreseen = predict(tree, workflow.task.reduce(campaign), draws=40, jobs=1)
+    for run, error in told.items():
+        for key in ("ratio_to_noise", "ratio_to_expected"):
+            for table in (assessed, foreseen):
+                found = float(table[key].sel(output="force", run=run))
+                assert found == pytest.approx(error[key]), (key, run)
+        assert float(foreseen["expected_error"].sel(output="force", run=run)) == pytest.approx(
+            error["expected"]
+        )
+
+
+def test_what_is_expected_of_a_run_that_the_result_does_not_hold_is_near_what_the_loop_says(
+    closed, campaign
+):
+    """The same run with other samples: by draws, where the loop has sensitivities. Its offset is
+    drawn from the prior there and estimated on the run here, so that more is expected."""
+    tree, _ = closed
+    reduced = workflow.task.reduce(campaign)
+    record = reduced.record("e")
+    other = replace(record, samples={k: v.copy() for k, v in record.samples.items()})
+    other.samples["force"][0] += 1e-6
+    changed = replace(reduced, records=(other,))
+    same, found = (predict(tree, one, runs=["e"], draws=200, jobs=1) for one in (reduced, changed))
+    assert float(found["noise"][0, 0]) == pytest.approx(float(same["noise"][0, 0]), rel=1e-3)
+    assert float(found["expected_error"][0, 0]) > 10 * float(same["expected_error"][0, 0])
 
 
 def test_a_second_close_takes_up_the_checkpoints_and_agrees(closed, campaign):

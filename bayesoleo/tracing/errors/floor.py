@@ -57,14 +57,32 @@ def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
     return math.sqrt(max(_quantile(entries, 1.0 - FALSE_ALARM / tests), 0.0))
 
 
+def chance(entries: Sequence[RunError]) -> float:
+    """Probability that chance alone gives a squared ratio to what is expected as large.
+
+    Parameters
+    ----------
+    entries : sequence of RunError
+        Over which it is averaged; not a number where a run could not be solved.
+    """
+    square = float(np.mean([entry.ratio_to_expected**2 for entry in entries]))
+    share, number, free = _variate(entries)
+    return float(stats.f.sf(1.0 + (square - 1.0) / share, number, free))
+
+
 def _quantile(entries: Sequence[RunError], above: float) -> float:
     """Squared ratio that is exceeded with a probability."""
+    share, number, free = _variate(entries)
+    return 1.0 + share * (float(stats.f.isf(above, number, free)) - 1.0)
+
+
+def _variate(entries: Sequence[RunError]) -> tuple[float, float, float]:
+    """``b`` and degrees of freedom of an F variate, ``1 - b + b F`` being the squared ratio."""
     second, third = _moments(entries)
-    # Mean one, variance 2 second, third cumulant 8 third are those of 1 - b + b F, F of mean one.
+    # Mean one, variance 2 second, third cumulant 8 third.
     number = max(second**3 / third**2, 1e-3)
-    share = second**2 / third
     free = len(entries) ** 2 / sum(entry.own_share**2 / entry.free for entry in entries)
-    return 1.0 + share * (float(stats.f.isf(above, number, max(free, 1e-3))) - 1.0)
+    return second**2 / third, number, max(free, 1e-3)
 
 
 def _moments(entries: Sequence[RunError]) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -18,6 +18,8 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State
+from bayesoleo.tracing.errors.errors_table import RunError
+from bayesoleo.tracing.errors.floor import chance
 from bayesoleo.tracing.errors.holdout import Prediction, predict_fitted
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
@@ -26,6 +28,8 @@ from bayesoleo.tracing.outcome.shapes import shape_group
 from bayesoleo.tracing.outcome.summary import titles_of, told
 
 Array = NDArray[np.float64]
+
+_OUTPUT_UNIT = "SI unit of each output"
 
 
 def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.Dataset]:
@@ -306,30 +310,26 @@ def _error_tables(rounds: Sequence[Round]) -> dict[str, xr.Variable]:
     dims = (schema.ROUND, schema.OUTPUT, schema.RUN)
     first = rounds[0].before
     runs = [p.record.label for p in ordered(first)]
-    names = {
-        schema.RMS: "rms",
-        schema.REPEATING: "repeating",
-        schema.NOISE: "noise",
-        schema.RATIO_TO_NOISE: "ratio",
-        schema.EXPECTED_ERROR: "expected",
-        schema.RATIO_TO_EXPECTED: "ratio_to_expected",
+    numbers: dict[str, tuple[Callable[[RunError], float], str]] = {
+        schema.RMS: (lambda e: e.rms, _OUTPUT_UNIT),
+        schema.REPEATING: (lambda e: e.repeating, _OUTPUT_UNIT),
+        schema.NOISE: (lambda e: e.noise, _OUTPUT_UNIT),
+        schema.RATIO_TO_NOISE: (lambda e: e.ratio, "1"),
+        schema.EXPECTED_ERROR: (lambda e: e.expected, _OUTPUT_UNIT),
+        schema.RATIO_TO_EXPECTED: (lambda e: e.ratio_to_expected, "1"),
+        schema.CHANCE: (lambda e: chance([e]), "1"),
     }
+
+    def table(number: Callable[[RunError], float]) -> list[list[list[float]]]:
+        outputs = first.errors.outputs
+        return [
+            [[number(entry.before.errors.at(output, run)) for run in runs] for output in outputs]
+            for entry in rounds
+        ]
+
     return {
         name: xr.Variable(
-            dims,
-            np.array(
-                [
-                    [
-                        [getattr(e.before.errors.at(o, run), field) for run in runs]
-                        for o in first.errors.outputs
-                    ]
-                    for e in rounds
-                ]
-            ),
-            {
-                schema.LONG_NAME: name,
-                schema.UNITS: "1" if field.startswith("ratio") else "SI unit of each output",
-            },
+            dims, np.array(table(number)), {schema.LONG_NAME: name, schema.UNITS: unit}
         )
-        for name, field in names.items()
+        for name, (number, unit) in numbers.items()
     }
