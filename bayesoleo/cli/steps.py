@@ -119,16 +119,20 @@ def _status(tree: xr.DataTree) -> dict[str, Any]:
 def _how_it_went(status: dict[str, Any]) -> list[str]:
     """How the estimate ended, which trials failed on the way, and how fine the mesh was."""
     from bayesoleo.solvers.status import counted
+    from bayesoleo.tracing.fitting.fit import LARGEST_SHIFT
 
     lines = [status["status_message"]]
     failures = counted(json.loads(status["failures"]))
     if failures:
         lines.append(f"trials that failed: {failures}")
     if "steps" in status:
-        lines.append(
-            f"{status['scheme']} with {status['steps']} steps in a period: half as long, they would"
-            f" move no parameter by more than {status['mesh_shift']:.2g} sd"
-        )
+        mesh = f"{status['scheme']} with {status['steps']} steps in a period"
+        if status["mesh_shift"] <= LARGEST_SHIFT:
+            mesh += (
+                f": half as long, they would move no parameter by more than"
+                f" {status['mesh_shift']:.2g} sd"
+            )
+        lines.append(mesh)  # of another mesh the notes speak
     return lines + json.loads(status["notes"])
 
 

@@ -60,14 +60,14 @@ def dynamics_of(
     return Dynamics(
         kernels=kernels(pieces.model, active, backend),
         orders=derived.orders,
-        signal=_signal(record, derived.inputs),
+        signal=signal_of_rows(record, derived.inputs),
         active=len(derived.active),
         conditions=len(derived.admissible),
         switches=pieces.switches,
     )
 
 
-def _signal(record: Record, rows: tuple[tuple[str, int], ...]) -> Signal:
+def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> Signal:
     """Fourier coefficients of input rows; the time itself, which no equation has, is left zero."""
     used = {
         name: harmonics_of(record, name).for_derivative(highest)

@@ -6,11 +6,13 @@ is asked for once, at the estimate.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.prediction.dynamics import signal_of_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.adaptive.error_estimate import NONE, ErrorEstimate, estimate_error
@@ -19,6 +21,7 @@ from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.schemes.mesh import equidistant
 from bayesoleo.solvers.schemes.tableau import tableau
+from bayesoleo.solvers.shooting.signals import evaluate
 
 Array = NDArray[np.float64]
 
@@ -49,7 +52,7 @@ def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstima
         equations=run.kernels,
         orders=derived.orders,
         period=run.period,
-        inputs_at=lambda phase: input_rows(run.record, derived.inputs, phase),
+        inputs_at=_inputs_at(run),
         conditions=len(derived.admissible),
         active=len(derived.active),
     )
@@ -66,6 +69,15 @@ def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstima
         return np.asarray(scheme.sample(anchor.x[None, :, :, None], plan, step)[0, :, 0])
 
     return estimate_error(problem, method, anchor.p, motion, mesh, tolerance, initial=initial)
+
+
+def _inputs_at(run: RunPredictor) -> Callable[[Array], Array]:
+    """Input rows at phases; harmonics by rotation, since so many phases are asked for."""
+    rows, record = run.kernels.derived.inputs, run.record
+    if not record.periodic:
+        return lambda position: input_rows(record, rows, position)
+    signal = signal_of_rows(record, rows)
+    return lambda phase: evaluate(signal, phase * run.period)
 
 
 def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:

@@ -1,13 +1,16 @@
 """The mesh is as fine as the estimate needs: half its steps move no parameter by a tenth of its
 sd."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bayesoleo import system
+from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run
+from bayesoleo.tracing.deciding.loop import _warnings
 from bayesoleo.tracing.fitting.fit import (
     FEWEST_STEPS,
     LARGEST_SHIFT,
@@ -15,6 +18,7 @@ from bayesoleo.tracing.fitting.fit import (
     first_steps,
     fit_model,
 )
+from bayesoleo.tracing.outcome.result import point_group
 
 MODEL = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.0, [3.0, 0.0, 0.5])}, periods=3.0)
@@ -63,6 +67,43 @@ def test_given_steps_are_kept_and_their_shift_is_told():
     found = fit(1e-4, 64)
     assert found.steps == 64
     assert found.shift > LARGEST_SHIFT
+
+
+def test_a_mesh_that_did_not_do_is_said_plainly(monkeypatch):
+    coarse, fine = fit(1e-4, 64), fit(1e-2, 1024)
+    assert fine.doubts == []
+    (text,) = coarse.doubts
+    assert "the mesh is too coarse: 64 steps leave an error" in text
+    assert f"by {coarse.shift:.2g} of its standard deviations" in text
+    assert "are not those of the equations" in text
+    assert text in json.loads(point_group(coarse).attrs["notes"])
+    assert text in _warnings(coarse)
+    monkeypatch.setattr("bayesoleo.tracing.fitting.fit._halved", lambda *_: None)
+    assert "could not be estimated" in fit(1e-2, 1024).doubts[0]
+
+
+def test_an_error_between_the_points_of_all_steps_is_seen():
+    """A pulse of a three-hundredth of the period: steps, and their halves, pass over it."""
+    width = 1e-3
+    model = Model(
+        "pulse",
+        inputs={"u": "1"},
+        dofs={"q": "m"},
+        parameters={"c": Parameter(0.5, sd=0.2), "k": Parameter(30.0, sd=3.0)},
+        equations={"q": f"ddot(q) + c*dot(q) + k*q - u - 200/(1 + ((u - 0.3)/{width})**2)"},
+        outputs={"y": "q"},
+    )
+    plan = RunPlan("a", 1.0, {"u": motion(0.0, [1.0])}, periods=2.0)
+    made = simulate_run(model, plan, noise={"y": 1e-4}, rng=np.random.default_rng(8), steps=16384)
+    seen = replace(record_of(model, plan), samples=dict(made.samples))
+    found = fit_model(model, [seen], Numerics("radau3", 32, jobs=1, backend="numpy"))
+    assert found.shift > LARGEST_SHIFT
+    assert found.motion_error > 1e-3
+    assert found.doubts
+    # Without steps given they are made short enough, or it is said that they are not.
+    freely = fit_model(model, [seen], Numerics("radau3", None, jobs=1, backend="numpy"))
+    assert freely.steps > 1000
+    assert freely.shift <= LARGEST_SHIFT or freely.doubts
 
 
 def test_a_mesh_that_nobody_asks_about_is_not_looked_at():

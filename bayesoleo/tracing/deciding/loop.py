@@ -292,8 +292,5 @@ def _warnings(fit: Fit) -> list[str]:
         )
     if fit.point.on_limit:
         found.append(f"{ON_LIMIT}: {', '.join(fit.point.on_limit)}")
-    if not fit.shift <= 0.1:
-        found.append(
-            f"halving the mesh's {fit.steps} steps would move a parameter by {fit.shift:.2g} sd"
-        )
+    found += fit.doubts
     return found

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from bayesoleo.estimation import PointEstimate, estimate, polish
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Model
+from bayesoleo.parallel import thread_map
+from bayesoleo.prediction.motion_error import motion_error, outputs_of
 from bayesoleo.prediction.predictor import Predictor, RunPrediction
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
@@ -24,6 +26,22 @@ Array = NDArray[np.float64]
 #: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior
 #: standard deviations.
 LARGEST_SHIFT = 0.1
+#: What is said of a mesh that did not do, or of which nothing is known.
+TOO_COARSE = (
+    "the mesh is too coarse: {} steps leave an error that moves a parameter by {:.2g} of its"
+    " standard deviations, where at most {:g} are allowed; the motion's own estimated error is {}"
+    " of its swing. Estimates and intervals are not those of the equations: allow more steps"
+    " (--steps), or make the model less steep"
+)
+UNKNOWN_SHIFT = (
+    "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
+    " the estimates"
+)
+#: What is missed between the points of steps replaces the movement by halving them where it is so
+#: many times larger: both meshes then pass over something.
+MISSED = 3.0
+#: Error of a motion over its swing below which its estimate resolves nothing more.
+RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
 #: iterations gain a digit each, and what is below no figure shows.
 RESOLUTION = 1e-3
@@ -77,8 +95,10 @@ class Fit:
     numerics : Numerics
         As asked for.
     shift : float
-        Largest movement of a parameter by halving the mesh's steps, in posterior standard
-        deviations; NaN where it was not looked at.
+        Largest movement of a parameter by halving the mesh's steps, or by what lies between their
+        points, in posterior standard deviations; NaN where it is not known.
+    motion_error : float
+        Estimated largest error of a fitted run's motion over its swing; NaN where it is not known.
     """
 
     model: Model
@@ -89,6 +109,19 @@ class Fit:
     steps: int
     numerics: Numerics
     shift: float
+    motion_error: float = float("nan")
+
+    @property
+    def doubts(self) -> list[str]:
+        """Where the estimate is that of the steps rather than of the equations."""
+        if not self.model.dofs:
+            return []
+        if not np.isfinite(self.shift):
+            return [UNKNOWN_SHIFT.format(self.steps)]
+        if self.shift > LARGEST_SHIFT:
+            least = f"{self.motion_error:.1g}" if np.isfinite(self.motion_error) else "unknown"
+            return [TOO_COARSE.format(self.steps, self.shift, LARGEST_SHIFT, least)]
+        return []
 
     @property
     def predictor(self) -> Predictor:
@@ -210,12 +243,15 @@ def fit_model(
             )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
-        shift = 0.0  # without dofs there is no mesh
+        # Without dofs there is no mesh.
+        shift, error = 0.0, 0.0
         if model.dofs:
-            shift = _mesh_shift(problem, point, predictions) if check_mesh else np.nan
+            shift = error = float("nan")
+            if check_mesh:
+                shift, error = _mesh_shift(problem, point, predictions)
         fine = not shift > LARGEST_SHIFT
         if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
-            return Fit(model, problem, mbe, point, predictions, steps, numerics, shift)
+            return Fit(model, problem, mbe, point, predictions, steps, numerics, shift, error)
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         steps, start = 2 * steps, point.theta
@@ -237,12 +273,27 @@ def _problem(
 
 
 def _mesh_shift(
-    problem: CampaignProblem,
-    point: PointEstimate,
-    predictions: list[RunPrediction],
-) -> float:
-    """Shift of the estimate that the discretisation causes, ``(J' W J)^-1 J' W delta``, in standard
-    deviations."""
+    problem: CampaignProblem, point: PointEstimate, predictions: list[RunPrediction]
+) -> tuple[float, float]:
+    """Shift of the estimate that the discretisation causes, in standard deviations, and the largest
+    error of a motion over its swing."""
+    coarse = problem.predictor
+    halved = _halved(problem, point)
+    if halved is None:
+        return float("nan"), float("nan")
+    shift = _shift(problem, point, predictions, halved)
+    found = thread_map(lambda run: motion_error(run, RESOLVED), coarse.runs, coarse.jobs)
+    error = float(np.max([one.error for one in found]))  # NaN where one is not known
+    better = [outputs_of(run, one) for run, one in zip(coarse.runs, found, strict=True)]
+    known = [y for y in better if y is not None and np.isfinite(y).all()]
+    if len(known) < len(better):
+        return shift, error
+    missed = _shift(problem, point, predictions, known)
+    return (missed if missed > max(MISSED * shift, LARGEST_SHIFT) else shift), error
+
+
+def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | None:
+    """Outputs ``(ny, N)`` of every run on half the steps; None where one has no solution."""
     coarse = problem.predictor
     theta = problem.full(point.theta[None])[0]
     fine = Predictor(
@@ -255,10 +306,20 @@ def _mesh_shift(
         share=coarse,
     )
     if any(status is not Status.CONVERGED for status in fine.set_anchor(theta)):
-        return float("nan")
-    gradient = np.zeros(theta.size)
-    for r, run in enumerate(predictions):
-        y = fine.simulate(theta[None], r).y[0]
+        return None
+    return [fine.simulate(theta[None], r).y[0] for r in range(len(fine.runs))]
+
+
+def _shift(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    better: list[Array],
+) -> float:
+    """Largest shift ``(J' W J)^-1 J' W delta`` over its standard deviation, by better outputs."""
+    names = problem.predictor.layout.names
+    gradient = np.zeros(len(names))
+    for run, y in zip(predictions, better, strict=True):
         gradient += np.einsum("ylN,yN->l", run.sensitivity, (y - run.y) / point.variance[:, None])
-    free = np.array([coarse.layout.names.index(name) for name in problem.names])
+    free = np.array([names.index(name) for name in problem.names])
     return float(np.max(np.abs(point.covariance @ gradient[free]) / point.sd, initial=0.0))

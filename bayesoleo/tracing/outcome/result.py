@@ -79,7 +79,13 @@ def point_group(fit: Fit) -> xr.Dataset:
     point = to_dataset(fit.point, mbe=fit.mbe, units=_units(fit))
     if fit.model.dofs:
         scheme = fit.numerics.scheme
-        point.attrs |= {"scheme": scheme, "steps": fit.steps, "mesh_shift": fit.shift}
+        point.attrs |= {
+            "scheme": scheme,
+            "steps": fit.steps,
+            "mesh_shift": fit.shift,
+            "motion_error": fit.motion_error,
+            "notes": json.dumps([*fit.point.notes, *fit.doubts], ensure_ascii=False),
+        }
     return point
 
 
