@@ -9,7 +9,7 @@ import pytest
 from fitted_states import NUMERICS, options
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo.tracing.deciding.elimination import _loss, dispersion, eliminated
+from bayesoleo.tracing.deciding.elimination import dispersion, eliminated, loss_without
 from bayesoleo.tracing.deciding.refit import new_parameters
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.assembly import Assembly
@@ -66,7 +66,7 @@ def test_a_loss_is_the_squared_distance_in_standard_deviations(tmp_path):
     """Of a term that is linear in its parameter: Wald and likelihood ratio agree."""
     reduced = damper_campaign(tmp_path, law(PIN, 0.0), per_period=60.3)
     state, _ = with_effects(reduced, "stroke_dependent_damping", "constant_force")
-    loss = _loss(state, state.base(), state.assembly.steps[1], NUMERICS)
+    loss = loss_without(state, state.base(), state.assembly.steps[1], NUMERICS)
     k = state.fit.problem.names.index("constant_force")
     expected = (state.fit.point.theta[k] / state.fit.point.sd[k]) ** 2
     assert loss.size == 1
@@ -77,9 +77,9 @@ def test_a_loss_is_the_squared_distance_in_standard_deviations(tmp_path):
 def test_what_is_left_beyond_the_noise_makes_unknowns_dearer(tmp_path):
     state, _ = with_effects(damper_campaign(tmp_path, law(PIN, RUB, 3.0), per_period=60.3), *BOTH)
     base = state.base()
-    loss = _loss(state, base, state.assembly.steps[0], NUMERICS)
+    loss = loss_without(state, base, state.assembly.steps[0], NUMERICS)
     assert dispersion(base) > 3.0
     assert loss.scale >= dispersion(base)
     quiet = replace(base, excess=0.0)
     assert dispersion(quiet) == 1.0
-    assert _loss(state, quiet, state.assembly.steps[0], NUMERICS).scale < loss.scale
+    assert loss_without(state, quiet, state.assembly.steps[0], NUMERICS).scale < loss.scale

@@ -24,9 +24,9 @@ from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 
-#: First effects besides the one that was taken, and how much less they may explain, beyond the
-#: price of their unknowns, to be followed.
-MOST_FOLLOWED, TIED = 2, 0.1
+#: First effects followed besides the one that was taken; and how much less one of them may explain,
+#: beyond the price of its unknowns: where causes led down to the noise, and where they did not.
+MOST_FOLLOWED, TIED, NEAR = 2, 0.02, 0.1
 #: Names stand instead of a curve only if they are better by this much (Kass and Raftery 1995).
 DECISIVE = 10.0
 
@@ -94,12 +94,14 @@ def followed(progress: Progress) -> list[Ranked]:
         and item.score.option.candidate.family != FAMILY
     ]
     most = max((worth for worth, _ in pool), default=0.0)
+    clear = final.at_floor and not _imitates(progress)
+    behind = TIED if clear else NEAR
     seen = set(final.assembly.added)
     alike = set() if taken is None else {taken.effect, *taken.same}
     chosen: list[Ranked] = []
     for worth, item in sorted(pool, key=lambda one: -one[0]):
         names = {item.effect, f"{item.effect} @ {item.target}"}
-        if worth > (1.0 - TIED) * most and (item.effect, item.target) not in seen:
+        if worth > (1.0 - behind) * most and (item.effect, item.target) not in seen:
             if not names & alike:
                 chosen.append(item)
             alike |= names | set(item.same)

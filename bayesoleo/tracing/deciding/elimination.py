@@ -56,9 +56,10 @@ class Loss:
 
     def __str__(self) -> str:
         error = float(np.sqrt(self.scale * (4.0 * max(self.rise, 0.0) + 2.0 * self.size)))
+        unknowns = "its unknown is" if self.size == 1 else f"its {self.size} unknowns are"
         return (
             f"without it the weighted squared error on fitted runs rises by"
-            f" {with_error(self.rise, error)}, and its {self.size} unknowns are worth"
+            f" {with_error(self.rise, error)}, and {unknowns} worth"
             f" {self.price * self.size * self.scale:.3g} (Schwarz 1978)"
         )
 
@@ -83,7 +84,7 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
     while len(state.assembly.steps) > 1:
         say("look whether the earlier effects are still needed")
         base = state.base()
-        losses = [_loss(state, base, step, numerics) for step in state.assembly.steps[:-1]]
+        losses = [loss_without(state, base, step, numerics) for step in state.assembly.steps[:-1]]
         least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
         if not least.worth < 0.0:
             return state
@@ -94,7 +95,8 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
     return state
 
 
-def _loss(state: State, base: Base, step: Step, numerics: Numerics) -> Loss:
+def loss_without(state: State, base: Base, step: Step, numerics: Numerics) -> Loss:
+    """What is lost without one effect of a model, everything else estimated anew."""
     without = state.assembly.without(step).model()
     fit = quick_fit(base, without, base.fit.values, numerics)
     share, changes = compare(base, fit)

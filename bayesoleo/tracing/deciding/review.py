@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.deciding.confirmation import confirmed, judged
-from bayesoleo.tracing.deciding.elimination import dispersion, eliminated
+from bayesoleo.tracing.deciding.elimination import Loss, dispersion, eliminated, loss_without
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, refit
@@ -29,8 +31,9 @@ from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score, score_all
 from bayesoleo.tracing.scoring.significance import without_twins
 
-#: Rivals of a final effect that are estimated beside the others.
-MOST_RIVALS = 5
+#: Rivals of a final effect that are estimated beside the others, and those of which it is asked
+#: whether they do without another effect.
+MOST_RIVALS, MOST_SMALLER = 5, 3
 
 Say = Callable[[str], None]
 
@@ -121,7 +124,90 @@ def reviewed(
             if found is not None:
                 return found
         progress = _with_class(progress, place)
+    return progress if curve or not replacing else _smaller(progress, roles, numerics, say)
+
+
+def _smaller(progress: Progress, roles: Roles, numerics: Numerics, say: Say) -> Progress:
+    """The search with one effect less, if another in one place makes a second superfluous.
+
+    An effect that is only near needs a companion for what it lacks; beside each other both seem to
+    be needed, and the true one in its place does without.
+    """
+    steps = progress.state.assembly.steps
+    if len(steps) < 2:
+        return progress
+    fitted = replace(roles, held_out=(), strategy="none")
+    for step in steps:
+        for result, gap in _close_rivals(progress, step):
+            state = fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
+            base = state.base()
+            say(f"look whether {result.score.option.key[0]} does without one of the others")
+            losses = [
+                loss_without(state, base, other, numerics) for other in state.assembly.steps[:-1]
+            ]
+            least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
+            if not least.worth + gap / least.scale < 0.0:
+                continue
+            found = _without_companion(progress, step, result, least, roles, numerics, say)
+            if found is not None:
+                return found
     return progress
+
+
+def _close_rivals(progress: Progress, step: Step) -> list[tuple[Refit, float]]:
+    """Estimates of what could stand in an effect's place, and by how much less they are worth: less
+    than the unknowns of another effect would be."""
+    entry = _entry_of(progress, step)
+    own = entry.accepted.refit if entry is not None and entry.accepted is not None else None
+    if entry is None or own is None or _added_by(progress, step) is not None:
+        return []  # estimated beside others than there are now
+    rivals = [
+        (item.refit, own.worth - item.refit.worth)
+        for item in entry.ranking
+        if item.refit is not None
+        and item.refit is not own
+        and not item.imitates
+        and np.isfinite(item.refit.share)
+        and item.score.option.candidate.family != FAMILY
+    ]
+    near = [one for one in rivals if one[1] < 2.0 * own.price * own.inflation]
+    return sorted(near, key=lambda one: one[1])[:MOST_SMALLER]
+
+
+def _entry_of(progress: Progress, step: Step) -> Round | None:
+    """The round that added a final effect."""
+    key = step.effect.id, step.target
+    for item in reversed(progress.rounds):
+        if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
+            return item
+    return None
+
+
+def _without_companion(
+    progress: Progress,
+    step: Step,
+    result: Refit,
+    least: Loss,
+    roles: Roles,
+    numerics: Numerics,
+    say: Say,
+) -> Progress | None:
+    """The search with a rival in a place and without another effect, if runs that were not used
+    have nothing against it."""
+    final, name = progress.state, result.score.option.key[0]
+    after = fit_state(result.assembly.without(least.step), roles, numerics)
+    if (final.at_floor and not after.at_floor) or _is_worse(final, after, result.inflation):
+        return None
+    entry = _entry_of(progress, step)
+    assert entry is not None
+    item = next(one for one in entry.ranking if one.refit is result)
+    told = (
+        f"{name} stands instead of {step.effect.id}, and then {least.step.effect.id} is not needed"
+    )
+    last = replace(entry, accepted=item, after=after, reason=f"{told}: {least}")
+    say(told)
+    notes = (*progress.notes, f"{told}: {least}")
+    return Progress(progress.first, after, (*progress.rounds[:-1], last), notes)
 
 
 def _added_by(progress: Progress, step: Step) -> int | None:

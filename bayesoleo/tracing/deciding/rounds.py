@@ -231,8 +231,11 @@ def _same(
         estimated = refits.get(id(other))
         if j == k:
             continue
-        if own is not None and estimated is not None:
+        if own is not None and estimated is not None and np.isfinite(estimated.share):
             alike = own.resembles(estimated)
+        elif own is not None and estimated is not None and own.reached:
+            # An estimate that failed tells nothing apart from what its score promises.
+            alike = not own.outdoes(other)
         else:
             alike = j in group and not (own is not None and own.outdoes(other))
         if alike:
