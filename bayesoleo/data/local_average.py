@@ -8,11 +8,12 @@ are the noise's standard error where nothing is missing, and larger where someth
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.data.smoothing import innovation_noise
+from bayesoleo.data.smoothing import HIGHEST_DIFFERENCE, innovation_noise
 
 Array = NDArray[np.float64]
 
@@ -49,6 +50,17 @@ class LocalAverage:
     def ratio(self) -> float:
         """``repeating / noise``: about one where nothing is left but noise."""
         return self.repeating / self.noise
+
+    @property
+    def free(self) -> float:
+        """Degrees of freedom of ``sigma`` squared: neighbouring differences share samples.
+
+        Those of order d are correlated so that their mean square varies as that of
+        ``1 / (binomial(4 d, 2 d) / binomial(2 d, d)**2)`` as many independent ones.
+        """
+        order = HIGHEST_DIFFERENCE
+        shared = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
+        return max(self.samples / shared, 1.0)
 
     def on_phase(self, points: int) -> Array:
         """A transient has no phase: not a number, shape (points,)."""

@@ -12,6 +12,7 @@ from small_campaigns import damper, damper_campaign, oscillator_campaign, spring
 
 from bayesoleo import schema
 from bayesoleo.data import periodic_average
+from bayesoleo.data.local_average import local_average
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.tracing.deciding.loop import close_loop
 from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
@@ -130,6 +131,19 @@ def test_less_than_chance_allows_is_told_with_its_figures():
     assert "0.16 times the expected" in sentence
     assert "measured too large" in sentence
     assert not too_quiet(ErrorTable((noise_entry(ratio=0.9),)))
+
+
+def test_differences_know_the_noise_as_well_as_they_say():
+    """Over white noise: the scatter of the estimated variance is that of so many independent
+    samples or a little less, whichever order of differences was chosen."""
+    rng = np.random.default_rng(4)
+    found = [local_average(rng.standard_normal(500)) for _ in range(600)]
+    variances = np.array([item.sigma**2 for item in found])
+    shown = 2.0 * np.mean(variances) ** 2 / np.var(variances)
+    assert found[0].free < 1.1 * shown
+    assert shown < 500 / 1.7
+    squares = np.array([item.ratio**2 for item in found])
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
 
 
 def _input_columns(seed: int = 3) -> np.ndarray:

@@ -95,6 +95,8 @@ class RunError:
     @property
     def free(self) -> float:
         """Degrees of freedom that its noise was measured with."""
+        if isinstance(self.average, LocalAverage):
+            return self.average.free
         if self.spectrum is None:
             return self.average.samples - self.average.number
         return self.spectrum.free
