@@ -196,7 +196,8 @@ def check(
 ) -> None:
     """Read a campaign and a model, say what would be done, and touch nothing.
 
-    Channels, units, conditions, priors and roles are checked against each other as close would.
+    Channels, units, conditions, priors and roles are checked against each other as close would, and
+    the model is solved once at its nominal values: turned signs and wrong units show there.
 
     \b
     Examples:
@@ -215,6 +216,7 @@ def check(
         return
     console = shell.console()
     sentences = plan.pop("findings")
+    plan.pop("start")
     tables.print_mapping(plan, console)
     for sentence in sentences:
         console.print(sentence, style="dim", markup=False, soft_wrap=True)

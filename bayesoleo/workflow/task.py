@@ -27,6 +27,7 @@ from bayesoleo.tracing.fitting.fit import first_steps
 from bayesoleo.tracing.fitting.roles import Roles, assign
 from bayesoleo.units import parse_unit, same_quantity
 from bayesoleo.workflow.settings import Settings
+from bayesoleo.workflow.start_check import about_start, as_plain, starts_of
 
 Say = Callable[[str], None]
 Source = str | os.PathLike[str] | Campaign | ReducedCampaign
@@ -192,12 +193,6 @@ def _check_units(model: Model, campaign: Campaign) -> None:
                 value=channel.unit,
                 hint=f"write a unit that converts to {unit}, or declare the model otherwise",
             )
-        if wanted.factor != 1.0 or wanted.shift != 0.0:
-            raise ModelError(
-                f"model {model.name!r}: channel {name!r} is in {unit}, but data come in SI",
-                value=unit,
-                hint=f"declare the model in {wanted.si_name}",
-            )
 
 
 def choose_drive(model: Model, campaign: Campaign, wanted: str | None) -> str | None:
@@ -220,11 +215,14 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
     -------
     dict
         Campaign, model, drive, runs by role, unknowns, outputs, steps of the mesh, number of
-        candidate effects, and what deserves a look in the records.
+        candidate effects, what the model says at its nominal values by run and output (``start``),
+        and what deserves a look in records and start.
     """
     task = prepare(campaign, model, settings)
     driven = task.assembly.model()
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
+    steps = settings.steps or first_steps(driven, task.roles.fitted)
+    starts = starts_of(driven, task.roles.fitted, steps, settings.scheme, settings.jobs)
     return {
         **task.about(),
         "inputs": list(driven.inputs),
@@ -234,10 +232,14 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         "strategy": task.roles.description,
         "unknowns": list(predictor.layout.names),
         "possible_drives": list(possible_drives(model)),
-        "steps": settings.steps or first_steps(driven, task.roles.fitted),
+        "steps": steps,
         "effects": sum(
             bool(effect.places(driven if effect.family == "sensor" else model))
             for effect in settings.searched
         ),
-        "findings": findings(task.reduced.records, task.campaign.units),
+        "start": as_plain(starts),
+        "findings": [
+            *findings(task.reduced.records, task.campaign.units),
+            *about_start(starts, driven),
+        ],
     }

@@ -1,0 +1,92 @@
+"""Turned signs and wrong units show at the nominal values; poor starts give no alarm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_campaigns import damper, damper_campaign
+
+from bayesoleo import workflow
+from bayesoleo.data import Campaign
+from bayesoleo.errors import DataWarning
+from bayesoleo.model import Model
+from bayesoleo.systems import system
+from bayesoleo.workflow import Settings
+from bayesoleo.workflow.start_check import Start, about_start
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Campaign:
+    return damper_campaign(tmp_path_factory.mktemp("damper")).campaign
+
+
+def told(campaign: Campaign, model: Model, **factors: float) -> list[str]:
+    """What is found of the start where channels are multiplied."""
+    runs = tuple(
+        replace(run, samples={k: factors.get(k, 1.0) * values for k, values in run.samples.items()})
+        for run in campaign.runs
+    )
+    plan = workflow.check(replace(campaign, runs=runs), model, Settings(jobs=1))
+    return [text for text in plan["findings"] if "nominal" in text]
+
+
+def test_an_honest_start_gives_no_alarm(campaign):
+    plan = workflow.check(campaign, damper(), Settings(jobs=1))
+    assert {item["output"] for item in plan["start"]} == {"force"}
+    assert all(item["status"] == "converged" for item in plan["start"])
+    assert all(item["correlation"] > 0.5 for item in plan["start"])
+    assert told(campaign, damper()) == []
+    assert told(campaign, damper(), force=4.0) == []
+
+
+def test_a_turned_sign_is_told_with_figures(campaign):
+    (text,) = told(campaign, damper(), force=-1.0)
+    assert text.startswith("at the nominal values force answers with the opposite sign (corr")
+    assert "-0." in text
+    assert "sign is turned looks so" in text
+
+
+@pytest.mark.parametrize(("factor", "size"), [(1e-3, "times as much"), (2e3, "times as much")])
+def test_a_unit_off_by_a_thousand_is_told(campaign, factor, size):
+    (text,) = told(campaign, damper(), force=factor)
+    assert size in text
+    assert "units of channels" in text
+
+
+def start(correlation: float, ratio: float, run: str = "a") -> Start:
+    return Start(run, "displacement", "converged", correlation, ratio)
+
+
+@pytest.mark.parametrize(
+    ("starts", "words"),
+    [
+        ([start(0.99, 10.1), start(0.98, 9.9, "b")], ["a power of ten"]),
+        ([start(0.99, 10.1), start(0.90, 9.9, "b")], []),
+        ([start(0.99, 1.01), start(0.99, 0.98, "b")], []),
+        ([start(0.3, 150.0), start(-0.2, 90.0, "b")], []),
+        ([start(0.3, 150.0), start(-0.2, 900.0, "b")], ["150 to 900 times as much"]),
+        # A resonance between the nominal and the true one of some runs.
+        ([start(-0.98, 2.0), start(0.9, 1.1, "b")], []),
+        ([start(-0.98, 2.0), start(-0.6, 1.1, "b")], ["or a resonance on the wrong side"]),
+        ([Start("a", "displacement", "converged")], []),
+        ([Start("a", "displacement", "outside")], ["no solution at its nominal values in run a"]),
+    ],
+)
+def test_what_all_runs_show_alike_is_told(starts, words):
+    found = about_start(starts, system("duffing"))
+    assert len(found) == len(words)
+    for text, word in zip(found, words, strict=True):
+        assert word in text
+
+
+def test_noise_alone_has_no_size(campaign):
+    rng = np.random.default_rng(0)
+    runs = tuple(
+        replace(run, samples={**run.samples, "force": rng.standard_normal(run.time.size)})
+        for run in campaign.runs
+    )
+    with pytest.warns(DataWarning, match="nothing in force repeats"):
+        plan = workflow.check(replace(campaign, runs=runs), damper(), Settings(jobs=1))
+    assert not [text for text in plan["findings"] if "nominal" in text]
