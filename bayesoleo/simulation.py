@@ -112,23 +112,34 @@ def simulate_like(
     """
     streams = np.random.default_rng(seed).spawn(len(records) * len(sets))
     runs, units = [], {name: item.unit for name, item in model.conditions.items()}
+    errors = []
     for k, values in enumerate(sets):
         for r, record in enumerate(records):
             label = record.label if len(sets) == 1 else f"{record.label}, draw {k + 1}"
             made = _simulated(
                 model, record, values, noise, streams[k * len(records) + r], scheme, steps
             )
+            if k == 0:
+                errors.append(made.error)
             runs.append(replace(to_simulated_run(made, units), label=label))
     wanted = (*model.inputs, *model.outputs)
     channels = {n: (c.column, c.unit) for n, c in campaign.channels.items() if n in wanted}
     return write_campaign(
         out,
         name=f"{campaign.name} simulated",
-        description=f"Simulated with {model.name} like {campaign.name}.",
+        description=f"Simulated with {model.name} like {campaign.name}.{_how_well(errors)}",
         controlled=campaign.controlled if campaign.controlled in channels else None,
         channels=channels,
         runs=runs,
     )
+
+
+def _how_well(errors: Sequence[float]) -> str:
+    """The largest error of a motion, in a sentence; none of a model that moves nothing."""
+    if not np.isfinite(errors).all():
+        return " The error of a motion could not be estimated."
+    worst = max(errors, default=0.0)
+    return f" Motions err by {worst:.1g} of their swing at most, by estimate." if worst else ""
 
 
 def _simulated(

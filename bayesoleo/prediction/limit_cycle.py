@@ -12,7 +12,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.branch import collocation_scheme
-from bayesoleo.solvers.branches.autonomous import LimitCycle, solve_limit_cycle
+from bayesoleo.solvers.branches.autonomous import LimitCycle, solve_limit_cycle, with_error
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.transient.state_space import StateSpace
@@ -57,7 +57,8 @@ def limit_cycle(
     Returns
     -------
     LimitCycle
-        With its period, multipliers, and the period's derivatives by the estimated parameters.
+        With its period, multipliers, and the period's derivatives by the estimated parameters; its
+        ``orbit.error`` is what halving the steps changes.
 
     Raises
     ------
@@ -81,9 +82,11 @@ def limit_cycle(
         if name not in names:
             raise InputError("no such dof", key=name, hint=f"there are {', '.join(names)}")
     state = np.array([start.get(name, 0.0) for name in names])
-    problem = Boundary(
-        compiled, method, 1.0, np.zeros((nu, method.phases(steps).size)), 0, len(derived.active)
-    )
+
+    def problem(count: int) -> Boundary:
+        still = np.zeros((nu, method.phases(count).size))
+        return Boundary(compiled, method, 1.0, still, 0, len(derived.active))
+
     way = _motion(space, p, state, settle, period, model.name)
     begin, length = (settle, period) if period else _last_turn(way, settle, model.name)
 
@@ -93,7 +96,18 @@ def limit_cycle(
 
     nodes, points = np.arange(steps) / steps, method.phases(steps)
     x = method.from_motion(rows(nodes), rows(points))[0]
-    return solve_limit_cycle(problem, p, x, length)
+    cycle = solve_limit_cycle(problem(steps), p, x, length)
+    if not cycle.solution.status.ok:
+        return cycle
+
+    def again(phase: Array) -> Array:
+        step, plan = cycle.solution.value / steps, method.plan(phase, steps)
+        return np.asarray(method.sample(cycle.solution.x[None, :, :, None], plan, step)[:, :, 0])
+
+    nodes, points = np.arange(2 * steps) / (2 * steps), method.phases(2 * steps)
+    x = method.from_motion(again(nodes), again(points))[0]
+    finer = solve_limit_cycle(problem(2 * steps), p, x, cycle.solution.value)
+    return with_error(cycle, problem(steps), finer)
 
 
 def _motion(

@@ -273,7 +273,7 @@ class _Way:
     ) -> tuple[Found, ErrorEstimate]:
         """An orbit with the error of its motion, and a status that compares it to the tolerance."""
         orbit, motion, slopes = found
-        if not orbit.status.ok:
+        if not orbit.status.solved:
             return found, NONE
         mesh = Mesh(np.append(orbit.phases, 1.0))
         error = estimate_error(self.problem, tableau(method), p, motion, mesh, self.tolerance)

@@ -12,6 +12,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.model.kernels import kernels
+from bayesoleo.prediction.motion_error import motion_error
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
@@ -126,6 +127,8 @@ class Simulation:
         All inputs and outputs of the model, SI, with noise where asked for.
     conditions : mapping of str to float
         SI.
+    run : RunPredictor, optional
+        By which it was made.
     """
 
     label: str
@@ -135,6 +138,20 @@ class Simulation:
     time: Array
     samples: Mapping[str, Array]
     conditions: Mapping[str, float]
+    run: RunPredictor | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def error(self) -> float:
+        """Estimated largest error of the motion over its swing, looked for between the steps too.
+
+        It is estimated when it is asked for. Zero of a model without dofs; NaN where there is no
+        estimate.
+        """
+        if self.run is None:
+            return float("nan")
+        if not self.run.kernels.derived.dofs:
+            return 0.0
+        return motion_error(self.run).error
 
 
 def simulate_run(
@@ -181,7 +198,7 @@ def simulate_run(
     noise, quantisation, values = noise or {}, quantisation or {}, values or {}
     _check_plan(model, plan, values)
     _check_channels(model, plan, noise, quantisation, rng)
-    clean = _clean_samples(model, plan, values, steps, scheme, backend)
+    clean, run = _clean_samples(model, plan, values, steps, scheme, backend)
     samples = {}
     for name, x in clean.items():
         if noise.get(name, 0.0) > 0 and rng is not None:
@@ -197,6 +214,7 @@ def simulate_run(
         plan.time,
         samples,
         dict(plan.conditions),
+        run,
     )
 
 
@@ -248,8 +266,8 @@ def _check_channels(
 
 def _clean_samples(
     model: Model, plan: RunPlan, values: Mapping[str, float], steps: int, scheme: str, backend: str
-) -> dict[str, Array]:
-    """All channels without noise, inputs first."""
+) -> tuple[dict[str, Array], RunPredictor]:
+    """All channels without noise, inputs first, and what they were made by."""
     record = record_of(model, plan)
     inputs = {name: record.samples[name] for name in _moved(model)}
     run = RunPredictor(model, kernels(model, model.estimated(), backend), record, steps, scheme)
@@ -266,7 +284,7 @@ def _clean_samples(
             run=plan.label,
             hint="change the motion, the conditions or the parameter values",
         )
-    return inputs | dict(zip(run.kernels.derived.outputs, answer.y[0], strict=True))
+    return inputs | dict(zip(run.kernels.derived.outputs, answer.y[0], strict=True)), run
 
 
 def record_of(model: Model, plan: RunPlan) -> Record:

@@ -65,6 +65,11 @@ def test_period_of_a_limit_cycle_by_name():
     assert cycle.orbit.status is Status.CONVERGED
     assert cycle.orbit.period == pytest.approx(6.6632868593, rel=1e-8)
     assert cycle.own == pytest.approx(1.0, abs=1e-7)
+    # Steps of 1/32 of a period leave an error that is told, and is larger than the period's.
+    coarse = limit_cycle(system("van_der_pol"), {"position": 1.0}, 40.0, steps=32)
+    late = abs(coarse.orbit.period / 6.6632868593 - 1.0)
+    assert cycle.orbit.error < 1e-5
+    assert coarse.orbit.error > max(late, 10 * cycle.orbit.error)
 
 
 def test_bad_input_is_named():

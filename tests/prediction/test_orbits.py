@@ -148,7 +148,8 @@ def test_a_library_integrates_the_stiff_contact_too(integrator):
     found = shoot_by_library(
         space, shot.p[0], 1.0, np.array([0.5, 0.0]), integrator=integrator, tolerance=1e-8
     )
-    assert found.orbit.status is Status.CONVERGED
+    # By itself the library estimates no error of the motion.
+    assert found.orbit.status is Status.NO_ERROR_ESTIMATE
     np.testing.assert_allclose(found.sample(PHASES)[0], shot.rows(PHASES)[0, 0], atol=2e-6)
     there = shot.rows_by_parameter(PHASES)[0, 0]
     np.testing.assert_allclose(

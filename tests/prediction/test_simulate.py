@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -178,3 +180,15 @@ def test_a_motion_beyond_the_gas_volume_is_an_error():
     plan = RunPlan("far", 0.5, {"displacement": motion(0.2, [0.1])})
     with pytest.raises(InputError, match=r"run far: model 'f16n2d2' has no periodic answer"):
         simulate_run(OLEO, plan)
+
+
+def test_a_simulation_knows_the_error_of_its_motion():
+    """Of a harmonic too fast for the steps it is large, and by many steps it is the difference."""
+    fast = force_plan(samples_per_period=333.3)
+    fast = replace(fast, inputs={"force": motion(0.0, [1.0, *[0.0] * 98, 500.0])})
+    coarse = simulate_run(OSCILLATOR, fast, steps=128)
+    fine = simulate_run(OSCILLATOR, fast, steps=4096)
+    true = np.abs(coarse.samples["displacement"] - fine.samples["displacement"]).max()
+    assert fine.error < 1e-5
+    assert coarse.error > true / np.ptp(fine.samples["displacement"])
+    assert coarse.error > 0.01

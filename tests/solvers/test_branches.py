@@ -176,7 +176,8 @@ def test_period_of_van_der_pol_and_its_derivative(mu, steps, guess):
         for value in (mu, mu + 1e-4, mu - 1e-4)
     ]
     cycle = cycles[0]
-    assert cycle.orbit.status is Status.CONVERGED
+    # Solved for, without a look at finer steps.
+    assert cycle.orbit.status is Status.NO_ERROR_ESTIMATE
     assert cycle.own == pytest.approx(1.0, abs=1e-7)
     assert cycle.stable
     period = return_time(mu, cycle.orbit.states[0])

@@ -24,6 +24,7 @@ from bayesoleo.solvers.branches.bordered import (
 )
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.periodic.solve import Boundary
+from bayesoleo.solvers.status import Status
 
 Array = NDArray[np.float64]
 
@@ -58,11 +59,11 @@ class LimitCycle:
         """Whether all multipliers but the motion's own lie inside the unit circle."""
         values = self.orbit.multipliers
         others = np.delete(values, np.argmin(np.abs(values - 1.0)))
-        return self.orbit.status.ok and bool(np.all(np.abs(others) < 1.0))
+        return self.orbit.status.solved and bool(np.all(np.abs(others) < 1.0))
 
     def __repr__(self) -> str:
         status = self.orbit.status
-        if not status.ok:
+        if not status.solved:
             return f"limit cycle, {status.name.lower().replace('_', ' ')}"
         kind = "stable" if self.stable else "unstable"
         return f"{kind} limit cycle of period {self.solution.value:.8g} s"
@@ -86,6 +87,7 @@ def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> L
     Returns
     -------
     LimitCycle
+        Without an estimate of its error; see :func:`with_error`.
     """
 
     def family(value: float) -> tuple[Boundary, Array]:
@@ -104,11 +106,43 @@ def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> L
         states=solution.x[:, :D],
         period=solution.value,
         multipliers=multipliers,
-        status=solution.status,
+        status=Status.NO_ERROR_ESTIMATE if solution.status.ok else solution.status,
         error=np.nan,
         evaluations=4 * solution.iterations * problem.inputs.shape[1],
     )
     return LimitCycle(solution, orbit, _period_theta(family, solution, condition))
+
+
+def with_error(cycle: LimitCycle, problem: Boundary, finer: LimitCycle) -> LimitCycle:
+    """A cycle with its error, by the same cycle on steps half as long.
+
+    Parameters
+    ----------
+    cycle : LimitCycle
+        Of :func:`solve_limit_cycle`.
+    problem : Boundary
+        As solved.
+    finer : LimitCycle
+        On twice as many steps of equal length, started from it.
+
+    Returns
+    -------
+    LimitCycle
+        Its error is the larger of those of a state over its swing and of the period over itself.
+        Where the finer one failed there is none, as its status says.
+    """
+    if not (cycle.solution.status.ok and finer.solution.status.ok):
+        return cycle
+    scheme, x, states = problem.scheme, cycle.solution.x, finer.orbit.states
+    plan, step = scheme.plan(finer.orbit.phases, len(x)), cycle.solution.value / len(x)
+    rows = scheme.sample(x[None, :, :, None], plan, step)[0, :, 0]
+    first = np.cumsum([0, *(order + 1 for order in scheme.orders)])
+    kept = [int(first[j]) + k for j, o in enumerate(scheme.orders) for k in range(o)]
+    swing = np.maximum(np.ptp(states, axis=0), 1e-300)
+    away = float((np.abs(rows[kept].T - states).max(axis=0) / swing).max())
+    late = abs(finer.solution.value / cycle.solution.value - 1.0)
+    orbit = replace(cycle.orbit, status=Status.CONVERGED, error=max(away, late))
+    return replace(cycle, orbit=orbit)
 
 
 def _period_theta(family: Family, solution: BorderedSolution, condition: Condition) -> Array:

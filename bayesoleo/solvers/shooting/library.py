@@ -203,7 +203,8 @@ class _Library:
     def found(self, path: Any, end: Array) -> LibraryShot:
         D = self.space.size
         inside = self.space.admissible(path.t, path.y[None, :: end.shape[1]], self.p[None])
-        status = Status.CONVERGED if inside.all() else Status.INADMISSIBLE
+        # By itself it estimates no error of what it found.
+        status = Status.NO_ERROR_ESTIMATE if inside.all() else Status.INADMISSIBLE
         monodromy = end[:, 1 : 1 + D]
         start_theta = np.linalg.solve(np.eye(D) - monodromy, end[:, 1 + D :])
         states = path.y[:: end.shape[1], :-1].T

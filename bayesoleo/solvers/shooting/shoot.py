@@ -89,14 +89,14 @@ class Shot:
         return np.einsum("zdn,da->zan", by[:, :D], self.start_theta) + by[:, D:]
 
     def orbit(self) -> Orbit:
-        """The motion as every solver returns it."""
+        """The motion as every solver returns it; by itself shooting estimates no error of it."""
         path = self.trajectory
         return Orbit(
             phases=(path.times[:-1] - path.times[0]) / max(self.period, 1e-300),
             states=path.states[:-1],
             period=self.period,
             multipliers=floquet_multipliers(self.monodromy),
-            status=self.status,
+            status=Status.NO_ERROR_ESTIMATE if self.status.ok else self.status,
             error=np.nan,
             evaluations=self.evaluations,
         )
