@@ -136,7 +136,7 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
 _SURE = {
     schema.CERTAIN: (
         "Certain: it was added alone, nothing else is significant beside it, no other effect"
-        " explains as much, and what is left is expected."
+        " explains as much, and the error is what is expected."
     ),
     schema.PROBABLE: (
         "Probable: it explains the data best of what was tried, which is not all there is."
@@ -206,6 +206,9 @@ def _large(summary: Mapping[str, Any]) -> str:
         if row[0].split("[")[0] in new:
             cells = dict(zip(table.head, row, strict=True))
             interval = cells["95 % interval"]
+            if summary["parameters"][row[0]].get("shared_with"):
+                texts.append(f"{row[0]} {interval}")
+                continue
             text = f"{row[0]} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
             known = any(character.isdigit() for character in interval)
             texts.append(f"{text} (95 %: {interval})" if known else text)

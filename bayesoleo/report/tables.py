@@ -248,6 +248,8 @@ def parameters(summary: Mapping[str, Any]) -> Table:
         values = [_scaled(entry[key], scale, sd) for key in ("estimate", "mean", "sd")]
         interval = entry["interval"]
         text = "–"
+        if entry.get("shared_with"):
+            text = f"shared with {entry['shared_with']}"
         if interval is not None:
             text = " … ".join(_scaled(bound, scale, sd) for bound in interval)
         known = entry.get("tolerance")

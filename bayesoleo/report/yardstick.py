@@ -32,8 +32,8 @@ def too_small(errors: Mapping[str, Any]) -> bool:
 
 def words(summary: Mapping[str, Any]) -> str:
     """What the errors of a summary are multiples of."""
-    runs = next(iter(summary["rounds"][-1].get("error", {}).values()), {})
-    pooled = [e for outputs in summary["error_after"].values() for e in outputs.values()]
-    entries = [*runs.values(), *pooled]
-    known = any(schema.RATIO_TO_EXPECTED in errors for errors in entries)
+    errors = summary["rounds"][-1].get("error", {}).values()
+    entries = [e for tables in (errors, summary["error_after"].values())
+               for table in tables for e in table.values()]  # fmt: skip
+    known = any(schema.RATIO_TO_EXPECTED in entry for entry in entries)
     return "what is expected" if known else "its noise"

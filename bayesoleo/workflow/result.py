@@ -20,6 +20,7 @@ from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.experiments.questions import Question
 from bayesoleo.tracing.experiments.stored import proposals_entry, proposals_group
 from bayesoleo.tracing.fitting.fit import Fit
+from bayesoleo.tracing.outcome.curves import CurveFacts
 from bayesoleo.tracing.outcome.result import (
     loop_groups,
     point_group,
@@ -122,7 +123,10 @@ def result_tree(
     # Bare names: they stay true when the folder moves.
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}
     files = {} if output.folder is None else names
-    summary = summarise(loop, samples, {**task.about(), "files": files})
+    facts = stages.attempt(
+        stage_names.PREDICTIONS, lambda: CurveFacts.of(loop.final), lambda: CurveFacts()
+    )
+    summary = summarise(loop, samples, {**task.about(), "files": files}, facts)
     summary["notes"] = [*summary["notes"], *findings(task.reduced.records, task.campaign.units)]
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     summary[schema.UNFINISHED] = list(stages.failed)

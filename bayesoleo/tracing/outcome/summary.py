@@ -15,10 +15,14 @@ from bayesoleo.tracing.deciding.loop import ON_LIMIT, ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.errors.floor import LEAST_RATIO, limit, lowest
+from bayesoleo.tracing.outcome.curves import CurveFacts
 
 
 def summarise(
-    loop: ClosedLoop, samples: Samples | None, about: Mapping[str, Any]
+    loop: ClosedLoop,
+    samples: Samples | None,
+    about: Mapping[str, Any],
+    facts: CurveFacts | None = None,
 ) -> dict[str, Any]:
     """Describe a closed loop in the terms of the summary's JSON Schema.
 
@@ -29,6 +33,8 @@ def summarise(
         Posterior of the final model; without it the parameters have no mean and no interval.
     about : mapping
         ``campaign``, ``model``, ``drive``, ``seed`` and other keys for the top level.
+    facts : CurveFacts, optional
+        Of the final model's curves; found out if they are not given.
 
     Returns
     -------
@@ -36,12 +42,13 @@ def summarise(
         Checked against the schema.
     """
     final, stability, titles = loop.final, loop.final.stability, titles_of(loop)
+    facts = CurveFacts.of(final) if facts is None else facts
     summary = {
         **about,
         "rounds": [_round(item, titles) for item in loop.rounds],
         "effects": list(loop.effects),
         "targets": list(loop.targets),
-        "parameters": _parameters(final, samples),
+        "parameters": _parameters(final, samples, facts.shared),
         "error_before": _by_role(loop.first),
         "error_after": _by_role(final),
         "verdict": loop.verdict,
@@ -58,6 +65,7 @@ def summarise(
         },
         "notes": [
             *(told(note, titles) for note in loop.notes),
+            *facts.notes,
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
             *_input_noise_notes(final),
@@ -93,7 +101,7 @@ def _round(item: Round, titles: Mapping[str, str]) -> dict[str, Any]:
         "accepted": item.accepted.effect if item.accepted else None,
         "accepted_target": item.accepted.target if item.accepted else None,
         "reason": told(item.reason, titles),
-        "failed": dict(item.failed),
+        "failed": {label: told(reason, titles) for label, reason in item.failed.items()},
     }
 
 
@@ -139,7 +147,9 @@ def _candidate(ranked: Ranked) -> dict[str, Any]:
     } | ({"closest": near} if near else {})
 
 
-def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, Any]]:
+def _parameters(
+    state: State, samples: Samples | None, shared: Mapping[str, str]
+) -> dict[str, dict[str, Any]]:
     fit, table = state.fit, {}
     for k, name in enumerate(fit.problem.names):
         owner = fit.predictor.layout.parameters[fit.predictor.layout.names.index(name)]
@@ -161,6 +171,8 @@ def _parameters(state: State, samples: Samples | None) -> dict[str, dict[str, An
                 "sd": float(draws.std()),
                 "interval": [float(low), float(high)],
             }
+        if name in shared:  # what is shown for certain would be the convention's, not the data's
+            entry |= {"sd": None, "interval": None, "shared_with": shared[name]}
         table[name] = entry
     return table
 

@@ -109,8 +109,25 @@ class Motions:
 
     def at(self, r: int, k: int, phase: Array) -> Array:
         """Quantity number ``k`` in run number ``r`` at phases in cycles, shape (N,)."""
+        present = self.fit.predictor.constants(
+            self.fit.problem.full(self.fit.point.theta[None]), r
+        )[0]
+        return self.along(self.fit.predictor.runs[r], present, k, phase)
+
+    def along(self, run: RunPredictor, constants: Array, k: int, phase: Array) -> Array:
+        """Quantity number ``k`` along any solved run of the model, shape (N,).
+
+        Parameters
+        ----------
+        run : RunPredictor
+        constants : ndarray
+            The run's, in the order of its kernels.
+        k : int
+        phase : ndarray, shape (N,)
+            In cycles.
+        """
         function, items = self._functions[k]
-        columns = [_row(self.fit, r, item, phase) for item in items]
+        columns = [_row(run, constants, item, phase) for item in items]
         with np.errstate(all="ignore"):
             found: Array = np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)
         return found
@@ -173,19 +190,17 @@ def _driven(assembly: Assembly, item: Quantity) -> sp.Expr | None:
     return driven.output(name) if name in driven.outputs else None
 
 
-def _row(fit: Fit, r: int, item: sp.Symbol, phase: Array) -> Array:
+def _row(run: RunPredictor, present: Array, item: sp.Symbol, phase: Array) -> Array:
     """A symbol of the driven model: of a dof, an input or a constant. Not a number where it is
     none of them, as a channel fed back within an effect, or where the run has no solution."""
-    run: RunPredictor = fit.predictor.runs[r]
     name, order = split_derivative(item)
     motions = run.known_motions()
     if name in motions:
         rows: Array = motions[name](phase)
         return rows[order]
-    if name in fit.predictor.model.inputs:
+    if name in run.model.inputs:
         return signal_of(run.record, name, order).evaluate(phase, run.record.rate, order)
     constants = run.kernels.derived.constants
     if name in constants:
-        present = fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
         return np.asarray(present[constants.index(name)])
     return np.full(phase.size, np.nan)
