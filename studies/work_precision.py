@@ -104,7 +104,7 @@ class Problem:
             found = solve_adaptive(
                 self.pieces, self.p, guess, method=method, tolerance=tolerance
             )  # fmt: skip
-            return found.motion if found.orbit.status.ok else None
+            return found.motion if found.orbit.status.solved else None
 
         return solve
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from chaotic_records import Chaos
@@ -131,6 +133,10 @@ def test_estimate_and_covariance_are_those_of_the_closed_form():
     np.testing.assert_allclose(found.point.variance, variance, rtol=1e-5)
     np.testing.assert_allclose(np.sqrt(np.diag(found.point.covariance_likelihood)), sd, rtol=1e-3)
     assert found.trajectories[1].time[0] == 5.0
+    assert found.doubt == ""
+    assert "too coarse" in str(replace(found, shift=0.3))
+    assert "moved a parameter by 0.3 of its standard deviations" in str(replace(found, shift=0.3))
+    assert "nothing is known" in replace(found, shift=np.nan).doubt
 
 
 def test_the_prior_pulls_the_mode_and_not_the_robust_estimate():

@@ -105,8 +105,20 @@ class ShootingEstimate:
         """How the iteration ended."""
         return self.point.status
 
+    @property
+    def doubt(self) -> str:
+        """Where the estimate may be that of the steps, in a sentence; empty where it is not."""
+        if np.isnan(self.shift):
+            return "the mesh was not refined: nothing is known of what its steps do to the estimate"
+        if self.shift <= LARGEST_SHIFT:
+            return ""
+        return (
+            f"the mesh is too coarse: its last refinement moved a parameter by {self.shift:.2g} of"
+            f" its standard deviations, where {LARGEST_SHIFT:g} are allowed"
+        )
+
     def __str__(self) -> str:
-        return str(self.point)
+        return "\n".join(filter(None, [str(self.point), self.doubt]))
 
 
 def multiple_shooting(
