@@ -175,7 +175,9 @@ def _channel(name: str, table: Any) -> Channel:
     scale = get_value(table, f"{inside}.scale", float, "a number", default=1.0)
     accuracy = get_value(table, f"{inside}.accuracy", float, "a positive number", default=None)
     hint = "the highest frequency in Hz that counts as an input, or inf"
-    bandwidth = get_value(table, f"{inside}.bandwidth", float, hint, default=None)
+    bandwidth = table.get(f"{inside}.bandwidth")
+    if bandwidth != np.inf:
+        bandwidth = get_value(table, f"{inside}.bandwidth", float, hint, default=None)
     for key, value in (
         ("scale", scale != 0),
         ("accuracy", accuracy is None or accuracy > 0),

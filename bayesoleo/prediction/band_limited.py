@@ -65,7 +65,12 @@ def band_limited(
     curves = []
     for order in range(DERIVATIVES + 1):
         cut = spectrum.cut(order)
-        band = Band(cut, spectrum.fastest(_UNRESOLVED, order, cut))
+        band = Band(
+            cut,
+            spectrum.fastest(_UNRESOLVED, order, cut),
+            spectrum.held(cut, order),
+            spectrum.lost(cut, order),
+        )
         curves.append(_curve(values, step, band, noise))
     return replace(curves[0], derivatives=tuple(curves[1:]))
 
@@ -81,7 +86,11 @@ def _of_few(values: Array, step: float) -> Smoothed:
 
 
 def declared(
-    values: Array, step: float, bandwidth: float, spectrum: Spectrum | None = None
+    values: Array,
+    step: float,
+    bandwidth: float,
+    spectrum: Spectrum | None = None,
+    fade: float = 0.5,
 ) -> Smoothed:
     """The curve up to a frequency that is given, whatever is done with it.
 
@@ -94,11 +103,13 @@ def declared(
         Hz.
     spectrum : Spectrum, optional
         Of the samples, for their noise.
+    fade : float
+        Part of the bandwidth over which the curve fades out above it.
     """
     highest = 0.5 / step
     cut = bandwidth if bandwidth < highest else np.inf
     noise = 0.0 if spectrum is None else noise_of(spectrum)
-    return _curve(values, step, Band(cut, min(cut, highest)), noise)
+    return _curve(values, step, Band(cut, min(cut, highest), fade=fade), noise)
 
 
 def band_limited_channels(
@@ -133,7 +144,7 @@ def band_limited_channels(
         if (
             curve.band is not None
             and np.isfinite(curve.band.cut)
-            and _answered(samples[name], others, step, curve.band.cut)
+            and answered(samples[name], others, step, curve.band.cut)
         ):
             whole = _curve(samples[name], step, Band(np.inf, 0.5 / step), curve.noise)
             curves[name] = replace(whole, derivatives=curve.derivatives)
@@ -161,8 +172,18 @@ def sample_noise(values: Array, step: float) -> float:
     return smooth_signal(values, step).noise if spectrum is None else spectrum.noise
 
 
-def _answered(values: Array, others: list[Array], step: float, above: float) -> bool:
-    """Whether any other channel is coherent with one above a frequency."""
+def answered(values: Array, others: list[Array], step: float, above: float) -> bool:
+    """Whether any other channel is coherent with one above a frequency.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    others : list of ndarray, shape (N,)
+    step : float
+        Sampling interval, s.
+    above : float
+        Hz.
+    """
     size = segment_length(values.size)
     for other in others:
         f, found = signal.coherence(values, other, 1.0 / step, "hann", size, size // 2)

@@ -42,17 +42,24 @@ class Band:
         Frequency in Hz above which there was nothing but noise; infinite where nothing is cut off.
     upper : float
         Frequency in Hz above which there is a negligible part of the curve.
+    held, lost : float
+        Root mean square of what the curve holds, and of what was cut off beyond a flat floor of
+        noise; of the derivative that it is for.
+    fade : float
+        Part of the cut over which the gain falls to nothing.
     """
 
     cut: float
     upper: float
+    held: float = 0.0
+    lost: float = 0.0
+    fade: float = 0.5
 
     def gain(self, frequency: Array) -> Array:
-        """Part of an amplitude that stays, shape of `frequency`: falls from `cut` to half as much
-        again."""
+        """Part of an amplitude that stays, shape of `frequency`."""
         if not np.isfinite(self.cut):
             return np.ones(frequency.shape)
-        part = np.clip(2.0 * (frequency / self.cut - 1.0), 0.0, 1.0)
+        part = np.clip((frequency / self.cut - 1.0) / self.fade, 0.0, 1.0)
         return np.asarray(np.cos(0.5 * np.pi * part) ** 2)
 
 

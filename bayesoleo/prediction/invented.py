@@ -34,6 +34,8 @@ _INVENTED, _OFF = 100.0, 10.0
 #: Parts of an output's power: what an invented band has at least (a hundredth of the amplitude),
 #: and what is none.
 _MATTERS, _NONE = 1e-4, 1e-6
+#: Part of the frequency over which a transient's input fades out: less than a band.
+_FADE = 0.15
 #: Part of what was invented that may be left by the cut.
 _LEFT = 0.1
 
@@ -182,7 +184,7 @@ def cut_off(record: Record, channel: str, frequency: float, order: int) -> Recor
         return record
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     values = item.for_derivative(order).at(record.time - record.time[0])
-    lower = replace(declared(values, step, frequency), noise=item.noise)
+    lower = replace(declared(values, step, frequency, fade=_FADE), noise=item.noise)
     return replace(
         record,
         smoothed={**record.smoothed, channel: replace(item, derivatives=(lower, lower))},

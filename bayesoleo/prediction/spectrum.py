@@ -97,6 +97,23 @@ class Spectrum:
         above = np.cumsum(power[::-1])[::-1]
         return float(self.frequency[np.flatnonzero(above >= part * above[0])[-1]])
 
+    def held(self, cut: float, derivative: int) -> float:
+        """Root mean square of a derivative up to a cut in Hz."""
+        power = self.frequency ** (2 * derivative) * self.density * (self.frequency <= cut)
+        return self._root(power, derivative)
+
+    def lost(self, cut: float, derivative: int) -> float:
+        """Root mean square of a derivative above a cut, where it clearly exceeds the floor."""
+        above = np.zeros(self.frequency.size)
+        for first, end in self._parts(derivative):
+            above[first:end] = np.maximum(self.density - self.floor, 0.0)[first:end]
+        power = self.frequency ** (2 * derivative) * above * (self.frequency > cut)
+        return self._root(power, derivative)
+
+    def _root(self, power: Array, derivative: int) -> float:
+        total = float(np.sqrt(power.sum() * self.frequency[0]))
+        return float((2.0 * np.pi) ** derivative * total)
+
     def cut(self, derivative: int) -> float:
         """Frequency above which there is nothing but noise, for a derivative to be taken.
 

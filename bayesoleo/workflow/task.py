@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from bayesoleo import schema
 from bayesoleo.data import (
     Campaign,
@@ -20,7 +22,9 @@ from bayesoleo.data import (
 from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
+from bayesoleo.model.derive import derive
 from bayesoleo.prediction.invented import Invented, without_invented
+from bayesoleo.prediction.lost import Lost, lost_inputs
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import first_steps
@@ -150,6 +154,11 @@ def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:
     records, invented = without_invented(model, reduced.records, given)
     for item in invented:
         warnings.warn(_about(item, reduced.campaign.units), DataWarning, stacklevel=2)
+    derived = derive(model)
+    missing = lost_inputs(derived.inputs, derived.outputs, records)
+    for lost in missing:
+        if lost.channel not in given:
+            warnings.warn(_about_lost(lost, reduced.campaign.units), DataWarning, stacklevel=2)
     return ReducedCampaign(reduced.campaign, records) if invented else reduced
 
 
@@ -162,6 +171,30 @@ def _about(item: Invented, units: Mapping[str, str]) -> str:
         f"{item.derivative}, where {item.measured:.2g} {outside} were measured; as an input "
         f"{item.channel} ends there. To decide otherwise write bandwidth = … in Hz under "
         f"[channels.{item.channel}], inf for all of it"
+    )
+
+
+def _about_lost(item: Lost, units: Mapping[str, str]) -> str:
+    """What an input lacks, as a sentence."""
+    unit = units.get(item.channel, "(SI)") + (f"/s^{item.derivative}" if item.derivative else "")
+    share = f"{item.lost:.2g} of {np.hypot(item.held, item.lost):.2g} {unit}"
+    run, name = f"run {item.run}", item.channel
+    if item.why == "masked":
+        return (
+            f"{run}: as an input {name} is a straight line where it is masked, for up to "
+            f"{item.where:.3g} s; elsewhere such a line misses it by {share}. Cut the run there "
+            "with start or stop"
+        )
+    if item.why == "repeating":
+        return (
+            f"{run}: {share} of {name} do not repeat and are no input of a periodic run, although "
+            "an output answers to them; declare the run as kind = 'transient'"
+        )
+    what = f"derivative {item.derivative} of {name}" if item.derivative else name
+    return (
+        f"{run}: of {what}, {share} above {item.where:.4g} Hz are left out of the input, next to "
+        "its noise but no flat part of it. To decide otherwise write bandwidth = … in Hz under "
+        f"[channels.{name}], inf for all of it"
     )
 
 
