@@ -12,6 +12,7 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, whereabouts
 from bayesoleo.effects.titles import called, listed
+from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.errors import InputError
 from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.report import sentences
@@ -199,8 +200,13 @@ def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _large(summary: Mapping[str, Any]) -> str:
     """The new parameters as the table shows them."""
-    new = {key.split("[")[0] for entry in summary["rounds"]
-           for key in (chosen(entry) or {}).get("expected", {})}  # fmt: skip
+    added = [chosen(entry) or {} for entry in summary["rounds"]]
+    new = {
+        key.split("[")[0]
+        for one in added
+        if one.get("family") != FAMILY  # the coefficients of a curve say nothing one by one
+        for key in one.get("expected", {})
+    }
     table, texts = parameters(summary), []
     for row in table.rows:
         if row[0].split("[")[0] in new:
@@ -214,7 +220,9 @@ def _large(summary: Mapping[str, Any]) -> str:
             texts.append(f"{text} (95 %: {interval})" if known else text)
     most = 6
     rest = f" and {len(texts) - most} more" if len(texts) > most else ""
-    return f"{', '.join(texts[:most])}{rest}." if texts else ""
+    drawn = any(one.get("family") == FAMILY for one in added)
+    curve = "The curve and its band are drawn below, in the round that added it." if drawn else ""
+    return " ".join(filter(None, [f"{', '.join(texts[:most])}{rest}." if texts else "", curve]))
 
 
 def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:

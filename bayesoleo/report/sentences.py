@@ -43,11 +43,11 @@ def _said(summary: Mapping[str, Any]) -> str:
         return f"Certain: {found} {was} missing; {down}."
     if sure == schema.PROBABLE:
         return f"Probable: {found} {was} missing; {down}.{_class(summary)}"
-    if sure == schema.NO_CAUSE:
+    if sure == schema.NO_CAUSE and summary["verdict"] == schema.EFFECT_ADDED:
         return f"No cause is named: {found} {was} added; {down}.{_class(summary)}"
-    return (
-        f"A likeness only: {found} {was} added, and {_size_left(summary)}{_unexplained(summary)}."
-    )
+    lead = "No cause is named" if sure == schema.NO_CAUSE else "A likeness only"
+    left = f"{_size_left(summary)}{_unexplained(summary)}"
+    return f"{lead}: {found} {was} added, and {left}."
 
 
 def certainty(summary: Mapping[str, Any]) -> str | None:

@@ -55,6 +55,11 @@ def test_each_certainty_has_its_word():
     assert none.startswith("No cause is named: a smooth function of stroke (force) was added; ")
 
 
+def test_a_curve_that_leaves_an_error_names_no_cause_either():
+    text = told(["unnamed_stroke @ force"], schema.NO_CAUSE, ratio=6.0, verdict=schema.UNEXPLAINED)
+    assert text.startswith("No cause is named: unnamed stroke (force) was added, and the error of")
+
+
 def test_a_class_is_said_with_titles():
     text = told(["coulomb_friction @ stroke"], schema.PROBABLE,
                 alike=["stribeck_friction", "coulomb_friction @ arm"])  # fmt: skip

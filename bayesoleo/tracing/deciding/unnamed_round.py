@@ -303,8 +303,7 @@ def unnamed_notes(rounds: Sequence[Round]) -> list[str]:
         item = entry.accepted
         if item is None or item.score.option.candidate.family != FAMILY:
             continue
-        title = item.score.option.assembly.steps[-1].effect.title
         near = ", ".join(f"{effect} (cosine {cosine:.2f})" for effect, cosine in item.closest)
-        text = f"{item.effect} is no named effect. {title}, in the balance of {item.target}"
+        text = f"{item.effect} @ {item.target} is no named effect"
         found.append(text + (f"; the named ones most like it: {near}" if near else ""))
     return found

@@ -53,10 +53,10 @@ def certainty_of(final: State, certain: bool) -> str | None:
     steps = final.assembly.steps
     if not steps:
         return None
-    if not _as_expected(final):
-        return schema.LIKENESS
     if all(step.effect.family in NO_CAUSE for step in steps):
         return schema.NO_CAUSE
+    if not _as_expected(final):
+        return schema.LIKENESS
     return schema.CERTAIN if certain else schema.PROBABLE
 
 
