@@ -146,6 +146,14 @@ def test_differences_know_the_noise_as_well_as_they_say():
     assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
 
 
+def test_a_poorly_known_run_may_be_predicted_well_by_chance():
+    """Nine tenths of what is expected are one unknown's, which may happen to be right."""
+    vague = noise_entry(parameters=np.array([[0.9]]), own_share=0.1)
+    sharp = noise_entry()
+    assert lowest([vague]) == pytest.approx(np.sqrt(0.1) * lowest([sharp]))
+    assert lowest([vague, vague]) > lowest([vague])
+
+
 def _input_columns(seed: int = 3) -> np.ndarray:
     """Forty harmonics with rising power, as a model that differentiates makes them."""
     phase = np.arange(400) / 100.0

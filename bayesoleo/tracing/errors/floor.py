@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -47,6 +48,9 @@ def limit(entries: Sequence[RunError], tests: int = 1) -> float:
 def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
     """Ratio to what is expected that chance hardly falls below.
 
+    The unknowns' errors may be nothing by chance, but noise is always there: the limit is that of
+    the noise alone.
+
     Parameters
     ----------
     entries : sequence of RunError
@@ -54,7 +58,12 @@ def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
     tests : int
         Ratios that are looked at together.
     """
-    return math.sqrt(max(_quantile(entries, 1.0 - FALSE_ALARM / tests), 0.0))
+    own = float(np.mean([entry.own_share for entry in entries]))
+    none = np.zeros((0, 0))
+    noise = [replace(e, parameters=none, own_share=e.own_share / own) for e in entries]
+    share, number, free = _variate(noise)
+    square = 1.0 + share * (float(stats.f.ppf(FALSE_ALARM / tests, number, free)) - 1.0)
+    return math.sqrt(own * max(square, 0.0))
 
 
 def chance(entries: Sequence[RunError]) -> float:
