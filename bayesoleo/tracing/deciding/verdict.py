@@ -75,11 +75,11 @@ def explained_by_physics(rounds: Sequence[Round], first: State, final: State) ->
     whole = max(excess(first), 1e-300)
     if all(step.effect.family not in NO_CAUSE for step in final.assembly.steps):
         return (excess(first) - excess(final)) / whole if added else 0.0
-    states = [*(item.before for item in rounds), final]
+    # A round that replaced an effect begins without it, not where the round before it ended.
     return sum(
-        (excess(before) - excess(after)) / whole
-        for item, before, after in zip(rounds, states, states[1:], strict=False)
-        if _is_physics(item, added)
+        (excess(item.before) - excess(item.after)) / whole
+        for item in rounds
+        if item.after is not None and _is_physics(item, added)
     )
 
 
