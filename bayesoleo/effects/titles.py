@@ -37,7 +37,7 @@ def in_sentence(title: str) -> str:
     text = title.removeprefix(_UNNAMED).split(":")[0]
     text = " ".join(re.sub(r"\([^)]*\)", "", text).split()) or title
     first = text.split()[0]
-    kept = first in PROPER or first[1:] != first[1:].lower() or len(first) == 1
+    kept = first in PROPER or first[1:] != first[1:].lower() or (len(first) == 1 and first != "A")
     return text if kept else text[0].lower() + text[1:]
 
 

@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from bayesoleo.effects.titles import titles_for
+from bayesoleo.effects.titles import called, titles_for
 from bayesoleo.plots import reading, style
 
-LEFT, TOP, BOTTOM, ROW, RIGHT = 2.9, 0.55, 0.6, 0.27, 2.0
+LEFT, TOP, BOTTOM, ROW, RIGHT = 3.9, 0.55, 0.6, 0.27, 2.0
 
 
 def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
@@ -35,7 +35,8 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
         The accepted effect is blue, those the data cannot tell from it are pale blue and
         marked ``≈``.
     """
-    entry = reading.summary(tree)["rounds"][number]
+    summary = reading.summary(tree)
+    entry, titles = summary["rounds"][number], summary.get("titles", {})
     candidates = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
     shown = candidates[:most]
     height = TOP + ROW * max(len(shown), 2) + BOTTOM
@@ -48,7 +49,7 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     for row, candidate in enumerate(shown):
         _bar(axes, row, candidate, candidate is accepted, any(candidate is c for c in alike))
     axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
-    axes.set_yticks(range(len(shown)), [style.plain(title(c), 42) for c in shown])
+    axes.set_yticks(range(len(shown)), [style.plain(called(name(c), titles), 56) for c in shown])
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
     largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)

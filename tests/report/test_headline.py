@@ -117,6 +117,7 @@ def test_titles_read_as_parts_of_sentences():
     assert called("play @ arm", {}) == "play (arm)"
     assert called("my_own_law", {}) == "my own law"
     assert in_sentence("PWM force") == "PWM force"
+    assert in_sentence("A parameter that differs").startswith("a parameter")
 
 
 @pytest.mark.parametrize(
