@@ -40,7 +40,7 @@ def transient_record(
     Returns
     -------
     Record
-        With the smooth curve behind each channel, and its noise.
+        With the curve through each channel, and its noise.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 A channel is two things at once: its raw samples, which a likelihood compares with a prediction, and
 a signal, which a model takes as an input together with its time derivatives: the significant
-harmonics of a periodic channel, the smooth curve behind one of a transient.
+harmonics of a periodic channel, the band-limited curve through one of a transient.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Record:
     dropped_periods : int
         Leading periods left out because they had not settled.
     smoothed : mapping of str to Smoothed
-        The smooth curve behind each channel (transient runs).
+        The curve through each channel, with those for derivatives (transient runs).
     kept : ndarray of bool, shape (N,), optional
         Which samples count; None where all do.
     """
@@ -163,7 +163,7 @@ class Record:
 
     @property
     def signals(self) -> Mapping[str, Signal]:
-        """Each channel as an input: by its harmonics, or by its smooth curve."""
+        """Each channel as an input: by its harmonics, or by its curve."""
         return self.harmonics if self.periodic else self.smoothed
 
     @property
