@@ -208,7 +208,11 @@ class TransientRun(RunPredictor):
         """The first solution, on a mesh of its own unless one was taken over."""
         rows: Motion = lambda position: self._known(position, state)  # noqa: E731
         if self.chosen is None and max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED:
-            return self._by_inputs(p, state, rows)
+            equal = self._by_inputs(p, state, rows)
+            if equal.status[0] == Status.CONVERGED.value:
+                return equal
+            # Where a force jumps, an integrator's own steps may still get across.
+            self.chosen = None
         if self.chosen is None or not self.motions:
             found = integrate(self.space, p, state, self.period)
             if not found.status.ok and found.status is not Status.SINGULAR:
