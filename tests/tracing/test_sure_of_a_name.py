@@ -74,7 +74,9 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
     after = SimpleNamespace(accepted=None, ranking=[SimpleNamespace(p_value=left)], tests=TESTS)
     added = [SimpleNamespace(accepted=accepted, ranking=[], tests=TESTS)] * effects
     final = SimpleNamespace(
-        at_floor=floor, assembly=SimpleNamespace(added=[("play", "stroke")] * effects)
+        at_floor=floor,
+        too_quiet=(),
+        assembly=SimpleNamespace(added=[("play", "stroke")] * effects),
     )
     return ClosedLoop((*added, after), None, final, None, ())
 
