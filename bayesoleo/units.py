@@ -138,6 +138,58 @@ def parse_unit(name: str) -> Unit:
     return Unit(name, si_name, factor, shift)
 
 
+#: Powers of base dimensions, without zeros.
+type Dimensions = dict[str, float]
+
+_BASE = {
+    "[length]": "m",
+    "[mass]": "kg",
+    "[time]": "s",
+    "[temperature]": "K",
+    "[current]": "A",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
+}
+
+
+# Composed units that a reader expects instead of powers of base units.
+_USUAL = (
+    *("N/m", "N*s/m", "N*s**2/m**2", "N/m**3", "N*s/m**2", "N/s", "W/K", "J/K", "K/W"),
+    *("W/K**4", "Pa/m", "Pa*s", "N*m/A", "N*m*s", "N*s/(m*A)", "H", "F", "V*s", "1/s", "m/s**2"),
+)
+
+
+@cache
+def _dimensions(name: str) -> tuple[tuple[str, float], ...]:
+    with _lock:
+        found = _registry().Unit(_as_pint_writes(name)).dimensionality
+        return tuple((base, float(power)) for base, power in found.items() if power)
+
+
+def dimensions(name: str) -> Dimensions:
+    """Powers of the base dimensions of a unit; of a number and an angle there are none.
+
+    Parameters
+    ----------
+    name : str
+        A unit that is known.
+    """
+    return dict(_dimensions(name))
+
+
+def unit_of_dimensions(powers: Dimensions) -> str:
+    """The SI unit of these powers of base dimensions; empty for a number."""
+    powers = {base: power for base, power in powers.items() if power}
+    usual = next((name for name in _USUAL if dimensions(name) == powers), "")
+    if usual:
+        return usual
+    parts = [
+        _BASE[base] if power == 1 else f"{_BASE[base]}**{power:g}"
+        for base, power in sorted(powers.items())
+    ]
+    return parse_unit("*".join(parts)).si_name if parts else ""
+
+
 def in_si(name: str) -> str:
     """The SI unit of the same kind, written as the unit is: ``N/m`` of ``N/mm``.
 

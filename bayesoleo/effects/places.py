@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects.units import parse_unit
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import WITHIN, derivative_symbol, split_derivative
 from bayesoleo.model.initial import with_starts
+from bayesoleo.units import dimensions
 
 
 def force_places(model: Model) -> dict[str, Coordinate]:
@@ -47,23 +47,18 @@ def _is_motion(model: Model, place: Coordinate) -> bool:
     force, motion = model.outputs[place.target].unit, model.inputs[place.name]
     if not force or not motion:
         return True
-    powers, moved = _dimensions(force), _dimensions(motion)
+    powers, moved = dimensions(force), dimensions(motion)
     if powers == moved:
         return True
-    if not (set(moved) <= {"[length]"} or moved == _dimensions("C")):
+    if not (set(moved) <= {"[length]"} or moved == dimensions("C")):
         return False
     for base, power in moved.items():
         powers[base] = powers.get(base, 0) + power
-    for base, power in _dimensions("J").items():
+    for base, power in dimensions("J").items():
         powers[base] = powers.get(base, 0) - power
     # Work; or that by length, area or volume; or by mass, where a law is of accelerations.
     by_length, by_mass = powers.pop("[length]", 0), powers.pop("[mass]", 0)
     return -3 <= by_length <= 0 and by_mass in (0, -1) and not any(powers.values())
-
-
-def _dimensions(unit: str) -> dict[str, float]:
-    """Powers of the base dimensions."""
-    return dict(parse_unit(unit).dimensionality)
 
 
 def drives(model: Model) -> tuple[str, ...]:
@@ -158,7 +153,7 @@ def measures(model: Model, name: str, unit: str) -> bool:
     declared |= {key: item.unit for key, item in model.parameters.items()}
     declared |= {key: item.unit for key, item in model.conditions.items()}
     own = declared.get(name, "")
-    return not own or _dimensions(own) == _dimensions(unit)
+    return not own or dimensions(own) == dimensions(unit)
 
 
 def substitute(model: Model, table: Mapping[sp.Symbol, sp.Expr]) -> Model:

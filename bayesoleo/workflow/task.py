@@ -23,6 +23,7 @@ from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation.runs.nuisance import declared_nuisance
 from bayesoleo.model import Model, driven_by, possible_drives
 from bayesoleo.model.derive import derive
+from bayesoleo.model.dimensions import check_dimensions
 from bayesoleo.prediction.invented import Invented, without_invented
 from bayesoleo.prediction.lost import Lost, lost_inputs
 from bayesoleo.prediction.predictor import Predictor
@@ -114,7 +115,7 @@ def prepare(campaign: Source, model: Model, settings: Settings, *, progress: boo
     InputError
         If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
     """
-    model = settings.inference.declare(model)
+    model = settings.inference.declare(check_dimensions(model))
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
     starts = not all(record.periodic for record in reduced.records)
