@@ -149,4 +149,8 @@ def pseudo_inverse_gram(rows: Array, rank: float | None = None) -> tuple[Array, 
     count = int(np.sum(singular > limit * singular[0])) if singular.size else 0
     root = directions[:count].T / singular[:count] / unit[:, None]
     open_part = np.sqrt(np.sum(directions[count:] ** 2, axis=0))
-    return root @ root.T, open_part > _TAKES_PART
+    with np.errstate(over="ignore", invalid="ignore"):
+        inverse = root @ root.T
+    # A column of 1e-160 has a variance beyond all numbers: the rows do not determine its unknown.
+    endless = ~np.isfinite(np.diag(inverse))
+    return inverse, (open_part > _TAKES_PART) | endless

@@ -249,7 +249,8 @@ def expected_of_held_out(
     at_estimate = predictor.predict(prediction.vector)[0].sensitivity
     if not np.isfinite(at_estimate).all():
         return entries
-    own = np.array([prediction.re_estimated > 0 and name not in mine.names for name in names])
+    re_estimated = prediction.re_estimated > 0
+    own = np.array([re_estimated and name not in mine.names for name in names], dtype=np.bool_)
     sigma = np.array([max(entry.sigma, 1e-300) for entry in entries])
     run = _Run.of(prediction.record, found, at_estimate, sigma**-2)
     shared = mine.of(names)
