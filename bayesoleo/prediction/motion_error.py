@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 #: Error over the swing below which nothing more is resolved: what no channel shows.
 TOLERANCE = 1e-6
+#: Points of a run at which its equations are looked at: every run of every fit is.
+LOOKS = 16_384
 
 
 def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:
@@ -68,7 +70,9 @@ def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstima
             plan = scheme.plan(phase, run.steps)
         return np.asarray(scheme.sample(anchor.x[None, :, :, None], plan, step)[0, :, 0])
 
-    return estimate_error(problem, method, anchor.p, motion, mesh, tolerance, initial=initial)
+    return estimate_error(
+        problem, method, anchor.p, motion, mesh, tolerance, initial=initial, looks=LOOKS
+    )
 
 
 def _inputs_at(run: RunPredictor) -> Callable[[Array], Array]:

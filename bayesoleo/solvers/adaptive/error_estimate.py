@@ -39,8 +39,8 @@ from bayesoleo.solvers.status import Status
 Array = NDArray[np.float64]
 
 #: Points of a period at which equations are looked at, at least, and of a step: a pulse as short as
-#: a ten-thousandth of the period is seen wherever it stands.
-LOOKS, LEAST_LOOKS = 16_384, 8
+#: three hundred-thousandths of the period is seen wherever it stands.
+LOOKS, LEAST_LOOKS = 65_536, 8
 #: Steps are cut while what is missed between stages is more than this part of the error, or of the
 #: tolerance.
 PART = 0.1
@@ -95,6 +95,7 @@ def estimate_error(
     tolerance: float,
     *,
     initial: bool = False,
+    looks: int = LOOKS,
 ) -> ErrorEstimate:
     """Estimate the error of a motion that is said to solve a periodic or an initial value problem.
 
@@ -115,6 +116,9 @@ def estimate_error(
     initial : bool
         Whether the motion starts from a state that is given instead of returning to where it
         began; phases are then parts of its time.
+    looks : int
+        Points at which the equations are looked at, at least: nothing that lies between them is
+        seen.
 
     Returns
     -------
@@ -128,7 +132,7 @@ def estimate_error(
         boundary = problem.on(method, finest, kinks)
         x = _unknowns(boundary, method, finest, motion)
         level = Level(boundary, x, Status.CONVERGED, kinks, 0)
-        look = _look(problem, level, p)
+        look = _look(problem, level, p, looks)
         if look is None:
             return NONE
         found, missed = _estimate(problem, level, p, motion, look, initial)
@@ -185,10 +189,10 @@ class _Look:
     shares: Array
 
 
-def _look(problem: PeriodicProblem, level: Level, p: Array) -> _Look | None:
+def _look(problem: PeriodicProblem, level: Level, p: Array, looks: int) -> _Look | None:
     """Look at the equations between the stages of all steps; None where they are no numbers."""
     scheme, n = level.scheme, level.mesh.steps
-    count = max(LEAST_LOOKS, -(-LOOKS // n))
+    count = max(LEAST_LOOKS, -(-looks // n))
     nodes, weights = np.polynomial.legendre.leggauss(min(count, 64))
     parts = -(-count // nodes.size)
     position = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
