@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import xarray as xr
 
 from bayesoleo.effects import catalogue
+from bayesoleo.effects.titles import catalogue_titles, with_titles
 from bayesoleo.model import Model
 from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop, loop_of
 from bayesoleo.tracing.deciding.progress import Progress
@@ -171,11 +172,18 @@ def run_loop(
     Exception
         Of any kind, if the model could not be estimated.
     """
-    settings, say = task.settings, stages.say
+    settings, titles = task.settings, dict(catalogue_titles())
+    titles |= {effect.id: effect.title for effect in task.settings.effects or ()}
+
+    def say(text: str) -> None:
+        stages.say(with_titles(text, titles))
+
     for effect in settings.searched if settings.effects else ():
         base = task.assembly.model() if effect.on_channels else task.assembly.native
         if effect not in catalogue() and not effect.places(base):
-            say(f"effect {effect.id} has no place in this model: it needs {effect.applies_to}")
+            stages.say(
+                f"effect {effect.id} has no place in this model: it needs {effect.applies_to}"
+            )
     known = output.kept(task, say) if resume else None
     reached = [] if known is None else [known]
 
