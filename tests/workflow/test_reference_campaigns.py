@@ -11,7 +11,9 @@ from bayesoleo import schema, workflow
 from bayesoleo.modelfile import load_model
 from bayesoleo.workflow import Settings
 from bayesoleo.workflow.closing import run_loop
+from bayesoleo.workflow.output import Output
 from bayesoleo.workflow.result import write_result
+from bayesoleo.workflow.stages import Stages
 
 pytestmark = pytest.mark.reference
 STUDIES = Path(__file__).parents[2] / "studies" / "measured"
@@ -21,7 +23,9 @@ def summary_of(folder: Path, model: str) -> dict:
     """Close the loop but for the sampling, which changes no error and no verdict."""
     reduced = workflow.reduce(folder)
     task = workflow.prepare(reduced, load_model(model), Settings())
-    loop = run_loop(task, Settings().max_effects, lambda _: None)
+    stages = Stages()
+    loop = run_loop(task, Settings().max_effects, stages, Output(None))
+    assert stages.failed == []
     tree = write_result(task, loop, None, None, lambda _: None)
     return json.loads(tree.attrs[schema.SUMMARY])
 
