@@ -26,7 +26,7 @@ def summary_of(folder: Path, model: str) -> dict:
     stages = Stages()
     loop = run_loop(task, Settings().max_effects, stages, Output(None))
     assert stages.failed == []
-    tree = write_result(task, loop, None, None, lambda _: None)
+    tree = write_result(task, loop, None, Output(None), stages)
     return json.loads(tree.attrs[schema.SUMMARY])
 
 
