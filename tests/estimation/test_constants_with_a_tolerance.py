@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_campaigns import damper, damper_campaign
 
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.estimation import (
@@ -19,7 +20,9 @@ from bayesoleo.estimation import (
     profile,
     sampling_distribution,
 )
+from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Normal, Parameter, Uniform
+from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.systems import system
 
 GAIN, OFFSET, TOLERANCE, NOISE = 2.0, 0.5, 0.2, 0.05
@@ -148,3 +151,22 @@ def test_a_tolerance_must_hold_the_value():
     with pytest.raises(ModelError, match="exclude the start"):
         Parameter(2.0, "N/m", fixed=True, prior=Uniform(0.0, 1.0))
     assert replace(Parameter(0.5, fixed=True, prior=Uniform(0.0, 1.0)), value=0.7).toleranced
+
+
+def test_data_sets_of_a_campaign_are_fitted_together_beside_what_is_held(tmp_path):
+    """As one by one: the constant keeps its value, the others follow the data."""
+    reduced = damper_campaign(tmp_path)
+    model = damper()
+    known = replace(model.parameters["stiffness"], value=950.0, fixed=True)
+    predictor = Predictor(model.with_parameters(stiffness=known), reduced.records, steps=32)
+    problem = CampaignProblem(predictor)
+    rng = np.random.default_rng(4)
+    (force,) = problem.data
+    data = force + 0.1 * rng.standard_normal((3, force.size))
+    found = estimate_many(problem, data)
+    assert found.names == problem.names
+    assert found.together.all()
+    assert (found["stiffness"] == 950.0).all()
+    for row, theta in zip(data, found.theta, strict=True):
+        alone = estimate(problem.with_data([row]), "mbe", tolerance=1e-6)
+        np.testing.assert_allclose(theta, alone.theta, rtol=1e-5)

@@ -13,13 +13,14 @@ Verbeek (1993), eqs. 2.18-2.20 (what replications are for) and 3.17-3.23 (the st
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
+from bayesoleo.estimation.estimators.known import without_measured
 from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.problems.batch import BatchProblem
@@ -102,7 +103,8 @@ def estimate_many(
         Measured samples, runs one after the other.
     method, tolerance, max_iterations, bias_corrected
         As in :func:`~bayesoleo.estimation.estimate`. BE, MBE and Gauss-Newton are computed
-        together, the others one by one; so are those that hold what was measured beside the data.
+        together, the others one by one. What was measured beside the data is held by those that
+        forget priors.
     start : array_like, shape (l,) or (R, l), optional
         One for all or one each; by default the problem's own.
     jobs : int, optional
@@ -124,8 +126,28 @@ def estimate_many(
     data = _checked_data(problem, data_sets)
     scale = PriorScale.of(problem.priors, problem.names)
     starts = _checked_starts(problem, scale, start, len(data[0]))
+    measured = measured_of(problem)
+    if (
+        measured.any()
+        and not step.fixed_prior
+        and (starts[:, measured] == starts[0, measured]).all()
+    ):
+        section = without_measured(problem, starts[0], measured)
+        if isinstance(section, BatchProblem):
+            found = estimate_many(
+                section,
+                data,
+                step,
+                start=starts[:, ~measured],
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                bias_corrected=bias_corrected,
+                jobs=jobs,
+                progress=progress,
+            )
+            return _with_measured(found, problem.names, starts, measured)
     walk = Walk(problem, step, scale, tolerance, max_iterations, bias_corrected)
-    together = step.steady and (step.fixed_prior or not measured_of(problem).any())
+    together = step.steady and (step.fixed_prior or not measured.any())
     size = problem.lanes
     cuts = [slice(k, min(k + size, len(starts))) for k in range(0, len(starts), size)]
 
@@ -151,6 +173,18 @@ def estimate_many(
         together=np.concatenate([part.done for part in parts]),
         method=step.name,
     )
+
+
+def _with_measured(
+    found: Replications, names: tuple[str, ...], starts: Array, measured: NDArray[np.bool_]
+) -> Replications:
+    """The same in all unknowns: those that were held are where they started, and have no scatter of
+    their own."""
+    theta, own = starts.copy(), np.flatnonzero(~measured)
+    theta[:, own] = found.theta
+    covariance = np.full((len(theta), len(names), len(names)), np.nan)
+    covariance[:, own[:, None], own] = found.covariance
+    return replace(found, names=tuple(names), theta=theta, covariance=covariance)
 
 
 def _checked_data(problem: BatchProblem, data_sets: ArrayLike | Sequence[ArrayLike]) -> list[Array]:
