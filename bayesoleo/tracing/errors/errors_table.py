@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo.data import PeriodicAverage, periodic_average
-from bayesoleo.data.local_average import LocalAverage, local_average
+from bayesoleo.data.local_average import LocalAverage, local_average, local_means
 from bayesoleo.data.noise_spectrum import NoiseSpectrum, noise_spectrum
 from bayesoleo.data.resolution import rounding_in_average
 from bayesoleo.parallel import thread_map
@@ -245,14 +245,17 @@ def compared(
     record, predictor = prediction.record, prediction.predictor
     columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
     left = [record.samples[o] - prediction.y[b] for b, o in enumerate(predictor.outputs)]
-    averages, spectra, before = [], [], list[RecordNoise | None]()
+    averages, spectra, before, shown = [], [], list[RecordNoise | None](), []
     for output, rest in zip(predictor.outputs, left, strict=True):
         residual = without_masked(record, rest)
         before.append(measured(output, record.label))
         averages.append(_average(record, output, residual, before[-1]))
         spectra.append(_spectrum(record, residual, averages[-1]))
-    spread = np.sqrt(np.mean(np.sum(columns**2, axis=1), axis=1))
-    scale = borne_out(columns, [average.values for average in averages])
+        # Of a transient all samples: averages over neighbours show no fast noise, input's or not.
+        shown.append(averages[-1].values if record.periodic else residual)
+    averaged = columns if record.periodic else local_means(columns)
+    spread = np.sqrt(np.mean(np.sum(averaged**2, axis=1), axis=1))
+    scale = borne_out(columns, shown, drawn=not record.periodic)
     factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
     entries = [
         RunError(

@@ -35,7 +35,7 @@ MOST_COLUMNS = 128
 CLEARLY_LESS = 0.9
 
 
-def borne_out(columns: Array, residuals: Sequence[Array]) -> float:
+def borne_out(columns: Array, residuals: Sequence[Array], *, drawn: bool = False) -> float:
     """Largest factor, at most one, by which the input's noise may be what the residual holds.
 
     Parameters
@@ -44,6 +44,9 @@ def borne_out(columns: Array, residuals: Sequence[Array]) -> float:
         Change of the outputs by one standard deviation of each input coefficient.
     residuals : sequence of ndarray, shape (N,)
         What the average over periods (or neighbouring samples) leaves of each output.
+    drawn : bool
+        Whether columns are draws of an error with as many coefficients as samples, as those of a
+        transient's input are, instead of one coefficient each.
 
     Returns
     -------
@@ -58,7 +61,7 @@ def borne_out(columns: Array, residuals: Sequence[Array]) -> float:
         lines = scipy.fft.rfft(block, axis=1)
         power, there = np.sum(np.abs(lines) ** 2, axis=0), np.abs(scipy.fft.rfft(residual)) ** 2
         for band in _bands(power):
-            coefficients = _coefficients(lines[:, band])
+            coefficients = _of_lines(power[band]) if drawn else _coefficients(lines[:, band])
             low = float(stats.chi2.ppf(FALSE_ALARM / BANDS, coefficients)) / coefficients
             ratio = float(there[band].sum() / power[band].sum())
             least = min(least, ratio / max(low, 1e-300))
@@ -72,6 +75,11 @@ def _bands(power: Array) -> list[slice]:
     ends = np.unique(np.concatenate([[0], edges, [power.size]]))
     found = [slice(int(a), int(b)) for a, b in pairwise(ends)]
     return [band for band in found if power[band].sum() > 0.01 * total[-1]]
+
+
+def _of_lines(power: Array) -> float:
+    """The same where each line has two of its own."""
+    return max(2.0 * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
 
 
 def _coefficients(lines: NDArray[np.complex128]) -> float:
