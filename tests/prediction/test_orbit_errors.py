@@ -171,3 +171,32 @@ def test_shooting_by_given_steps_closes_on_them():
     assert again is not None
     np.testing.assert_allclose(again.trajectory.times, steps, atol=1e-12)
     np.testing.assert_allclose(again.sample(PHASES)[0], first.sample(PHASES)[0], atol=1e-7)
+
+
+def test_pulses_are_seen_in_long_steps_too():
+    """Several pulses of a thirty-thousandth of the period, of which some lie in long steps.
+
+    A mesh that is fine about those that were met had few looks left for the others.
+    """
+    width = 2e-4
+    model = Model(
+        "pulses",
+        inputs={"u": "1"},
+        dofs={"T": "K"},
+        parameters={"tau": Parameter(7.5e-3, sd=1e-3)},
+        equations={"T": f"tau*dot(T) + T - 1.4*exp(-((u - 0.037)/{width})**2)"},
+        outputs={"y": "T"},
+    )
+    plan = RunPlan("a", 1.0, {"u": motion(0.0, [1.0, *[0.0] * 20, 0.011])})
+    turn = 2 * np.pi * np.arange(COUNT) / COUNT
+    u = np.cos(turn) + 0.011 * np.cos(22 * turn)
+    # A pulse is seven samples wide, and a Gaussian's coefficients fall to round-off before half of
+    # the sampling frequency.
+    exact = linear_answer(
+        1.4 * np.exp(-(((u - 0.037) / width) ** 2)), lambda w: 1 / (1 + 7.5e-3j * w)
+    )
+    found = periodic_orbit(model, plan, None, "adaptive", backend="numpy", jobs=1)
+    if found.status[0] == Status.CONVERGED:
+        assert true_error(found, exact) < 1e-7
+    else:
+        assert found.orbits[0].error > 0.1 * true_error(found, exact)

@@ -34,8 +34,9 @@ PLAN = RunPlan("a", 0.2, {"force": motion(0.0, [2.0])})
 
 def test_every_mass_is_solved_and_agrees_with_shooting() -> None:
     masses, phases = {"mass": np.logspace(0, -3, 13)}, np.arange(101) / 101
-    # Equal steps see the sticking of a light mass as coarse as they are: a part of 1/512 each.
-    mesh = periodic_orbit(MODEL, PLAN, masses, steps=512, tolerance=1.0 / 512, jobs=1)
+    # Equal steps see the sticking of a light mass as coarse as they are: a part of 1/512 each. The
+    # estimate is linear and on the safe side.
+    mesh = periodic_orbit(MODEL, PLAN, masses, steps=512, tolerance=5.0 / 512, jobs=1)
     shot = periodic_orbit(MODEL, PLAN, masses, "shooting", jobs=1)
     np.testing.assert_array_equal(mesh.status, Status.CONVERGED)
     np.testing.assert_array_equal(shot.status, Status.CONVERGED)

@@ -40,7 +40,8 @@ Array = NDArray[np.float64]
 
 #: Points of a period at which equations are looked at, at least, and of a step: a pulse as short as
 #: three hundred-thousandths of the period is seen wherever it stands.
-LOOKS, LEAST_LOOKS = 65_536, 8
+#: The last are those of a step at most: longer ones are cut before.
+LOOKS, LEAST_LOOKS, MOST_LOOKS = 65_536, 8, 64
 #: Steps are cut while what is missed between stages is more than this part of the error, or of the
 #: tolerance.
 PART = 0.1
@@ -124,7 +125,7 @@ def estimate_error(
     -------
     ErrorEstimate
     """
-    finest, found = _apart(mesh).halved(), NONE
+    finest, found = _no_longer(_apart(mesh).halved(), MOST_LOOKS / looks), NONE
     for _ in range(MAXIMUM_ROUNDS):
         kinks = crossings_of(problem, motion, finest, p)
         if kinks is not None:
@@ -155,6 +156,13 @@ def _apart(mesh: Mesh) -> Mesh:
     inner = mesh.edges[1:-1]
     kept = (np.diff(mesh.edges)[:-1] > SHORTEST) & (1.0 - inner > SHORTEST)
     return Mesh(np.concatenate([[0.0], inner[kept], [1.0]]))
+
+
+def _no_longer(mesh: Mesh, longest: float) -> Mesh:
+    """Cut steps into equal parts no longer than that, in cycles."""
+    parts = np.ceil(np.diff(mesh.edges) / longest).astype(int)
+    ends = np.concatenate([[0], np.cumsum(parts)])
+    return Mesh(np.interp(np.arange(ends[-1] + 1), ends, mesh.edges))
 
 
 def _with_edges(mesh: Mesh, kinks: Crossings) -> Mesh:
@@ -190,51 +198,73 @@ class _Look:
 
 
 def _look(problem: PeriodicProblem, level: Level, p: Array, looks: int) -> _Look | None:
-    """Look at the equations between the stages of all steps; None where they are no numbers."""
-    scheme, n = level.scheme, level.mesh.steps
-    count = max(LEAST_LOOKS, -(-looks // n))
-    nodes, weights = np.polynomial.legendre.leggauss(min(count, 64))
-    parts = -(-count // nodes.size)
-    position = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
-    weight = np.tile(weights / 2 / parts, parts)
-    z = level.inside(np.repeat(np.arange(n), position.size), np.tile(position, n))
-    phases = level.mesh.points(position)
-    g, gz = _evaluate(problem, z, problem.inputs_at(phases), p)
-    at_stages, _ = _held(level, p)
-    follow = at_stages.reshape(-1, n, scheme.method.stages) @ scheme.method.weights(position)[0].T
-    missed = g - follow.reshape(g.shape)
-    if not (np.isfinite(missed).all() and np.isfinite(gz).all()):
-        return None
-    h = np.repeat(scheme.lengths(n, level.boundary.step(n)), position.size)
-    whole = _response(scheme.orders, gz, missed, h)
-    short = _response(scheme.orders, gz, missed, h * np.tile(weight, n))
-    return _collect(level, z, whole, short, weight, position, h)
-
-
-def _collect(
-    level: Level, z: Array, whole: Array, short: Array, weight: Array, position: Array, h: Array
-) -> _Look:
-    """Sum what is missed over each step, and take the largest of what does not last."""
-    orders, n, count = level.scheme.orders, level.mesh.steps, position.size
-    kept = state_rows(orders)
-    states = z[kept]
-    size = np.abs(states).max(axis=1)
-    scale = np.maximum.reduce(
-        [np.ptp(states, axis=1), LEAST_SWING * size, np.full(len(kept), 1e-300)]
-    )
-    jumps, between = np.empty((len(kept), n)), np.empty((len(kept), n))
-    lengths, own, state = h.reshape(n, count), weight * np.ones((n, 1)), 0
-    for j, order in enumerate(orders):
-        top, brief = whole[j].reshape(n, count), short[j].reshape(n, count)
-        last = state + order - 1
-        jumps[last] = np.sum(own * lengths * top, axis=1)
-        between[last] = np.abs(own * lengths * brief).max(axis=1)
-        if order == 2:
-            jumps[state] = np.sum(own * lengths**2 * (1.0 - position) * top, axis=1)
-            between[state] = np.abs((own * lengths) ** 2 * brief).max(axis=1)
-        state += order
+    """Look at the equations between the stages of all steps, at places as dense everywhere; None
+    where they are no numbers."""
+    orders, n = level.scheme.orders, level.mesh.steps
+    D, at_stages = sum(orders), _held(level, p)[0].reshape(len(orders), n, -1)
+    jumps, between, ends = np.empty((D, n)), np.empty((D, n)), np.empty((2, D, n))
+    places = np.exp2(np.ceil(np.log2(looks * np.diff(level.mesh.edges)))).astype(int)
+    places = np.clip(places, LEAST_LOOKS, MOST_LOOKS)
+    for count in np.unique(places):
+        steps = np.flatnonzero(places == count)
+        seen = _look_into(problem, level, p, steps, int(count), at_stages[:, steps])
+        if seen is None:
+            return None
+        jumps[:, steps], between[:, steps], ends[:, :, steps] = seen
+    low, high = ends[0].min(axis=1), ends[1].max(axis=1)
+    size = np.maximum(np.abs(low), np.abs(high))
+    scale = np.maximum.reduce([high - low, LEAST_SWING * size, np.full(D, 1e-300)])
     shares = (np.maximum(np.abs(jumps), between) / scale[:, None]).max(axis=0)
     return _Look(-jumps, between.max(axis=1), scale, shares)
+
+
+def _look_into(
+    problem: PeriodicProblem,
+    level: Level,
+    p: Array,
+    steps: NDArray[np.int64],
+    count: int,
+    at_stages: Array,
+) -> tuple[Array, Array, Array] | None:
+    """What some steps miss at their ends, and inside them, ``(D, n)``, and between which values
+    their states lie, ``(2, D, n)``; None where the equations are no numbers."""
+    scheme, number = level.scheme, steps.size
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    position, weight = (nodes + 1) / 2, weights / 2
+    z = level.inside(np.repeat(steps, count), np.tile(position, number))
+    left, lengths = level.mesh.edges[steps], np.diff(level.mesh.edges)[steps]
+    phases = (left[:, None] + lengths[:, None] * position).ravel()
+    g, gz = _evaluate(problem, z, problem.inputs_at(phases), p)
+    missed = g - (at_stages @ scheme.method.weights(position)[0].T).reshape(g.shape)
+    if not (np.isfinite(missed).all() and np.isfinite(gz).all()):
+        return None
+    h = lengths * problem.period
+    own = np.outer(h, weight)
+    whole = _response(scheme.orders, gz, missed, np.repeat(h, count))
+    short = _response(scheme.orders, gz, missed, own.ravel())
+    jumps, between = _summed(scheme.orders, whole, short, own, np.outer(h, 1.0 - position))
+    states = z[state_rows(scheme.orders)].reshape(-1, number, count)
+    return jumps, between, np.stack([states.min(axis=2), states.max(axis=2)])
+
+
+def _summed(
+    orders: tuple[int, ...], whole: Array, short: Array, own: Array, ahead: Array
+) -> tuple[Array, Array]:
+    """Sum what is missed over each step, and take the largest of what does not last, ``(D, n)``.
+
+    ``own (n, N)`` are the times that belong to the places, ``ahead (n, N)`` those to the end.
+    """
+    jumps, between, state = np.empty((sum(orders), len(own))), np.empty((sum(orders), len(own))), 0
+    for j, order in enumerate(orders):
+        top, brief = whole[j].reshape(own.shape), short[j].reshape(own.shape)
+        last = state + order - 1
+        jumps[last] = np.sum(own * top, axis=1)
+        between[last] = np.abs(own * brief).max(axis=1)
+        if order == 2:
+            jumps[state] = np.sum(own * ahead * top, axis=1)
+            between[state] = np.abs(own**2 * brief).max(axis=1)
+        state += order
+    return jumps, between
 
 
 def _response(orders: tuple[int, ...], gz: Array, residual: Array, h: Array) -> Array:
