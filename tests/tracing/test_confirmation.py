@@ -140,7 +140,8 @@ def test_what_hardly_shows_an_effect_hardly_counts():
     both = swamped.and_by(quiet)
     assert both.confirms
     assert both.value == pytest.approx(500.0, rel=1e-3)
-    assert quiet.and_by(swamped) == both
+    again = quiet.and_by(swamped)
+    assert (again.value, again.error) == (both.value, both.error)
     # No other weights would show a real effect more surely.
     power = both.expected / both.error
     assert power == pytest.approx(np.hypot(400 / 9000, 480 / 50))
@@ -198,5 +199,27 @@ def test_noise_of_the_input_scatters_a_fall_as_much_as_is_said(tmp_path):
 
         fall = fall_on_hold_out(with_damping(199.0), with_damping(200.0))
         pulls.append((fall.value - fall.expected) / fall.error)
+    # Thirty standard normal draws: their mean square scatters by a quarter.
+    assert 0.4 < np.mean(np.square(pulls)) < 1.9
+
+
+def test_errors_of_the_parameters_scatter_a_fall_as_much_as_is_said(tmp_path):
+    """Small fitted runs know little of what a large one does: the noise alone is a tenth of it."""
+    small = (("a", 1.0, 0.001, "fit"), ("b", 2.0, 0.001, "fit"), ("d", 1.5, 0.01, "hold-out"))
+    pulls, ratios = [], []
+    for seed in range(30):
+        reduced = damper_campaign(
+            tmp_path / str(seed), plain, seed=seed, runs=small, per_period=30.3, periods=4
+        )
+        state = fit_state(Assembly(damper(cubic=False)), assign(reduced.records), NUMERICS)
+        changed = []
+        for prediction in state.held_out:
+            _, v = motion(prediction.record)
+            changed.append(replace(prediction, y=prediction.y + 5.0 * v))
+        fall = fall_on_hold_out(state, replace(state, held_out=changed))
+        # Nothing is there of what was added: the fall is minus its square, on average.
+        pulls.append((fall.value + fall.expected) / fall.error)
+        ratios.append(fall.error / (2.0 * np.sqrt(fall.expected)))
+    assert np.median(ratios) > 2.0
     # Thirty standard normal draws: their mean square scatters by a quarter.
     assert 0.4 < np.mean(np.square(pulls)) < 1.9

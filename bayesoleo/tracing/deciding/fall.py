@@ -39,14 +39,23 @@ class Fall:
     value : float
         Sum over the runs, less the charge for parameters that were estimated on them.
     error : float
-        Standard error.
+        Standard error if the effect is not there: of the noise, what is left, and the parameters of
+        the model without it.
     expected : float
         What it would be on average if the effect is exactly right.
+    spread : float, optional
+        Standard error if the effect is there, its own parameters' included; by default the same.
     """
 
     value: float
     error: float
     expected: float
+    spread: float | None = None
+
+    @property
+    def scatter(self) -> float:
+        """Standard error if the effect is there."""
+        return self.error if self.spread is None else self.spread
 
     @property
     def confirms(self) -> bool:
@@ -56,17 +65,19 @@ class Fall:
     @property
     def undecided(self) -> bool:
         """Whether these runs are unlikely to confirm even an effect that is real."""
-        return bool(self.expected < (ENOUGH + stats.norm.isf(MISSED)) * self.error)
+        least = ENOUGH * self.error + stats.norm.isf(MISSED) * self.scatter
+        return bool(self.expected < least)
 
     def and_by(self, other: Fall) -> Fall:
         """Both together, each weighted by what it would show of a real effect: by the expected fall
         over the variance, which gives the test with most power. The larger weight is one."""
-        weights = np.array([one.expected / max(one.error, 1e-300) ** 2 for one in (self, other)])
+        weights = np.array([one.expected / max(one.scatter, 1e-300) ** 2 for one in (self, other)])
         first, second = weights / max(weights.max(), 1e-300)
         return Fall(
             float(first * self.value + second * other.value),
             float(np.hypot(first * self.error, second * other.error)),
             float(first * self.expected + second * other.expected),
+            float(np.hypot(first * self.scatter, second * other.scatter)),
         )
 
     def __str__(self) -> str:
@@ -91,8 +102,9 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
     With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``. Noise with the
     covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
     ``4 d' w (1/w + B B') w d`` with ``d = b - a``; coloured noise multiplies the first part by the
-    inflation. What the model still leaves, beyond the noise, adds to it. Runs that could not be
-    solved in both states do not count.
+    inflation. What the model still leaves, beyond the noise, adds to it, and so do the errors of
+    the parameters: ``4 d' w J S J' w d`` with their sensitivities and covariance. Runs that could
+    not be solved in both states do not count.
 
     Parameters
     ----------
@@ -108,6 +120,7 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
         charged with what it takes of their noise on average.
     """
     fall = expected = variance = 0.0
+    pulls = [np.zeros(len(state.fit.problem.names)) for state in (before, after)]
     charged = sum(p.re_estimated for p in after.held_out)
     charged -= sum(p.re_estimated for p in before.held_out)
     for old, new in zip(before.held_out, after.held_out, strict=True):
@@ -115,7 +128,37 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
             continue
         parts = _of_run(before, after, old, new, inflation)
         fall, expected, variance = fall + parts[0], expected + parts[1], variance + parts[2]
-    return Fall(fall - inflation * charged, float(np.sqrt(variance)), expected)
+        pulls[0] += _pull(before, old, before, new.y - old.y)
+        pulls[1] += _pull(after, new, before, new.y - old.y)
+    error, spread = (
+        float(np.sqrt(variance + 4.0 * inflation * _known_to(state, pull)))
+        for state, pull in zip((before, after), pulls, strict=True)
+    )
+    return Fall(fall - inflation * charged, error, expected, spread)
+
+
+def _pull(state: State, prediction: Prediction, measured: State, change: Array) -> Array:
+    """By unknown of a fit, how its error moves the fall in one run: ``J' w d``, shape (l,)."""
+    predictor, names = prediction.predictor, state.fit.problem.names
+    found, layout = np.zeros(len(names)), predictor.layout.names
+    sensitivity = predictor.predict(prediction.vector)[0].sensitivity
+    if not np.isfinite(sensitivity).all():
+        return found
+    counts, label = weights(prediction.record), prediction.record.label
+    for b, output in enumerate(predictor.outputs):
+        weight = measured.hold_errors.at(output, label).average.sigma ** -2
+        along = sensitivity[b] @ (weight * change[b] * counts)
+        for k, name in enumerate(names):
+            # What is estimated on the run itself follows what is wrong with the others.
+            if name in layout and name in state.fit.model.parameters:
+                found[k] += along[layout.index(name)]
+    return found
+
+
+def _known_to(state: State, pull: Array) -> float:
+    """Variance of what the errors of a fit's parameters do along a direction."""
+    covariance = state.fit.point.covariance
+    return float(max(pull @ covariance @ pull, 0.0)) if np.isfinite(covariance).all() else 0.0
 
 
 def _of_run(
