@@ -158,7 +158,9 @@ def _pull(state: State, prediction: Prediction, measured: State, change: Array) 
 def _known_to(state: State, pull: Array) -> float:
     """Variance of what the errors of a fit's parameters do along a direction."""
     covariance = state.fit.point.covariance
-    return float(max(pull @ covariance @ pull, 0.0)) if np.isfinite(covariance).all() else 0.0
+    if not np.isfinite(covariance).all():
+        return 0.0
+    return max(float(pull @ covariance @ pull), 0.0)
 
 
 def _of_run(
