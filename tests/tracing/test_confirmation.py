@@ -149,6 +149,10 @@ def test_what_hardly_shows_an_effect_hardly_counts():
     against = Fall(-480.0, 50.0, 480.0)
     assert quiet.and_by(against).value == pytest.approx(20.0)
     assert not quiet.and_by(against).confirms
+    # Runs that could not be solved, or that the effect does not change, say nothing.
+    alone = quiet.and_by(Fall(0.0, 0.0, 0.0))
+    assert (alone.value, alone.error, alone.expected) == (500.0, 50.0, 480.0)
+    assert not Fall(0.0, 0.0, 0.0).and_by(Fall(0.0, 0.0, 0.0)).confirms
 
 
 @pytest.mark.parametrize(

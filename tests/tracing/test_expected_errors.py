@@ -197,3 +197,12 @@ def test_no_round_has_another_noise():
     assert quiet.noise == pytest.approx(np.sqrt(own + 1.0))
     assert quiet.expected**2 - quiet.noise**2 == pytest.approx(16.0 - loud.noise**2)
     assert quiet.ratio_to_expected > loud.ratio_to_expected
+
+
+def test_the_noise_of_a_run_that_could_not_be_solved_is_not_known():
+    """A later model that solves the run measures it."""
+    unsolved = {("a", "force"): RecordNoise(np.nan, np.nan)}
+    later = {("a", "force"): RecordNoise(1.0, 0.5)}
+    assert least_noise({}, unsolved) == {}
+    assert least_noise(unsolved, later) == later
+    assert least_noise(later, unsolved) == later

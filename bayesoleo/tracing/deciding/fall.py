@@ -68,10 +68,15 @@ class Fall:
         least = ENOUGH * self.error + stats.norm.isf(MISSED) * self.scatter
         return bool(self.expected < least)
 
+    @property
+    def _weight(self) -> float:
+        return self.expected / self.scatter**2 if self.scatter > 0 else 0.0
+
     def and_by(self, other: Fall) -> Fall:
         """Both together, each weighted by what it would show of a real effect: by the expected fall
-        over the variance, which gives the test with most power. The larger weight is one."""
-        weights = np.array([one.expected / max(one.scatter, 1e-300) ** 2 for one in (self, other)])
+        over the variance, which gives the test with most power. The larger weight is one. Runs
+        that the effect does not change, or that could not be solved, say nothing."""
+        weights = np.array([one._weight for one in (self, other)])
         first, second = weights / max(weights.max(), 1e-300)
         return Fall(
             float(first * self.value + second * other.value),

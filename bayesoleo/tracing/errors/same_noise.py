@@ -18,15 +18,21 @@ def least_noise(one: Noise, other: Noise) -> dict[tuple[str, str], RecordNoise]:
     """By run and output the smaller of two measurements.
 
     A residual is nowhere smaller than the noise in it, whichever model leaves it: the least that
-    was found is nearest.
+    was found is nearest. Where a run could not be solved nothing was measured.
     """
-    found = dict(one)
+    found = {key: noise for key, noise in one.items() if _is_known(noise)}
     for key, noise in other.items():
+        if not _is_known(noise):
+            continue
         known = found.get(key, noise)
         found[key] = RecordNoise(
             min(known.sigma, noise.sigma), min(known.input_noise, noise.input_noise)
         )
     return found
+
+
+def _is_known(noise: RecordNoise) -> bool:
+    return bool(np.isfinite(noise.sigma) and np.isfinite(noise.input_noise))
 
 
 def with_same_noise(table: ErrorTable, noise: Noise) -> ErrorTable:
