@@ -58,5 +58,10 @@ def test_a_search_that_broke_off_ends_in_a_round_that_says_why(searched):
     assert loop.effects == ("coulomb_friction",)
     assert loop.rounds[-1].before is loop.final
     finished = kept[-1]
-    assert finished.ended("never said") is finished
+    broken = finished.ended("never said")
+    assert broken.rounds == finished.rounds
+    assert not finished.broken
+    # Its effects had still to be looked at beside each other.
+    assert broken.broken
+    assert not loop_of(broken, roles).certain
     assert replace(finished, rounds=finished.rounds[:1]).finished is False

@@ -22,7 +22,8 @@ class Progress:
     notes : tuple of str
         What a reader should know so far.
     broken : bool
-        Whether it ended before a round found nothing more.
+        Whether it ended before a round found nothing more, or before its final effects had been
+        looked at again.
     """
 
     first: State
@@ -62,7 +63,9 @@ class Progress:
         return Progress(self.first, state, (*self.rounds, outcome), tuple(notes))
 
     def ended(self, reason: str) -> Progress:
-        """With a last round that examined nothing and accepts nothing, where there is none.
+        """Broken off: with a last round that examined nothing and accepts nothing, where there is
+        none. After the last round effects are still looked at again, so that one that has it may
+        break off too.
 
         Parameters
         ----------
@@ -70,6 +73,6 @@ class Progress:
             Why the search went no further.
         """
         if self.finished:
-            return self
+            return replace(self, broken=True)
         last = Round(self.state, (), {}, None, None, reason, 1.0)
         return replace(self, rounds=(*self.rounds, last), broken=True)
