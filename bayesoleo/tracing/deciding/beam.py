@@ -132,7 +132,9 @@ def _followed(
     begun = Round(
         opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
     )
-    found = follow(Progress(progress.first, after, (begun,), progress.notes[:1]), most)
+    # Of the notes only that on the roles holds for the other search too.
+    notes = tuple(note for note in progress.notes if note == roles.description)
+    found = follow(Progress(progress.first, after, (begun,), notes), most)
     if provisional and not _together_confirmed(found):
         return None
     return found
@@ -173,10 +175,11 @@ def _with_notes(best: Progress, other: Progress, gap: float, say: Say) -> Progre
         " and ".join(effect for effect, _ in one.state.assembly.added) or "no effect"
         for one in (other, best)
     )
-    say(f"{names} do better")
+    say(f"take {names} instead of {present}")
+    way = f"falls by {gap:.3g}" if gap > 0 else f"rises by {-gap:.3g} only, and they name causes"
     told = (
-        f"{names} stand instead of {present}: with unknowns counted (Schwarz 1978) the weighted"
-        f" squared error on fitted runs falls by {gap:.3g}"
+        f"instead of {present} the model has {names}: with unknowns counted (Schwarz 1978) the"
+        f" weighted squared error on fitted runs {way}"
     )
     return replace(other, notes=(*other.notes, told))
 
