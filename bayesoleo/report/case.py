@@ -160,6 +160,11 @@ def _sure(summary: Mapping[str, Any]) -> str:
         return ""
     sure = sentences.certainty(summary)
     alike = any(one["indistinguishable_from"] for one in sentences.accepted(summary))
+    if sure == schema.LIKENESS and sentences.only_too_small(summary):
+        return (
+            "A likeness only: an error is smaller than chance allows, so that the noise is not"
+            " what it is held to be."
+        )
     if sure == schema.PROBABLE and alike:
         return (
             "Probable, as one of a class: these data cannot tell it from the effects named above."

@@ -25,7 +25,8 @@ def role_shown(summary: Mapping[str, Any]) -> str:
 def headline(summary: Mapping[str, Any]) -> str:
     """The result as a sentence, which begins with how sure it is."""
     broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))
-    return f"Unfinished, the search broke off. {_said(summary)}" if broken else _said(summary)
+    lead = "Unfinished, the search did not come to its end. " if broken else ""
+    return f"{lead}{_said(summary)}"
 
 
 def _said(summary: Mapping[str, Any]) -> str:
@@ -36,7 +37,7 @@ def _said(summary: Mapping[str, Any]) -> str:
             return (
                 f"Nothing is missing: the model explains the measurements down to {words(summary)}."
             )
-        lead = "No verdict" if _only_too_small(summary) else "Something is missing"
+        lead = "No verdict" if only_too_small(summary) else "Something is missing"
         return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
     down = f"the error is then down to {words(summary)}"
     if sure == schema.CERTAIN:
@@ -102,7 +103,7 @@ def accepted(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _size_left(summary: Mapping[str, Any]) -> str:
     """How large the error is that remains: of an output over all runs of a role, or in one run
-    where that alone is too large."""
+    where that alone is too large; else which runs have no prediction."""
     pooled = {
         f"{output} on the {role} runs": errors
         for role, outputs in summary["error_after"].items()
@@ -113,22 +114,27 @@ def _size_left(summary: Mapping[str, Any]) -> str:
         for output, runs in summary["rounds"][-1]["error"].items()
         for run, errors in runs.items()
     }
-    if _only_too_small(summary):
+    if only_too_small(summary):
         where = min(
             (one for one in pooled if too_small(pooled[one])),
             key=lambda one: ratio(pooled[one]) or 0.0,
         )
         times = f"{format_short(ratio(pooled[where]))} times {words(summary)}"
         return f"the error of {where} is {times}, less than chance allows: its noise is overstated"
-    for found in (pooled, single):
-        known = {where: ratio(errors) or 0.0 for where, errors in found.items()}
-        where = max(known, key=lambda one: known[one], default="")
-        if where and known[where] and (too_large(found[where]) or found is single):
-            return f"the error of {where} is {format_short(known[where])} times {words(summary)}"
+    large = [{w: e for w, e in found.items() if too_large(e)} for found in (pooled, single)]
+    unknown = [where for where, errors in single.items() if ratio(errors) is None]
+    known = {where: errors for where, errors in single.items() if ratio(errors) is not None}
+    if known and unknown and not any(large):
+        return f"there is no prediction of {listed(unknown)}"
+    for found in (*large, known):
+        where = max(found, key=lambda one: ratio(found[one]) or 0.0, default="")
+        if where:
+            times = f"{format_short(ratio(found[where]))} times {words(summary)}"
+            return f"the error of {where} is {times}"
     return "an error is left"
 
 
-def _only_too_small(summary: Mapping[str, Any]) -> bool:
+def only_too_small(summary: Mapping[str, Any]) -> bool:
     """Whether no error is too large, but one is smaller than chance allows."""
     pooled = [e for outputs in summary["error_after"].values() for e in outputs.values()]
     single = [e for runs in summary["rounds"][-1]["error"].values() for e in runs.values()]
@@ -138,14 +144,14 @@ def _only_too_small(summary: Mapping[str, Any]) -> bool:
 def unfinished(summary: Mapping[str, Any]) -> list[str]:
     """Which stages did not finish, and why."""
     return [
-        f"Unfinished: the stage {item['stage']} failed. {item['reason']}"
+        f"Unfinished stage: {item['stage']}. {begin(item['reason'])}"
         for item in summary.get(schema.UNFINISHED, [])
     ]
 
 
 def _unexplained(summary: Mapping[str, Any]) -> str:
     """What the catalogue has to say to an error that remains, as the end of a sentence."""
-    if _only_too_small(summary):
+    if only_too_small(summary):
         return ""
     last = summary["rounds"][-1]
     open_ = [

@@ -90,7 +90,10 @@ def report_what_is_there(output: Output, stages: Stages) -> xr.DataTree | None:
         summary = json.loads(tree.attrs[schema.SUMMARY])
     except (BayesoleoError, KeyError, ValueError):
         return None
-    summary[schema.UNFINISHED] = list(stages.failed)
+    # What was missing when it was written is missing still.
+    before = [one for one in summary.get(schema.UNFINISHED, []) if one not in stages.failed]
+    summary[schema.UNFINISHED] = [*stages.failed, *before]
+    summary["headline"] = headline(summary)
     _mark(tree, summary)
     output.write(tree, summary)
     write_plain_report(summary, output.folder / REPORT)

@@ -78,7 +78,8 @@ def test_four_false_names_are_no_finding():
 def test_a_search_that_broke_off_is_said_first():
     broken = [{"stage": "search", "reason": "NameError: x"}]
     text = told(["play @ x"], schema.PROBABLE, unfinished=broken)
-    assert text.startswith("Unfinished, the search broke off. Probable: play (x) was missing")
+    lead = "Unfinished, the search did not come to its end. "
+    assert text.startswith(f"{lead}Probable: play (x) was missing")
     late = [{"stage": "posterior", "reason": "NameError: x"}]
     assert told(["play @ x"], schema.PROBABLE, unfinished=late).startswith("Probable: ")
 
@@ -86,6 +87,23 @@ def test_a_search_that_broke_off_is_said_first():
 def test_a_run_that_alone_is_too_large_is_named():
     text = told([], None, ratio=1.1, verdict=schema.UNEXPLAINED)
     assert text == "Something is missing: the error of force in run a is 1.10 times its noise."
+
+
+def runs_told(**ratios):
+    """The headline where nothing was found and no error is too large over all runs."""
+    runs = {run: {"ratio_to_noise": r, "limit": limit} for run, (r, limit) in ratios.items()}
+    last = {"accepted": None, "candidates": [], "error": {"force": runs}}
+    return told([], None, rounds=[last], verdict=schema.UNEXPLAINED)
+
+
+def test_the_run_that_is_named_is_one_that_is_too_large():
+    """Chance allows more in a run of few samples."""
+    assert "force in run b is 1.40 times" in runs_told(a=(1.5, 2.0), b=(1.4, 1.2))
+
+
+def test_a_run_without_a_prediction_is_what_is_missing():
+    text = runs_told(a=(1.0, 1.2), b=(None, 1.2))
+    assert text == "Something is missing: there is no prediction of force in run b."
 
 
 def test_less_error_than_chance_allows_is_no_finding():

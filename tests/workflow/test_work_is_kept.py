@@ -267,7 +267,7 @@ def test_the_terminal_says_what_failed_and_the_status_is_its_own(campaign, tmp_p
     arguments = ["close", campaign, "--model", f"{file}:model", "--out", tmp_path / "out"]
     shown = CliRunner().invoke(app, [*map(str, arguments), "--quick", "--max-effects", "0"])
     assert shown.exit_code == UNFINISHED == 3
-    assert "Unfinished: the stage posterior failed." in " ".join(shown.stdout.split())
+    assert "Unfinished stage: posterior. NameError" in " ".join(shown.stdout.split())
     assert shown.stderr.splitlines()[-1].startswith("error: unfinished: posterior: NameError")
 
 
