@@ -71,8 +71,9 @@ def kept_state(path: str | os.PathLike[str], key: Key) -> tuple[Any, str]:
         return None, "it cannot be read"
     if kind != _FORMAT or hashlib.sha256(content).hexdigest() != checksum:
         return None, "it is damaged"
-    other = [name for name, digest in key.items() if stored.get(name) != digest]
-    if other or stored.keys() != key.keys():
+    names = [*key, *(stored.keys() - key.keys())]
+    other = [name for name in names if stored.get(name) != key.get(name)]
+    if other:
         return None, f"it belongs to {' and '.join(f'another {name}' for name in other)}"
     try:
         return cloudpickle.loads(content), ""

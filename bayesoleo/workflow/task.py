@@ -178,7 +178,9 @@ def _about(item: Invented, units: Mapping[str, str]) -> str:
 def _about_lost(item: Lost, units: Mapping[str, str]) -> str:
     """What an input lacks, as a sentence."""
     unit = units.get(item.channel, "(SI)") + (f"/s^{item.derivative}" if item.derivative else "")
-    share = f"{item.lost:.2g} of {np.hypot(item.held, item.lost):.2g} {unit}"
+    # A masked stretch is held against all of the channel, other losses are no part of what stays.
+    whole = item.held if item.why == "masked" else np.hypot(item.held, item.lost)
+    share = f"{item.lost:.2g} of {whole:.2g} {unit}"
     run, name = f"run {item.run}", item.channel
     if item.why == "masked":
         return (

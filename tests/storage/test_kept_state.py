@@ -32,6 +32,8 @@ def test_another_calculation_or_a_damaged_file_has_none_and_a_reason(tmp_path):
     assert kept_state(path, KEY) == (None, "")
     keep_state(path, KEY, [1])
     assert kept_state(path, KEY | {"model": "c"}) == (None, "it belongs to another model")
+    fewer = {name: value for name, value in KEY.items() if name != "model"}
+    assert kept_state(path, fewer) == (None, "it belongs to another model")
     content = path.read_bytes()
     for broken in (content[:-1], content + b"x"):
         path.write_bytes(broken)
