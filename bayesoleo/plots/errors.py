@@ -1,4 +1,4 @@
-"""The error before and after, run by run, over the noise floor."""
+"""The error before and after, run by run, over what is expected of it."""
 
 from __future__ import annotations
 

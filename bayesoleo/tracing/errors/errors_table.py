@@ -233,7 +233,7 @@ def compared(
     prediction : Prediction
     roles : mapping of str to str
     measured : callable
-        The noise of an output in a run where it was measured before; it stays what it was.
+        The noise of an output in a run where it was measured before; it grows no more.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The noise of a record: measured once, and never more than the residual bears out.
+"""The noise of a record: the same whatever the model, and never more than the residual bears out.
 
 What the noise of an input does to a prediction is computed by sending its spectrum through the
 model. A model that differentiates its input makes much of it, and the spectrum between the input's

@@ -18,7 +18,7 @@ FIRST_HALF, SECOND_HALF = "first half", "second half"
 
 @dataclass(frozen=True)
 class RecordNoise:
-    """The noise of one output in one run, as it was measured with the model as declared.
+    """The noise of one output in one run, as the models of a search have shown it so far.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Roles:
     description : str
         The same as a sentence.
     measured : mapping of (run, output) to RecordNoise
-        Noise is a property of the records: once it has been measured it stays.
+        Noise is a property of the records: once it was measured no later model has more of it.
     """
 
     fitted: tuple[Record, ...]
