@@ -11,6 +11,7 @@ from fitted_states import NUMERICS, motion
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.effects import find_effect
+from bayesoleo.tracing.deciding import confirmation
 from bayesoleo.tracing.deciding.confirmation import confirmed, judged
 from bayesoleo.tracing.deciding.fall import Fall, fall_on_hold_out, surrogate_variance, with_error
 from bayesoleo.tracing.deciding.loop import close_loop
@@ -124,6 +125,22 @@ def test_what_leaves_more_than_noise_must_explain_more(share, reached, enough):
     assert ("does not exclude its null" in reason) is enough
     assert (f"would explain only {100 * share:.0f} %" in reason) is not enough
     assert "by 320 ± 280" in reason, "a fall is never said without its error"
+
+
+def test_runs_without_a_solution_are_not_said_to_speak_against_an_effect(monkeypatch):
+    item = SimpleNamespace(effect="play", gain=0.5)
+    point = SimpleNamespace(theta=np.zeros(1))
+    result = SimpleNamespace(
+        share=0.5, reached=True, excludes_null=lambda: True, inflation=1.0, assembly=None,
+        fit=SimpleNamespace(point=point),
+    )  # fmt: skip
+    after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
+    monkeypatch.setattr(confirmation, "fit_state", lambda *_, **__: after)
+    monkeypatch.setattr(confirmation, "judged", lambda *_: (None, None))
+    monkeypatch.setattr(confirmation, "fall_on_hold_out", lambda *_: Fall(0.0, 0.0, 0.0))
+    found, reason = confirmed(None, item, result, None, NUMERICS, print)
+    assert found is None
+    assert reason == "play cannot be confirmed: it changes no hold-out run that is solved"
 
 
 def test_a_fall_of_about_its_error_confirms_nothing():

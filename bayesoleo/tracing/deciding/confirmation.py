@@ -51,6 +51,8 @@ def confirmed(
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
     fall = fall_on_hold_out(*judged(state, after), result.inflation)
+    if fall.error == 0.0:
+        return None, f"{item.effect} cannot be confirmed: it changes no hold-out run that is solved"
     where = f"hold-out runs: the weighted squared error falls by {fall}"
     halves = in_halves(roles) if fall.undecided else None
     if halves is not None:
