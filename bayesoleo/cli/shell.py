@@ -135,7 +135,7 @@ def kept_in(folder: Path | None) -> str:
         return "nothing was written"
     older, results = folder / OLDER, folder / RESULTS
     said = "no result was written"
-    if older.is_dir():
+    if (older / RESULTS).is_file():
         said = f"an older result is in {older}, what is known of the new one in {folder}"
     elif results.is_file() and _unfinished(results):
         said = f"what is known is in {results}"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo.errors import InputError
 from bayesoleo.storage import check_writable, read_attributes, write_text_atomic, write_tree
 from bayesoleo.storage.digest import digest, package_digest
 from bayesoleo.storage.kept import keep_state, kept_state
@@ -23,6 +23,8 @@ from bayesoleo.workflow.task import Say, Task
 RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
 FILES = (RESULTS, REPORT, SUMMARY)
 CHECKPOINTS, SEARCH, OLDER = "checkpoints", "search.pickle", "older"
+#: By this file a folder of an older result is known as one that was made here, and may go.
+PUT_ASIDE = ".put-aside"
 
 
 @dataclass
@@ -45,11 +47,19 @@ class Output:
         Raises
         ------
         InputError
-            If it is no path, or files cannot be written there.
+            If it is no path, or files cannot be written there without writing over others.
         """
         if out is None:
             return cls(None)
-        return cls(check_writable(out, FILES, (CHECKPOINTS, OLDER)))
+        folder = check_writable(out, FILES, (CHECKPOINTS, OLDER))
+        aside = folder / OLDER
+        if not (aside / PUT_ASIDE).is_file() and any((aside / name).exists() for name in FILES):
+            raise InputError(
+                "holds a result that was not put aside here, which would be written over",
+                file=aside,
+                hint="rename or move it, or choose another folder",
+            )
+        return cls(folder)
 
     @property
     def checkpoints(self) -> Path | None:
@@ -87,8 +97,9 @@ class Output:
         if not is_finished(self.folder / RESULTS):
             return
         aside = self.folder / OLDER
-        shutil.rmtree(aside, ignore_errors=True)
-        aside.mkdir(parents=True)
+        _drop(aside)
+        aside.mkdir(parents=True, exist_ok=True)
+        (aside / PUT_ASIDE).touch()
         for name in FILES:
             if (self.folder / name).exists():
                 os.replace(self.folder / name, aside / name)
@@ -96,7 +107,7 @@ class Output:
     def finish(self) -> None:
         """Drop the older result, and what the search would go on from: the new one is complete."""
         if self.folder is not None and self.checkpoints is not None:
-            shutil.rmtree(self.folder / OLDER, ignore_errors=True)
+            _drop(self.folder / OLDER)
             # Fits of many candidates take tens of megabytes.
             (self.checkpoints / SEARCH).unlink(missing_ok=True)
 
@@ -119,6 +130,16 @@ class Output:
             return None
         say(f"go on after round {len(found.rounds)}, which {path} holds")
         return found
+
+
+def _drop(aside: Path) -> None:
+    """Remove a result that was put aside; whatever else is in its folder stays."""
+    if not (aside / PUT_ASIDE).is_file():
+        return
+    for name in (*FILES, PUT_ASIDE):
+        (aside / name).unlink(missing_ok=True)
+    with suppress(OSError):  # a user's own files are in it
+        aside.rmdir()
 
 
 def is_finished(results: Path) -> bool:
