@@ -11,7 +11,7 @@ from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 from bayesoleo.data.averaging import check_length
 from bayesoleo.errors import CampaignError
 from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.fitting.roles import assign, halves
+from bayesoleo.tracing.fitting.roles import RecordNoise, assign, halves
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +97,14 @@ def test_a_lone_transient_leaves_nothing_to_hold_out(records):
     roles = assign([replace(records[0], kind="transient", periods=0)])
     assert roles.strategy == "none"
     assert "transient" in roles.description
+
+
+def test_noise_that_was_measured_is_found_again(tmp_path):
+    """Of the halves of a lone run by each of them, of halves made later by the whole run."""
+    (whole,) = damper_campaign(tmp_path, runs=DAMPER_RUNS[:1], periods=8).records
+    roles, own, all_of_it = assign([whole]), RecordNoise(1.0, 0.1), RecordNoise(2.0, 0.2)
+    label = roles.fitted[0].label
+    assert roles.noise_of("force", label) is None
+    assert replace(roles, measured={(label, "force"): own}).noise_of("force", label) == own
+    later = replace(roles, measured={(whole.label, "force"): all_of_it})
+    assert later.noise_of("force", label) == all_of_it

@@ -55,9 +55,12 @@ class Roles:
     measured: Mapping[tuple[str, str], RecordNoise] = field(default_factory=dict)
 
     def noise_of(self, output: str, label: str) -> RecordNoise | None:
-        """Of a run, or of the run that it is a half of; None where it was not measured yet."""
+        """Of a run, or of the run that it is a half of; None where it was not measured yet.
+
+        Where all that there is are two halves of one run, each has been measured by itself.
+        """
         whole = label.removesuffix(f" ({FIRST_HALF})").removesuffix(f" ({SECOND_HALF})")
-        return self.measured.get((whole, output))
+        return self.measured.get((label, output), self.measured.get((whole, output)))
 
 
 def assign(records: Sequence[Record]) -> Roles:
