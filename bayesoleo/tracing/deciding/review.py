@@ -9,7 +9,7 @@ difference is. An effect that does better beside the others than the one that wa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.fitting.assembly import Step
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score, score_all
 from bayesoleo.tracing.scoring.significance import without_twins
@@ -34,6 +35,10 @@ from bayesoleo.tracing.scoring.significance import without_twins
 #: Rivals of a final effect that are estimated beside the others, and those of which it is asked
 #: whether they do without another effect.
 MOST_RIVALS, MOST_SMALLER = 5, 3
+
+#: Places in the scan of a shape from which an estimate is started again if it explains nearly as
+#: much as the best, to this part, but less by more than so many squared standard deviations.
+STARTS, LITTLE, CLOSE = (0.25, 0.5, 0.75), 0.8, 4.0
 
 Say = Callable[[str], None]
 
@@ -249,6 +254,7 @@ def place_of(
     chosen = [own, *rivals]
     results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
     refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
+    refits |= _from_other_shapes(base, refits, chosen, numerics)
     ranking = rank(scores, progress.rounds[number].tests, refits)
     mine = next(item for item in ranking if item.score is own)
     if mine.refit is None:
@@ -256,6 +262,31 @@ def place_of(
     others = [item for item in ranking if item.refit is not None and item is not mine]
     others.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
     return Place(number, without, mine, tuple(others))
+
+
+def _from_other_shapes(
+    base: Base, refits: Mapping[int, Refit], chosen: Sequence[Score], numerics: Numerics
+) -> dict[int, Refit]:
+    """Better estimates of effects that came out a little behind the best, by other starts.
+
+    Where friction switches, the error has several minima along the shape, and the shape that scores
+    best at the null may lie beside the wrong one: then an effect would be told from one that is the
+    same but for its shape.
+    """
+    best = max(result.fall for result in refits.values())
+    better: dict[int, Refit] = {}
+    for score in chosen:
+        found, grids = refits[id(score)], score.option.candidate.shapes
+        if not score.shapes or not found.fall > LITTLE * best:
+            continue
+        for part in STARTS:
+            if best - found.fall < CLOSE * found.inflation:
+                break
+            shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
+            again = refit(base, replace(score, shapes=shapes), numerics)
+            if np.isfinite(again.share) and again.fall > found.fall:
+                found = better[id(score)] = replace(again, score=score)
+    return better
 
 
 def _worth_estimating(own: Score, others: Sequence[Score], same: Sequence[str]) -> list[Score]:
