@@ -28,6 +28,7 @@ MODELS = {
     ("thermo-mechanical", "thesis"): "f16n2d1_thesis",
     ("thermo-mechanical", "linked"): "f16n2d1",
 }
+DAMPING = "orifice_damping"
 FRICTION = ("friction_base", "friction_per_pressure", "friction_slope")
 #: Heading and factor of each estimated parameter.
 COLUMNS = {
@@ -113,7 +114,9 @@ class Shaker:
     def friction(self) -> Friction:
         """Estimate it from force and pressure, driven by displacement."""
         direct = self._fit(bayesoleo.system("f16n2d2"), "displacement").point
-        each = self._fit(friction_of_each_run(bayesoleo.system("f16n2d2")), "displacement").point
+        # One amplitude for all of a run is an approximation: its error is not the damping's.
+        known = bayesoleo.system("f16n2d2").with_values({DAMPING: direct[DAMPING]}).fixing(DAMPING)
+        each = self._fit(friction_of_each_run(known), "displacement").point
         sds = dict(zip(each.names, each.sd, strict=True))
         names = [f"friction_of_run[{run}]" for run in self.runs]
         amplitude, sd = (np.array([table[n] for n in names]) for table in (each, sds))
