@@ -45,7 +45,7 @@ def test_the_run_that_separates_is_printed_and_drawn(run, springs, tmp_path):
     ask = ("propose", springs, "--model", springs / "model.py", "--limit", "force=:", *SPRINGS)
     result = run(*ask, "--figure", tmp_path / "map.png")
     assert result.exit_code == 0, result.output
-    assert "mean 0 mm, amplitude 50.0 mm would separate linear_stiffness from" in result.stdout
+    assert "mean 0 mm, amplitude 50.0 mm would separate linear stiffness from" in result.stdout
     assert (tmp_path / "map.png").stat().st_size > 10_000
     # The command line goes before the campaign.
     result = run(*ask, "--limit", "amplitude=5:20mm", "--json")

@@ -58,7 +58,7 @@ def test_what_was_found_before_the_last_effect_gets_the_class_that_it_has_beside
     estimate = object()
     own = replace(first, same=("play", "preload"), refit=estimate)
     place = SimpleNamespace(number=0, own=own, better=None)
-    monkeypatch.setattr(review, "place_of", lambda *_: place)
+    monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
     told = review.reviewed(found, None, None, None, lambda _: None, replacing=False).rounds
     assert told[0].accepted.same == ("play", "preload")
     assert told[0].accepted.beside is estimate

@@ -148,10 +148,8 @@ SEVERAL = ("end_stop_upper", "quadratic_stiffness", "cubic_stiffness", "coulomb_
 )
 def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_path, law, names):
     """Three names explain a law that the catalogue lacks down to the noise; two true ones stay."""
-    # The second name is hardly more than the noise: a draw in which runs held out confirm it.
-    reduced = damper_campaign(
-        tmp_path, law, per_period=60.3, noise=10.0 if len(names) == 1 else 2.0, seed=2
-    )
+    # With more noise the second name is hardly more than noise, and two names are enough.
+    reduced = damper_campaign(tmp_path, law, per_period=60.3, noise=6.0 if len(names) == 1 else 2.0)
     loop = close_loop(
         Assembly(damper(cubic=False)),
         assign(reduced.records),

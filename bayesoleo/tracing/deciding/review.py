@@ -119,8 +119,11 @@ def reviewed(
         number = _added_by(progress, step)
         if number is None or step.effect.family == FAMILY:
             continue
+        accepted = progress.rounds[number].accepted
+        if curve and (accepted is None or not accepted.same):
+            continue  # beside a curve nothing is replaced, and only known rivals are asked again
         say(f"look again at what was like {step.effect.id}")
-        place = place_of(progress, step, number, roles, numerics, effects)
+        place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
         if place is None:
             continue
         better = place.better if replacing and not curve else None
@@ -233,8 +236,13 @@ def place_of(
     roles: Roles,
     numerics: Numerics,
     effects: Sequence[Effect] | None,
+    *,
+    only_known: bool = False,
 ) -> Place | None:
-    """What could stand in a final effect's place; None where that cannot be said."""
+    """What could stand in a final effect's place; None where that cannot be said.
+
+    With ``only_known`` only what was in its class before is estimated.
+    """
     final, accepted = progress.state, progress.rounds[number].accepted
     assert accepted is not None
     less = final.assembly.without(step)
@@ -250,7 +258,7 @@ def place_of(
     scores, _ = without_twins(order)
     if not scores or scores[0].option.key != (step.effect.id, step.target):
         return None
-    own, rivals = scores[0], _worth_estimating(scores[0], scores[1:], accepted.same)
+    own, rivals = scores[0], _worth_estimating(scores[0], scores[1:], accepted.same, only_known)
     chosen = [own, *rivals]
     results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
     refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
@@ -289,7 +297,9 @@ def _from_other_shapes(
     return better
 
 
-def _worth_estimating(own: Score, others: Sequence[Score], same: Sequence[str]) -> list[Score]:
+def _worth_estimating(
+    own: Score, others: Sequence[Score], same: Sequence[str], only_known: bool
+) -> list[Score]:
     """Those that score near an effect, the best first, and those that were in its class before."""
     imitates = own.option.candidate.family in IMITATORS
     near = [
@@ -298,7 +308,7 @@ def _worth_estimating(own: Score, others: Sequence[Score], same: Sequence[str]) 
         if score.fall > NEAR * own.fall
         and (imitates or score.option.candidate.family not in IMITATORS)
     ]
-    chosen = near[:MOST_RIVALS]
+    chosen = [] if only_known else near[:MOST_RIVALS]
     before = [one for one in others if name_among(own, one) in same and one not in chosen]
     return [*chosen, *before[:MOST_RIVALS]]
 
