@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 #: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.
 Motion = Callable[[Array], Array]
+#: Rows of channels at fixed phases, by channel and derivative: they depend on no parameter.
+KnownRows = dict[tuple[str, int], Array]
 
 
 def guess_rows(
@@ -35,8 +37,12 @@ def guess_rows(
     constants: Mapping[str, float],
     phase: Array,
     motions: Mapping[str, Motion] | None = None,
+    known_rows: KnownRows | None = None,
 ) -> Array:
-    """Values and derivatives of every dof, shape (nz, N): known motions before guesses."""
+    """Values and derivatives of every dof, shape (nz, N): known motions before guesses.
+
+    With ``known_rows``, of the same record and phases, channels are evaluated once only.
+    """
     rows: list[Array] = []
     for dof, order in zip(derived.dofs, derived.orders, strict=True):
         if motions is not None and dof in motions:
@@ -46,7 +52,7 @@ def guess_rows(
                 continue
         expression = _measured(model, dof, record) or _declared(model, dof)
         for _ in range(order + 1):
-            rows.append(_evaluate(expression, record, constants, phase))
+            rows.append(_evaluate(expression, record, constants, phase, known_rows))
             expression = total_derivative(expression, list(record.harmonics))
     return np.stack(rows) if rows else np.empty((0, phase.size))
 
@@ -67,17 +73,23 @@ def _declared(model: Model, dof: str) -> sp.Expr:
 
 
 def _evaluate(
-    expression: sp.Expr, record: Record, constants: Mapping[str, float], phase: Array
+    expression: sp.Expr,
+    record: Record,
+    constants: Mapping[str, float],
+    phase: Array,
+    known_rows: KnownRows | None,
 ) -> Array:
     function, items = _compiled(expression)
+    found: KnownRows = {} if known_rows is None else known_rows
     columns = []
     for item in items:
         channel, order = split_derivative(item)
         if channel in record.harmonics:
             assert item == derivative_symbol(channel, order)
-            item = harmonics_of(record, channel).for_derivative(order)
-            motion = item.evaluate(phase, record.frequency, order)
-            columns.append(motion)
+            if (channel, order) not in found:
+                item = harmonics_of(record, channel).for_derivative(order)
+                found[channel, order] = item.evaluate(phase, record.frequency, order)
+            columns.append(found[channel, order])
         else:
             columns.append(np.asarray(constants[channel]))
     return np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)

@@ -16,7 +16,7 @@ from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.anchor import PATH_PIECES, Anchor
 from bayesoleo.prediction.from_shot import solve_from_shot
-from bayesoleo.prediction.guess import Motion, guess_rows
+from bayesoleo.prediction.guess import KnownRows, Motion, guess_rows
 from bayesoleo.prediction.inputs import RowCache, input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.squares import FusedSquares, squared_distances
@@ -114,6 +114,8 @@ class RunPredictor:
         self.period = 1.0 / record.frequency
         self.points = self.scheme.phases(steps)
         self.known_rows: RowCache = {} if known_rows is None else known_rows
+        #: Channels' rows that guesses took so far, at nodes and at collocation points.
+        self._guessed: tuple[KnownRows, KnownRows] = ({}, {})
         grid = f"{scheme_name} {steps}"
         self.boundary = Boundary(
             equations=kernels,
@@ -198,9 +200,9 @@ class RunPredictor:
         derived = self.kernels.derived
         constants = dict(zip(derived.constants, p, strict=True))
         nodes = np.arange(self.steps) / self.steps
-        at_nodes = guess_rows(self.model, derived, self.record, constants, nodes, self.motions)
-        at_points = guess_rows(
-            self.model, derived, self.record, constants, self.points, self.motions
+        at_nodes, at_points = (
+            guess_rows(self.model, derived, self.record, constants, phase, self.motions, known)
+            for phase, known in zip((nodes, self.points), self._guessed, strict=True)
         )
         return self.scheme.from_motion(at_nodes[None], at_points[None])
 
@@ -226,6 +228,8 @@ class RunPredictor:
         solution = solve_from_guess(self.boundary, p[None], guess)
         if solution.status[0] != Status.NO_CONVERGENCE.value:
             return solution
+        if self.anchor is not None:
+            guess = self.anchor.x[None]  # nearer, so that shooting takes fewer passes
         found = solve_from_shot(self.model, self.kernels, self.record, self.boundary, p, guess)
         return solution if found is None else found
 
