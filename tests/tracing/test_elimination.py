@@ -9,7 +9,13 @@ import pytest
 from fitted_states import NUMERICS, options
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo.tracing.deciding.elimination import dispersion, eliminated, loss_without
+from bayesoleo.tracing.deciding import elimination
+from bayesoleo.tracing.deciding.elimination import (
+    dispersion,
+    eliminated,
+    loss_without,
+    plainly_needed,
+)
 from bayesoleo.tracing.deciding.refit import new_parameters
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.assembly import Assembly
@@ -83,3 +89,20 @@ def test_what_is_left_beyond_the_noise_makes_unknowns_dearer(tmp_path):
     quiet = replace(base, excess=0.0)
     assert dispersion(quiet) == 1.0
     assert loss_without(state, quiet, state.assembly.steps[0], NUMERICS).scale < loss.scale
+
+
+@pytest.mark.parametrize("left_to_explain", [0.0, 3.0])
+def test_what_is_plainly_needed_is_not_tried_without(tmp_path, monkeypatch, left_to_explain):
+    """It would have been kept: what is lost is far more than its unknowns are worth."""
+    reduced = damper_campaign(tmp_path, law(5 * PIN, 20 * RUB, left_to_explain), per_period=60.3)
+    state, roles = with_effects(reduced, *BOTH)
+    base, step = state.base(), state.assembly.steps[0]
+    assert plainly_needed(state, base, step)
+    assert loss_without(state, base, step, NUMERICS).worth > 100.0
+    monkeypatch.setattr(elimination, "loss_without", lambda *_: pytest.fail("tried without"))
+    assert eliminated(state, roles, NUMERICS, [], lambda _: None) is state
+
+
+def test_what_is_small_is_tried_without(tmp_path):
+    state, _ = with_effects(damper_campaign(tmp_path, law(PIN, 0.0), per_period=60.3), *BOTH)
+    assert not plainly_needed(state, state.base(), state.assembly.steps[0])

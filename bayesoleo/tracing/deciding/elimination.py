@@ -20,6 +20,12 @@ from bayesoleo.tracing.fitting.assembly import Step
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
+from bayesoleo.tracing.scoring.projection import squared_distance
+
+#: An effect is needed, and not tried without, if its amplitudes' squared distance from their null
+#: is so many times what its unknowns must be worth: a fit without an effect of that size has far to
+#: go, and the noise's colour does not make up for such a factor.
+PLAINLY = 200.0
 
 Say = Callable[[str], None]
 
@@ -82,9 +88,13 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
         Told what is being done.
     """
     while len(state.assembly.steps) > 1:
-        say("look whether the earlier effects are still needed")
         base = state.base()
-        losses = [loss_without(state, base, step, numerics) for step in state.assembly.steps[:-1]]
+        earlier = state.assembly.steps[:-1]
+        doubted = [step for step in earlier if not plainly_needed(state, base, step)]
+        if not doubted:
+            return state
+        say("look whether the earlier effects are still needed")
+        losses = [loss_without(state, base, step, numerics) for step in doubted]
         least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
         if not least.worth < 0.0:
             return state
@@ -93,6 +103,19 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
         notes.append(f"{effect} was removed again, a later effect made it superfluous: {least}")
         state = fit_state(state.assembly.without(least.step), roles, numerics, progress=say)
     return state
+
+
+def plainly_needed(state: State, base: Base, step: Step) -> bool:
+    """Whether an effect's amplitudes are so far from their null that no fit without it is asked
+    for: by Wald's statistic, which is smaller than the fall of the sum of squares where they differ
+    by much (Hauck and Donner 1977, JASA 72, 851-853)."""
+    point, names = state.fit.point, state.fit.problem.names
+    index = [k for k, name in enumerate(names) if name.split("[")[0] in step.amplitudes]
+    covariance = point.covariance[np.ix_(index, index)]
+    if not index or not point.status.ok or not np.isfinite(covariance).all():
+        return False
+    distance = squared_distance(point.theta[index], covariance)
+    return bool(distance > PLAINLY * schwarz_price(base) * len(index))
 
 
 def loss_without(state: State, base: Base, step: Step, numerics: Numerics) -> Loss:
