@@ -82,6 +82,11 @@ class Candidate:
 Names = Mapping[str, sp.Symbol]
 
 
+def either_side(model: Model, target: str) -> int:
+    """Both sides of a null are physical."""
+    return 0
+
+
 @dataclass(frozen=True)
 class Effect:
     r"""A physical effect that a model may lack.
@@ -119,6 +124,9 @@ class Effect:
         ``periodic`` or ``transient`` where it can be told from such runs alone; else empty.
     shown : callable (scales) -> bool
         Whether there is anything in the runs to scan for.
+    side : callable (model, target) -> int
+        +1 or -1 where only one side of the null is physical at a place, else 0; for amplitudes that
+        state no sign of their own.
 
     Raises
     ------
@@ -145,6 +153,7 @@ class Effect:
     driven: bool = False
     kind: str = ""
     shown: Callable[[Scales], bool] = always
+    side: Callable[[Model, str], int] = either_side
 
     def __post_init__(self) -> None:
         if not self.id.isidentifier():
@@ -218,7 +227,7 @@ class Effect:
             target=target,
             model=extended,
             parameters=tuple(names[item.name] for item in self.amplitudes),
-            sign={names[item.name]: item.sign for item in self.amplitudes},
+            sign={names[i.name]: i.sign or self.side(model, target) for i in self.amplitudes},
             shapes={names[own]: grid for own, grid in grids.items()},
         )
 

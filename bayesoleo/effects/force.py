@@ -12,10 +12,14 @@ from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import Scan
 from bayesoleo.effects.parts import Amplitude, Scales, Shape
 from bayesoleo.effects.places import (
+    acceleration,
+    balance_terms,
     drives,
+    force_places,
     is_quantity,
     measures,
     moving_places,
+    resistance_sense,
     resisting_places,
     substitute,
 )
@@ -49,14 +53,28 @@ OFFSET_BY_RUN = force_effect(
     source=BY_RUN,
 )
 
-MASS = force_effect(
-    "mass_error",
-    "force",
-    "mass_error*acceleration",
-    {"mass_error": Amplitude("mass_error", "force/(position/s**2)", r"\Delta m", "added mass")},
-    formula=r"\Delta m \, \ddot q",
-    title="Mass error (inertia)",
-    source="Newton (1687), second law",
+
+def _side_of_mass(model: Model, target: str) -> int:
+    """Of a law without inertia only some can be missing: its force then has the sense in which the
+    law resists motion. Where the model has inertia, it may be stated too large as well."""
+    place = force_places(model)[target]
+    terms = balance_terms(model, place).values()
+    if place.kind == "equation" or any(model.expand(one).has(acceleration(place)) for one in terms):
+        return 0
+    return resistance_sense(model, place)
+
+
+MASS = replace(
+    force_effect(
+        "mass_error",
+        "force",
+        "mass_error*acceleration",
+        {"mass_error": Amplitude("mass_error", "force/(position/s**2)", r"\Delta m", "added mass")},
+        formula=r"\Delta m \, \ddot q",
+        title="Mass error (inertia)",
+        source="Newton (1687), second law",
+    ),
+    side=_side_of_mass,
 )
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import sympy as sp
 
 from bayesoleo.model import Coordinate, Model
@@ -112,14 +113,27 @@ def damping_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
     return found
 
 
+def resistance_sense(model: Model, place: Coordinate) -> int:
+    """Sense in which a balance's damping grows with velocity, +1 or -1; 0 where it has none, or
+    its terms disagree."""
+    values = {
+        float(np.sign(_at_velocity(model.expand(term), place.velocity, model, 1.0).real))
+        for term in damping_terms(model, place).values()
+    }
+    return int(values.pop()) if len(values) == 1 else 0
+
+
 def _grows(term: sp.Expr, velocity: sp.Expr, model: Model) -> bool:
     """Whether the term at twice a velocity is at least 1.5 times itself, at a mid-range state."""
+    once, twice = (abs(_at_velocity(term, velocity, model, value)) for value in (1.0, 2.0))
+    return twice >= 1.5 * once > 0
+
+
+def _at_velocity(term: sp.Expr, velocity: sp.Expr, model: Model, value: float) -> complex:
     numbers = model.nominal()
     # Any state will do that is off every zero; one half is inside a volume ratio of zero to one.
     others = {item: 0.5 for item in term.free_symbols if item not in numbers and item != velocity}
-    shape = term.subs(numbers).subs(others)
-    once, twice = (abs(complex(shape.subs(velocity, value))) for value in (1.0, 2.0))
-    return twice >= 1.5 * once > 0
+    return complex(term.subs(numbers).subs(others).subs(velocity, value))
 
 
 def spring_force(model: Model, place: Coordinate) -> sp.Expr:

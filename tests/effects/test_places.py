@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bayesoleo.effects import catalogue
+from bayesoleo.effects import catalogue, find_effect
 from bayesoleo.effects.places import force_places
 from bayesoleo.effects.unnamed import balance_places
 from bayesoleo.model import Dof, Model, Output, Parameter
@@ -72,6 +72,26 @@ def test_a_force_acts_on_a_motion(model, places):
     # A curve without a name needs no motion, and an output is a channel anyway.
     assert balance_places(model)
     assert "sensor_offset" in offered(model)
+
+
+@pytest.mark.parametrize(
+    ("model", "side"),
+    [
+        (law(("force", "N"), "a*dot(x) + b*x", x="m"), 1),
+        (law(("force", "N"), "-a*dot(x) - b*x", x="m"), -1),
+        (law(("force", "N"), "a*dot(x) + b*dot(x)**2*tanh(dot(x))", x="m"), 1),
+        (law(("force", "N"), "a*dot(x) - b*dot(x)*abs(x)", x="m"), 0),  # nobody knows
+        (law(("force", "N"), "a*dot(x) + b*ddot(x)", x="m"), 0),  # what is stated may be too large
+        (law(("force", "N"), "a*x", x="m"), 0),
+    ],
+)
+def test_a_law_without_inertia_can_only_lack_some(model, side):
+    """A mass that is less than none looks like a spring."""
+    assert find_effect("mass_error").side(model, "force") == side
+
+
+def test_the_mass_of_an_oscillator_may_be_wrong_either_way():
+    assert find_effect("mass_error").side(oscillator(" - force"), "position") == 0
 
 
 def test_the_first_order_keeps_what_needs_no_velocity():
