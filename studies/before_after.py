@@ -23,17 +23,17 @@ def print_before_after(summary: Mapping[str, Any], unit: str, per_si: float) -> 
     per_si : float
         How many of it one SI unit is.
     """
-    head = ("rms before", "after", "repeating before", "after", "over its noise")
+    head = ("rms before", "after", "repeating before", "after", "over what is expected")
     print(f"{f'error in {unit}':26}" + "".join(f"{text:>{len(text) + 3}}" for text in head))
     for role in ROLES:
         for output, last in summary["error_after"].get(role, {}).items():
             first = summary["error_before"][role][output]
             cells = [per_si * e[key] for key in ("rms", "repeating") for e in (first, last)]
-            ratio = f"{first['ratio_to_noise']:.1f} → {last['ratio_to_noise']:.1f}"
+            ratio = " → ".join(f"{e['ratio_to_expected']:.1f}" for e in (first, last))
             row = "".join(
                 f"{value:{len(text) + 3}.3g}" for value, text in zip(cells, head, strict=False)
             )
-            print(f"{f'{output}, {role}':26}{row}{ratio:>17}")
+            print(f"{f'{output}, {role}':26}{row}{ratio:>24}")
     print(f"\n{'posterior of what was added':34}{'mean':>10}{'sd':>10}   95 % interval")
     for effect, names in added_parameters(summary):
         print(effect)

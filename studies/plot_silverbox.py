@@ -23,7 +23,7 @@ import bayesoleo
 
 campaign = HERE / "measured" / "silverbox"
 model = bayesoleo.load_model(f"{campaign / 'model.py'}:model")
-study = Study("silverbox", data="measured/silverbox")
+study = Study("silverbox", data="measured/silverbox", slow=True)
 for line in bayesoleo.systems.equations(model).values():
     print(line)
 
@@ -41,10 +41,10 @@ study.text("summary", lambda: bayesoleo.print_summary(summary, Console(width=100
 
 def rounds():
     """Error of the hold-out block in each round, and what was added then."""
-    print("round  repeating  / noise   added")
+    print("round  repeating  / expected   added")
     for number, entry in enumerate(summary["rounds"], 1):
         error = entry["error"]["output_voltage"]["block 2"]
-        repeating = f"{1e3 * error['repeating']:6.3f} mV {error['ratio_to_noise']:8.1f}"
+        repeating = f"{1e3 * error['repeating']:6.3f} mV {error['ratio_to_expected']:11.1f}"
         print(f"{number:5}  {repeating}   {entry['accepted'] or '–'}")
     last = summary["rounds"][-1]["error"]["output_voltage"]["block 2"]
     reached = "reached" if last["repeating"] < 0.39e-3 else "missed"

@@ -13,7 +13,8 @@ from small_campaigns import damper, damper_campaign
 from bayesoleo.effects import find_effect
 from bayesoleo.tracing.deciding import review
 from bayesoleo.tracing.deciding.beam import followed
-from bayesoleo.tracing.deciding.loop import close_loop
+from bayesoleo.tracing.deciding.lookahead import leads_as_far
+from bayesoleo.tracing.deciding.loop import Search, close_loop, searched
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.refit import refit
 from bayesoleo.tracing.deciding.rounds import Ranked, Round, rank
@@ -111,6 +112,52 @@ def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(t
     assert "it stands instead of quintic_stiffness" in told[0]
     assert "±" in told[0]
     assert loop.final.at_floor
+
+
+def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
+    """Friction and a cubic spring are there: damping of another law beside either leaves more."""
+    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
+    begun = added_first(roles, "cubic_stiffness")
+    second = added_first(roles, "coulomb_friction").rounds[0].accepted
+    third = added_first(roles, "quadratic_damping").rounds[0].accepted
+    found = [
+        leads_as_far(begun_with_two(begun, roles), item, roles, NUMERICS, EFFECTS, lambda _: None)
+        for item in (second, third)
+    ]
+    assert found == [True, False]
+
+
+def begun_with_two(begun, roles):
+    """A search that went on from its first effect."""
+    search = Search(roles, NUMERICS, EFFECTS, 0, 2, False, lambda _: None, lambda _: None)
+    found = searched(begun, search)
+    assert set(found.state.assembly.added) == {
+        ("cubic_stiffness", "force"), ("coulomb_friction", "force")
+    }  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gap", "remaining", "reached", "replaced"),
+    [
+        (100.0, 5000.0, False, False),  # decisive by the noise, and two per cent of what is left
+        (100.0, 5000.0, True, True),  # with it noise alone is left
+        (1000.0, 5000.0, False, True),
+        (3.0, 5.0, True, False),
+    ],
+)
+def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
+    monkeypatch, gap, remaining, reached, replaced
+):
+    monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+
+    def item(name, worth, left, at_noise):
+        estimate = SimpleNamespace(worth=worth, inflation=1.0, remaining=left, reached=at_noise)
+        return replace(accepted(name, ()), refit=estimate)
+
+    own = item("dahl_friction", 1000.0, remaining, False)
+    rival = item("lugre_friction", 1000.0 + gap, remaining - gap, reached)
+    assert review.Place(0, None, own, (rival,)).better is (rival if replaced else None)
 
 
 def test_first_effects_that_were_nearly_as_good_are_followed():

@@ -8,15 +8,17 @@ effects that were nearly as good as the one that was taken are followed to their
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged
 from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
+from bayesoleo.tracing.deciding.lookahead import leads_as_far
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.refit import AS_LIKELY, compare, schwarz_price
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
@@ -38,6 +40,7 @@ def best_of_beam(
     roles: Roles,
     numerics: Numerics,
     follow: Callable[[Progress, int], Progress],
+    effects: Sequence[Effect] | None,
     max_effects: int,
     say: Say,
 ) -> Progress:
@@ -51,6 +54,8 @@ def best_of_beam(
     numerics : Numerics
     follow : callable (progress, most) -> Progress
         Carries a search on to its end, with so many effects at most.
+    effects : sequence of Effect or None
+        Instead of the catalogue.
     max_effects : int
         Effects added at most.
     say : callable
@@ -65,6 +70,8 @@ def best_of_beam(
     best = progress
     for first in followed(progress):
         if (first.effect, first.target) in best.state.assembly.added:
+            continue
+        if not leads_as_far(progress, first, roles, numerics, effects, say):
             continue
         say(f"follow {first.effect} as the first effect instead")
         other = _followed(progress, first, roles, numerics, follow, max_effects, say)

@@ -160,7 +160,7 @@ def close_loop(
         return searched(other, quiet)
 
     roles = _with_noise(roles, known)
-    known = best_of_beam(known, roles, numerics, follow, max_effects, say)
+    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, say)
     return loop_of(known, roles)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
-from bayesoleo.tracing.deciding.confirmation import confirmed, judged
+from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged
 from bayesoleo.tracing.deciding.elimination import Loss, dispersion, eliminated, loss_without
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.progress import Progress
@@ -66,14 +66,20 @@ class Place:
 
     @property
     def better(self) -> Ranked | None:
-        """A rival that makes the data more than twenty times as likely, where there is one."""
+        """A rival that makes the data more than twenty times as likely, where there is one.
+
+        Where it leaves more than noise it must also explain as much of what the effect leaves as
+        another effect would have to: two shapes of one cause differ by less.
+        """
         for rival in self.rivals:
             assert rival.refit is not None
             assert self.own.refit is not None
             scale = max(rival.refit.inflation, self.own.refit.inflation)
             scale *= _dispersion(rival.refit, self.without)
             gap = rival.refit.worth - self.own.refit.worth
-            if rival.imitates <= self.own.imitates and gap > AS_LIKELY * scale:
+            if rival.imitates > self.own.imitates or not gap > AS_LIKELY * scale:
+                continue
+            if rival.refit.reached or gap > FAIR_SHARE * self.own.refit.remaining:
                 return rival
         return None
 

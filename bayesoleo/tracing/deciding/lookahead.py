@@ -1,0 +1,106 @@
+"""Whether another first effect may lead as far as the one that was taken: one effect ahead, on the
+fitted runs alone.
+
+A search carried to its end takes minutes; what the best second effect leaves beside the first tells
+in seconds whether it can come out better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bayesoleo.effects import Effect
+from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.parallel import thread_map
+from bayesoleo.tracing.deciding.elimination import dispersion
+from bayesoleo.tracing.deciding.progress import Progress
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, compare, refit, schwarz_price
+from bayesoleo.tracing.deciding.rounds import Ranked
+from bayesoleo.tracing.deciding.state import State, state_of
+from bayesoleo.tracing.fitting.fit import Fit, Numerics
+from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.scoring.base import Base
+from bayesoleo.tracing.scoring.scales import scales_of
+from bayesoleo.tracing.scoring.score import score_all
+from bayesoleo.tracing.scoring.significance import without_twins
+
+#: Second effects that are estimated beside another first one.
+MOST_SECONDS = 4
+
+Say = Callable[[str], None]
+
+
+def leads_as_far(
+    progress: Progress,
+    first: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect] | None,
+    say: Say,
+) -> bool:
+    """Whether a first effect with the best second one beside it leaves about as little as the first
+    two that were added, unknowns counted, or as the noise.
+
+    Parameters
+    ----------
+    progress : Progress
+        A finished search.
+    first : Ranked
+        Estimated in its first round.
+    roles : Roles
+    numerics : Numerics
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    say : callable
+        Told what is being done.
+    """
+    result = first.refit
+    assert result is not None
+    say(f"look how far {first.effect} leads as the first effect instead")
+    fitted = replace(roles, held_out=(), strategy="none")
+    state = state_of(result.assembly, result.fit, fitted)
+    if state.at_floor:
+        return True
+    reference = progress.first.base()
+    seconds = _best_seconds(state, numerics, effects)
+    if any(second.reached for second in seconds):
+        return True
+    tried = (result, *seconds)
+    falls = [_fall(reference, one.fit) for one in tried]
+    worths = [_worth(reference, fall, one.fit) for fall, one in zip(falls, tried, strict=True)]
+    present = _with_two(progress).fit
+    fall = _fall(reference, present)
+    left = replace(reference, excess=reference.excess - max(fall, *falls))
+    scale = dispersion(left) * max(one.inflation for one in tried)
+    return max(worths) > _worth(reference, fall, present) - AS_LIKELY * scale
+
+
+def _best_seconds(
+    state: State, numerics: Numerics, effects: Sequence[Effect] | None
+) -> list[Refit]:
+    """The effects that score best beside a first one, estimated."""
+    base, assembly = state.base(), state.assembly
+    scales = scales_of(state.fit, assembly.drive, tuple(assembly.native.dofs))
+    options = assembly.options(scales, None if effects is None else tuple(effects))
+    scores, _ = without_twins(score_all(base, options, numerics.jobs)[0])
+    named = [score for score in scores if score.option.candidate.family != FAMILY]
+    chosen = sorted(named, key=lambda score: -score.fall)[:MOST_SECONDS]
+    return thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+
+
+def _with_two(progress: Progress) -> State:
+    """The model with the first two effects that were added, or the final one if it has fewer."""
+    after = [entry.after for entry in progress.rounds if entry.after is not None]
+    return after[1] if len(after) > 1 else progress.state
+
+
+def _fall(reference: Base, fit: Fit) -> float:
+    share, _ = compare(reference, fit)
+    return share * reference.fall_back if np.isfinite(share) else -np.inf
+
+
+def _worth(reference: Base, fall: float, fit: Fit) -> float:
+    return fall - schwarz_price(reference) * len(fit.problem.names)
