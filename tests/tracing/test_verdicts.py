@@ -68,6 +68,8 @@ def test_less_error_than_chance_allows_is_no_success():
     assert verdict_of([], quiet, quiet) == schema.UNEXPLAINED
     found = state(0.16, "run-to-run", quiet=("too little",))
     assert verdict_of([added("run-to-run", NONE, found)], NONE, found) == schema.UNEXPLAINED
+    physics = state(0.16, "friction", quiet=("too little",))
+    assert verdict_of([added("friction", NONE, physics)], NONE, physics) == schema.UNEXPLAINED
 
 
 def test_certainty_of_names():

@@ -27,6 +27,8 @@ from bayesoleo.tracing.scoring.significance import SAME
 
 #: How a note begins that names parameters.
 ON_LIMIT = "at the limit of their prior's support"
+#: How a note begins of a declared model that was estimated from another start than its own.
+OTHER_OPTIMUM = "from its declared values the model's estimate ended in a lesser optimum, lower"
 
 Say = Callable[[str], None]
 
@@ -233,7 +235,12 @@ def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Pr
         say("more is left than expected: try other starts")
         start = better_start(state.fit, numerics)
         if start is not None:
+            before = state.fit.point.objective
             state = fit_state(assembly, roles, numerics, start=start, progress=say)
+            notes.append(
+                f"{OTHER_OPTIMUM} by {state.fit.point.objective - before:.3g} in log density: look"
+                " whether the declared values and priors are what is meant"
+            )
     return Progress(state, state, notes=tuple(notes))
 
 

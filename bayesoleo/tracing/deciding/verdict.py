@@ -36,6 +36,8 @@ def verdict_of(rounds: Sequence[Round], first: State, final: State) -> str:
     """
     if _as_expected(final):
         return schema.EFFECT_ADDED if final.assembly.added else schema.NOTHING_MISSING
+    if final.too_quiet:
+        return schema.UNEXPLAINED  # by a noise that is too large all is explained
     found = explained_by_physics(rounds, first, final) > MOSTLY
     return schema.EFFECT_ADDED if found else schema.UNEXPLAINED
 
