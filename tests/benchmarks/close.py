@@ -103,7 +103,9 @@ def new_parameters(summary: Mapping[str, Any]) -> dict[str, str]:
              for key in (chosen(entry) or {}).get("expected", {})}  # fmt: skip
     texts = {}
     for name, entry in summary["parameters"].items():
-        if name.split("[")[0] in known:
+        if name.split("[")[0] in known and entry["interval"] is None:
+            texts[name] = f"{entry['mean']:.4g} {entry['unit']}, shared with {entry['shared_with']}"
+        elif name.split("[")[0] in known:
             low, high = entry["interval"]
             texts[name] = (
                 f"{entry['mean']:.4g} ± {entry['sd']:.2g} {entry['unit']} ({low:.4g} … {high:.4g})"
@@ -181,7 +183,7 @@ def row(job: str, result: Mapping[str, Any]) -> str:
     def cells(table: dict) -> str:
         parts = [
             f"{output}: rms {v['rms']:.3g}, repeating {v['repeating']:.3g},"
-            f" ratio {v['ratio_to_noise']:.2f}"
+            f" ratio {v['ratio_to_noise']:.2f} (to what is expected {v['ratio_to_expected']:.2f})"
             for output, v in table.items()
         ]
         return "; ".join(parts)

@@ -57,7 +57,7 @@ _NEEDED = float(stats.chi2.isf(LEVEL / CANDIDATES, 1))
 #: model can do.
 LIMIT = float(np.sqrt(optimize.brentq(lambda x: stats.ncx2.sf(_NEEDED, 1, x) - 0.5, 1e-6, 400.0)))
 #: Amplitude of the first look at what an effect changes, and tries to come to a size.
-PROBE, TRIES = 0.03, 4
+PROBE, TRIES = 0.03, 8
 #: Channels that show the motion on which an effect acts.
 MOVES = ("displacement", "first", "body")
 #: Harmonics that a lagging signal is made of.

@@ -58,7 +58,7 @@ def test_what_was_found_before_the_last_effect_gets_the_class_that_it_has_beside
     found = progress_of(first, accepted("coulomb_friction", ("dahl_friction",)))
     estimate = object()
     own = replace(first, same=("play", "preload"), refit=estimate)
-    place = SimpleNamespace(number=0, own=own, better=None)
+    place = SimpleNamespace(number=0, own=own, better=())
     monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
     told = review.reviewed(found, None, None, None, lambda _: None, replacing=False).rounds
     assert told[0].accepted.same == ("play", "preload")
@@ -157,7 +157,7 @@ def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
 
     own = item("dahl_friction", 1000.0, remaining, False)
     rival = item("lugre_friction", 1000.0 + gap, remaining - gap, reached)
-    assert review.Place(0, None, own, (rival,)).better is (rival if replaced else None)
+    assert review.Place(0, None, own, (rival,)).better == ((rival,) if replaced else ())
 
 
 def test_first_effects_that_were_nearly_as_good_are_followed():
@@ -237,3 +237,34 @@ def test_names_come_together_in_one_balance(steps, several):
         for family, target in steps
     ]
     assert _several_in_one_balance(made) is several
+
+
+@pytest.mark.parametrize(("gap", "replaced"), [(-4.0, True), (-8.0, False), (8.0, True)])
+def test_a_cause_that_is_as_likely_stands_instead_of_what_varies_by_run(monkeypatch, gap, replaced):
+    monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+
+    def item(name, family, worth):
+        found = accepted(name, ())
+        found.score.option.candidate.family = family
+        estimate = SimpleNamespace(worth=worth, inflation=1.0, remaining=0.0, reached=True)
+        return replace(found, refit=estimate)
+
+    by_run, cause = item("varies_by_run", "run-to-run", 100.0), item("drag", "damping", 100.0 + gap)
+    assert bool(review.Place(0, None, by_run, (cause,)).better) == replaced
+    # The other way round nothing that varies by run stands instead of a cause.
+    assert not review.Place(0, None, cause, (by_run,)).better
+
+
+def test_the_next_rival_is_asked_where_runs_speak_against_the_best(monkeypatch):
+    found = progress_of(accepted("varies_by_run", ()), accepted("sensor_lag", ()))
+    asked = []
+
+    def replaced(progress, step, place, better, *_):
+        asked.append(better)
+        return progress if better == "friction" else None
+
+    place = SimpleNamespace(number=0, own=found.rounds[0].accepted, better=("drag", "friction"))
+    monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
+    monkeypatch.setattr(review, "_replaced", replaced)
+    assert review.reviewed(found, None, None, None, lambda _: None) is found
+    assert asked == ["drag", "friction"]

@@ -35,6 +35,8 @@ from bayesoleo.tracing.scoring.significance import without_twins
 #: Rivals of a final effect that are estimated beside the others, and those of which it is asked
 #: whether they do without another effect.
 MOST_RIVALS, MOST_SMALLER = 5, 3
+#: Rivals that do better of which runs that were not used are asked.
+MOST_TRIED = 3
 
 #: Places in the scan of a shape from which an estimate is started again if it explains nearly as
 #: much as the best, to this part, but less by more than so many squared standard deviations.
@@ -65,23 +67,27 @@ class Place:
     rivals: tuple[Ranked, ...]
 
     @property
-    def better(self) -> Ranked | None:
-        """A rival that makes the data more than twenty times as likely, where there is one.
+    def better(self) -> tuple[Ranked, ...]:
+        """Rivals that make the data more than twenty times as likely, the best first.
 
-        Where it leaves more than noise it must also explain as much of what the effect leaves as
+        Instead of what merely varies from run to run a cause stands that is as likely. Where a
+        rival leaves more than noise it must also explain as much of what the effect leaves as
         another effect would have to: two shapes of one cause differ by less.
         """
+        own = self.own.refit
+        assert own is not None
+        found = []
         for rival in self.rivals:
-            assert rival.refit is not None
-            assert self.own.refit is not None
-            scale = max(rival.refit.inflation, self.own.refit.inflation)
-            scale *= _dispersion(rival.refit, self.without)
-            gap = rival.refit.worth - self.own.refit.worth
-            if rival.imitates > self.own.imitates or not gap > AS_LIKELY * scale:
-                continue
-            if rival.refit.reached or gap > FAIR_SHARE * self.own.refit.remaining:
-                return rival
-        return None
+            result = rival.refit
+            assert result is not None
+            gap, scale = result.worth - own.worth, max(result.inflation, own.inflation)
+            needed = AS_LIKELY * scale * _dispersion(result, self.without)
+            if rival.imitates < self.own.imitates:
+                needed = -needed
+            clearly = result.reached or gap > FAIR_SHARE * own.remaining
+            if rival.imitates <= self.own.imitates and gap > needed and clearly:
+                found.append(rival)
+        return tuple(found[:MOST_TRIED])
 
 
 def _dispersion(result: Refit, without: State) -> float:
@@ -132,8 +138,7 @@ def reviewed(
         place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
         if place is None:
             continue
-        better = place.better if replacing and not curve else None
-        if better is not None:
+        for better in place.better if replacing and not curve else ():
             found = _replaced(progress, step, place, better, roles, numerics, say)
             if found is not None:
                 return found
@@ -340,9 +345,10 @@ def _replaced(
     if _is_worse(final, after, better.refit.inflation):
         return None
     gained = better.refit.worth - place.own.refit.worth
+    way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"
     reason += (
         f"; it stands instead of {step.effect.id}, beside the others the weighted squared error is"
-        f" lower by {gained:.3g}, unknowns counted"
+        f" {way}, unknowns counted{'' if gained > 0 else ', and it names a cause'}"
     )
     tests = progress.rounds[place.number].tests
     ranking = (better, place.own, *(item for item in place.rivals if item is not better))
