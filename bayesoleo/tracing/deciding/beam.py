@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
-from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged
+from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged, speak_against
 from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.lookahead import leads_as_far
@@ -160,7 +160,9 @@ def _better(best: Progress, other: Progress, say: Say) -> Progress:
     gap, scale = likelihood_gap(best, other)
     if set(best.state.assembly.added) == set(other.state.assembly.added):
         return best
-    if (best.state.at_floor and not other.state.at_floor) or _is_worse(best, other):
+    if (best.state.at_floor and not other.state.at_floor) or speak_against(
+        best.state, other.state, _inflation(best)
+    ):
         return best
     curve = any(step.effect.family == FAMILY for step in best.state.assembly.steps)
     symptom = _imitates(best) and not _imitates(other)
@@ -212,13 +214,6 @@ def _inflation(found: Progress) -> float:
     """Largest variance of an added effect's unknowns over that in white noise."""
     refits = [item.accepted.refit for item in found.rounds if item.accepted is not None]
     return max((result.inflation for result in refits if result is not None), default=1.0)
-
-
-def _is_worse(best: Progress, other: Progress) -> bool:
-    """Whether runs that were not used speak against the other model."""
-    if not best.state.hold_errors.entries:
-        return False
-    return fall_on_hold_out(*judged(other.state, best.state), _inflation(best)).confirms
 
 
 def _with_classes(best: Progress, other: Progress) -> Progress:

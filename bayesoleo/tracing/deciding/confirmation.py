@@ -68,6 +68,20 @@ def confirmed(
     return after, f"{_explains(item)} and lowers the error on {where}"
 
 
+def speak_against(one: State, other: State, inflation: float) -> bool:
+    """Whether runs that were not used speak against another model instead of one.
+
+    Parameters
+    ----------
+    one, other : State
+    inflation : float
+        Variance of the noise along what tells them apart, over that of white noise.
+    """
+    if not one.hold_errors.entries:
+        return False
+    return fall_on_hold_out(*judged(other, one), inflation).confirms
+
+
 def _on_fitted(result: Refit) -> str:
     """By how much an estimate lowers the error on the runs that it was made from."""
     # The fall is a non-central chi-square, of variance 2 k + 4 times its non-centrality.

@@ -17,9 +17,8 @@ import numpy as np
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
-from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged
+from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, speak_against
 from bayesoleo.tracing.deciding.elimination import Loss, dispersion, eliminated, loss_without
-from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, refit
 from bayesoleo.tracing.deciding.rounds import IMITATORS, NEAR, Ranked, Round, name_among, rank
@@ -215,7 +214,7 @@ def _without_companion(
     have nothing against it."""
     final, name = progress.state, result.score.option.key[0]
     after = fit_state(result.assembly.without(least.step), roles, numerics)
-    if (final.at_floor and not after.at_floor) or _is_worse(final, after, result.inflation):
+    if (final.at_floor and not after.at_floor) or speak_against(final, after, result.inflation):
         return None
     entry = _entry_of(progress, step)
     assert entry is not None
@@ -342,7 +341,7 @@ def _replaced(
     after, reason = confirmed(before, better, better.refit, roles, numerics, say)
     if after is None or (final.at_floor and not after.at_floor):
         return None
-    if _is_worse(final, after, better.refit.inflation):
+    if speak_against(final, after, better.refit.inflation):
         return None
     gained = better.refit.worth - place.own.refit.worth
     way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"
@@ -357,13 +356,6 @@ def _replaced(
     last = Round(before, ranking, {}, better, after, reason, tests)
     rounds = (*progress.rounds[:-1], last)
     return Progress(progress.first, state, rounds, tuple(notes))
-
-
-def _is_worse(one: State, other: State, inflation: float) -> bool:
-    """Whether runs that were not used speak against another model."""
-    if not one.hold_errors.entries:
-        return False
-    return fall_on_hold_out(*judged(other, one), inflation).confirms
 
 
 def _with_class(progress: Progress, place: Place) -> Progress:

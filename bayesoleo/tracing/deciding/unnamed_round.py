@@ -20,7 +20,7 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo.effects.unnamed import FAMILY, Axis
-from bayesoleo.tracing.deciding.confirmation import confirmed
+from bayesoleo.tracing.deciding.confirmation import confirmed, speak_against
 from bayesoleo.tracing.deciding.refit import Refit, compare, refit
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
 from bayesoleo.tracing.deciding.state import State
@@ -281,6 +281,8 @@ def _accepting(
         return outcome, reason
     if outcome.before.at_floor and not after.at_floor:
         return outcome, f"{item.effect} leaves more than the effects that have names"
+    if answer.instead and speak_against(outcome.before, after, result.inflation):
+        return outcome, f"{item.effect} predicts runs that were not used worse than the names do"
     if answer.instead:
         before = [step.effect.id for step in outcome.before.assembly.steps]
         reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
