@@ -104,6 +104,8 @@ class Predictor:
 
         self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
         self._base = np.stack([run.base_constants() for run in self.runs])
+        #: Of the last evaluation, the first run that could not be solved.
+        self._failed: int | None = None
 
     def __copy__(self) -> Predictor:
         """A copy that shares everything, and not one made anew of a state."""
@@ -142,13 +144,46 @@ class Predictor:
         return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)
 
     def evaluate(self, theta: Array) -> list[RunPrediction]:
-        """Anchor every run at ``theta (l,)`` and predict it there, by one solve."""
-        work = range(len(self.runs))
-        return thread_map(
-            lambda r: self._by_unknown(r, self.runs[r].evaluate(self.constants(theta[None], r)[0])),
-            work,
-            self.jobs,
-        )
+        """Anchor every run at ``theta (l,)`` and predict it there, by one solve.
+
+        Where runs were anchored before and one cannot be solved at ``theta``, all stay where they
+        were anchored, all predictions have its status and are not finite, and the others need not
+        be solved: what a step of an estimate asks is whether all can be.
+        """
+        everything = range(len(self.runs))
+        if any(run.anchor is None for run in self.runs):
+            return thread_map(lambda r: self._evaluate_run(theta, r), everything, self.jobs)
+        before, found = [run.anchor for run in self.runs], self._until_one_fails(theta)
+        self._failed = next((r for r, run in found.items() if not run.status.ok), None)
+        if self._failed is None:
+            return [found[r] for r in everything]
+        for run, anchor in zip(self.runs, before, strict=True):
+            run.anchor = anchor
+        return [self._unsolved(r, found[self._failed].status) for r in everything]
+
+    def _until_one_fails(self, theta: Array) -> dict[int, RunPrediction]:
+        """Predictions by run, that which failed last time first, and none after one that fails; in
+        several threads the others go together, whatever comes of each."""
+        runs = list(range(len(self.runs)))
+        if self._failed is not None:
+            runs.remove(self._failed)
+            runs.insert(0, self._failed)
+        found: dict[int, RunPrediction] = {}
+        alone = len(runs) if self.jobs == 1 else int(self._failed is not None)
+        for r in runs[:alone]:
+            found[r] = self._evaluate_run(theta, r)
+            if not found[r].status.ok:
+                return found
+        rest = thread_map(lambda r: self._evaluate_run(theta, r), runs[alone:], self.jobs)
+        return found | dict(zip(runs[alone:], rest, strict=True))
+
+    def _evaluate_run(self, theta: Array, r: int) -> RunPrediction:
+        return self._by_unknown(r, self.runs[r].evaluate(self.constants(theta[None], r)[0]))
+
+    def _unsolved(self, r: int, status: Status) -> RunPrediction:
+        shape, unknowns = self.runs[r].measured.shape, len(self.layout.names)
+        nothing = np.full((shape[0], unknowns, shape[1]), np.nan)
+        return RunPrediction(np.full(shape, np.nan), nothing, status)
 
     def _predict_run(self, theta: Array, r: int) -> RunPrediction:
         constants = self.constants(theta[None], r)

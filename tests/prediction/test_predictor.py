@@ -11,6 +11,7 @@ from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model.drive import driven_by
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.status import Status
 from bayesoleo.systems.oleo import thermomechanical_oleo
 
@@ -133,3 +134,32 @@ def test_a_prediction_made_from_the_data_fits_them():
     squares, _ = predictor.sum_of_squares(theta[None])
     scale = np.stack([[np.sum(row**2) for row in run.measured] for run in predictor.runs])
     assert (squares[0] < 1e-24 * scale).all()
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_a_vector_that_one_run_does_not_solve_leaves_all_where_they_were(monkeypatch, jobs):
+    """In one thread nothing more is solved once a run has failed, and that run is asked first."""
+    model = driven_by(thermomechanical_oleo(), "displacement")
+    predictor = Predictor(model, oleo_runs(), steps=64, backend="numpy", jobs=jobs)
+    theta = predictor.layout.start(model)
+    first = predictor.evaluate(theta)
+    anchors, asked = [item.anchor for item in predictor.runs], []
+    solve = RunPredictor.evaluate
+
+    def evaluate(one, p):
+        asked.append(one.record.label)
+        found, lost = solve(one, p), one.record.label == "h"
+        return replace(found, status=np.array([Status.NO_CONVERGENCE.value])) if lost else found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunPredictor, "evaluate", evaluate)
+        for expected in (["b", "d", "h"], ["h"]) if jobs == 1 else (["b", "d", "h", "i", "n"],):
+            asked.clear()
+            found = predictor.evaluate(1.01 * theta)
+            assert sorted(asked) == expected
+            assert {item.status for item in found} == {Status.NO_CONVERGENCE}
+            assert all(np.isnan(item.y).all() for item in found)
+            assert all(np.isnan(item.sensitivity).all() for item in found)
+            assert [item.anchor for item in predictor.runs] == anchors
+    for again, once in zip(predictor.evaluate(theta), first, strict=True):
+        np.testing.assert_allclose(again.y, once.y, rtol=1e-9)
