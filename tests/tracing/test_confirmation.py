@@ -244,3 +244,28 @@ def test_errors_of_the_parameters_scatter_a_fall_as_much_as_is_said(tmp_path):
     assert np.median(ratios) > 2.0
     # Thirty standard normal draws: their mean square scatters by a quarter.
     assert 0.4 < np.mean(np.square(pulls)) < 1.9
+
+
+@pytest.mark.parametrize(
+    ("imitates", "reached", "asked"),
+    [(False, False, True), (False, True, True), (True, True, True), (True, False, False)],
+)
+def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
+    monkeypatch, imitates, reached, asked
+):
+    """They share what is odd in it: a parameter of its own always repeats there."""
+    refit = SimpleNamespace(
+        share=0.5, reached=reached, inflation=1.0, fall=50.0, size=1, assembly=None,
+        fit=SimpleNamespace(point=SimpleNamespace(theta=None)), excludes_null=lambda: True,
+    )  # fmt: skip
+    after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
+    seen = []
+    monkeypatch.setattr(confirmation, "fit_state", lambda *_, **__: after)
+    monkeypatch.setattr(confirmation, "judged", lambda *_: (None, None))
+    monkeypatch.setattr(confirmation, "_on_halves", lambda *_: seen.append(1) or (None, None))
+    monkeypatch.setattr(confirmation, "in_halves", lambda _: "halves")
+    falls = iter([Fall(9.0, 14.0, 20.0), Fall(500.0, 50.0, 500.0)])
+    monkeypatch.setattr(confirmation, "fall_on_hold_out", lambda *_: next(falls))
+    item = SimpleNamespace(effect="varies_by_run", gain=0.5, imitates=imitates)
+    found, _ = confirmation.confirmed(None, item, refit, None, None, lambda _: None)
+    assert (found is not None) == bool(seen) == asked
