@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 #: Lines that are averaged lie within this many periods' worth of lines, or this part of the
 #: frequency, whichever is wider: one harmonic on either side where noise may be steep.
 HARMONICS, PART = 1.0, 0.25
+#: The same of the mean. Slow noise is largest there and falls on either side alike, so that lines
+#: of a whole harmonic would say half of it; elsewhere what is steep is rather said too large.
+AT_MEAN = 0.5
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ def _windows(size: int, periods: int) -> tuple[NDArray[np.int64], NDArray[np.int
     """First line of each line's neighbourhood, and the first beyond it."""
     line = np.arange(size)
     half = np.maximum(HARMONICS * periods, PART * line).astype(np.int64)
+    half[:1] = max(1, int(np.ceil(AT_MEAN * periods)))
     high = np.minimum(line + half + 1, size)
     return np.maximum(line - half, 0), high
 

@@ -26,7 +26,8 @@ def plain(x, v, _):
 @pytest.mark.statistical
 def test_p_values_under_slow_noise_are_what_they_say(tmp_path):
     """AR(1) with coefficient 0.97, eight periods: nothing is missing, and little is found."""
-    small, above = {"coulomb_friction": 0, "cubic_stiffness": 0, "quadratic_stiffness": 0}, 0
+    names = ("coulomb_friction", "cubic_stiffness", "quadratic_stiffness", "constant_force")
+    small, above = dict.fromkeys(names, 0), 0
     for seed in range(SEEDS):
         folder = tmp_path / str(seed)
         state = fitted(
