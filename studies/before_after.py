@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from bayesoleo.effects.titles import called
 from bayesoleo.plots.rankings import chosen
 from bayesoleo.plots.units import engineering, format_number
 
@@ -41,6 +42,11 @@ def print_before_after(summary: Mapping[str, Any], unit: str, per_si: float) -> 
             print(_line(name, summary["parameters"][name]))
 
 
+def title_of(summary: Mapping[str, Any], effect: str | None) -> str:
+    """What an effect is called; a dash for none."""
+    return called(effect, summary.get("titles", {})) if effect else "–"
+
+
 def added_parameters(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     """Every effect that was added and stayed, with its parameters that were estimated."""
     for entry in summary["rounds"]:
@@ -48,7 +54,7 @@ def added_parameters(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str
         if added is None or added["effect"] not in summary["effects"]:
             continue
         names = [name for name in added["expected"] if name in summary["parameters"]]
-        yield f"{added['effect']} @ {added['target']}", names
+        yield title_of(summary, f"{added['effect']} @ {added['target']}"), names
 
 
 def _line(name: str, entry: Mapping[str, Any]) -> str:

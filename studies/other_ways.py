@@ -27,6 +27,7 @@ from numpy.polynomial import chebyshev
 
 import bayesoleo
 from bayesoleo import workflow
+from bayesoleo.effects.titles import called
 from bayesoleo.plots import style
 from bayesoleo.plots.units import format_number
 from bayesoleo.tracing.deciding.state import State, fit_state
@@ -318,8 +319,9 @@ def with_close(task, state: State) -> Found:
         entry = next(r for r in loop.rounds if r.accepted and r.accepted.effect == step.effect.id)
         own = (*entry.accepted.score.names, *entry.accepted.score.shapes)
         values = [_value(fit, name) for name in own if name in fit.values]
-        same = f" (or {', '.join(entry.accepted.same)})" if entry.accepted.same else ""
-        texts.append(f"{step.effect.id}{same}: {', '.join(values[:3])}")
+        others = ", ".join(called(name, {}) for name in entry.accepted.same)
+        same = f" (or {others})" if others else ""
+        texts.append(f"{called(step.effect.id, {})}{same}: {', '.join(values[:3])}")
     says = "; ".join(texts) or loop.rounds[-1].reason
     return judge("close", left, time.process_time() - start, says)
 

@@ -20,6 +20,7 @@ from rich.console import Console
 import bayesoleo
 from bayesoleo import plots
 from bayesoleo.demo import DEMO_EFFECT, DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
+from bayesoleo.effects.titles import called
 
 folder = demo_campaign(Path(tempfile.mkdtemp()) / "campaign", seed=0)
 model = bayesoleo.system(DEMO_SYSTEM)
@@ -45,7 +46,8 @@ ranking = plots.ranking(tree, most=10)
 # The truth is known here. The effect that was put in is the one found, and most parameters lie
 # within two standard deviations of what made the data:
 
-print("put in:", DEMO_EFFECT, " found:", ", ".join(summary["effects"]))
+print("put in:", called(DEMO_EFFECT, {}))
+print("found: ", ", ".join(called(effect, {}) for effect in summary["effects"]))
 print(f"{'parameter':26}{'truth':>12}{'estimate':>12}{'sd':>10}  off by (sd)")
 for name, found in summary["parameters"].items():
     if name in DEMO_TRUTH:

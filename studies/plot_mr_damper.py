@@ -14,7 +14,7 @@ import json
 
 import matplotlib.pyplot as plt
 import numpy as np
-from before_after import print_before_after
+from before_after import print_before_after, title_of
 from rich.console import Console
 from stored import HERE, Study
 
@@ -46,7 +46,7 @@ def rounds():
     for number, entry in enumerate(summary["rounds"], 1):
         error = entry["error"]["force"]
         row = "".join(f"{error[run]['rms']:9.2f} N" for run in ("3", "7"))
-        print(f"{number:5}{row}   {entry['accepted'] or '–'}")
+        print(f"{number:5}{row}   {title_of(summary, entry['accepted'])}")
     reached = all(error[run]["rms"] <= 9.0 for run in ("3", "7"))
     print(f"The mark, 9 N rms on each hold-out run, is {'reached' if reached else 'missed'}.")
 

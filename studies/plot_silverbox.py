@@ -15,7 +15,7 @@ import json
 
 import matplotlib.pyplot as plt
 import numpy as np
-from before_after import print_before_after
+from before_after import print_before_after, title_of
 from rich.console import Console
 from stored import HERE, Study
 
@@ -45,7 +45,7 @@ def rounds():
     for number, entry in enumerate(summary["rounds"], 1):
         error = entry["error"]["output_voltage"]["block 2"]
         repeating = f"{1e3 * error['repeating']:6.3f} mV {error['ratio_to_expected']:11.1f}"
-        print(f"{number:5}  {repeating}   {entry['accepted'] or '–'}")
+        print(f"{number:5}  {repeating}   {title_of(summary, entry['accepted'])}")
     last = summary["rounds"][-1]["error"]["output_voltage"]["block 2"]
     reached = "reached" if last["repeating"] < 0.39e-3 else "missed"
     print(f"The mark set beforehand, 0.39 mV repeating on the hold-out block, is {reached}.")

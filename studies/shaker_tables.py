@@ -46,6 +46,12 @@ COLUMNS = {
 RESIDUAL = {"force": ("mm", 1e3), "displacement": ("N", 1.0)}
 
 
+def column(name: str) -> tuple[str, float]:
+    """Title of a parameter, and what its SI value is multiplied by; constants known to a tolerance
+    have no column in the thesis."""
+    return COLUMNS.get(name, (name.replace("_", " "), 1.0))
+
+
 @dataclass(frozen=True)
 class Friction:
     """Friction amplitude of each run, and its line in the pressure.
@@ -185,7 +191,7 @@ class Shaker:
 
 
 def _heading(each: xr.Dataset, unit: str) -> str:
-    names = [COLUMNS[str(name)][0] for name in each.parameter.values]
+    names = [column(str(name))[0] for name in each.parameter.values]
     return "run " + "".join(f"{name:>15}" for name in names) + f"{f'largest e [{unit}]':>18}"
 
 
@@ -194,7 +200,7 @@ def print_each(shaker: Shaker, physics: str, variant: str, drive: str) -> None:
     each, (unit, factor) = shaker.each(physics, variant, drive), RESIDUAL[drive]
     print(f"{physics}, {variant}, driven by {drive}, each run by itself")
     print(_heading(each, unit))
-    scales = [COLUMNS[str(name)][1] for name in each.parameter.values]
+    scales = [column(str(name))[1] for name in each.parameter.values]
     for run in each.run.values:
         row = each.sel(run=run)
         values = [f"{s * float(v):15.4f}" for s, v in zip(scales, row["estimate"], strict=True)]
@@ -210,7 +216,7 @@ def print_scatter(shaker: Shaker, physics: str, variant: str, drive: str) -> Non
     print(f"{physics}, {variant}, driven by {drive}: mean ± standard deviation over runs")
     view = bayesoleo.estimation.between_runs(each)
     for k, name in enumerate(each.parameter.values):
-        title, scale = COLUMNS[str(name)]
+        title, scale = column(str(name))
         over = scale * usable["estimate"][:, k]
         print(
             f"  {title:15} {float(over.mean()):9.4f} ± {float(over.std(ddof=1)):.4f}"
@@ -224,7 +230,7 @@ def print_joint(shaker: Shaker, physics: str, variant: str, drive: str) -> None:
     fit, (unit, factor) = shaker.joint(physics, variant, drive), RESIDUAL[drive]
     print(f"{physics}, {variant}, driven by {drive}, all runs jointly")
     for name, start, value in zip(fit.mbe.names, fit.mbe.start, fit.mbe.theta, strict=True):
-        title, scale = COLUMNS[name]
+        title, scale = column(name)
         print(f"  {title:15} {scale * value:9.4f}   start {scale * start:9.4f}")
     table = shaker.residuals(physics, variant, drive)
     print(f"  residual [{unit}]: mean ± standard deviation by run")
@@ -257,7 +263,7 @@ def print_findings(shaker: Shaker, variant: str, drive: str) -> None:
         for each in alone:
             usable = each["estimate"].where(each["status"] == "converged").sel(parameter=name)
             spread.append(100 * float(usable.std(ddof=1) / abs(usable.mean())))
-        title = COLUMNS[name][0].split()[0]
+        title = column(name)[0].split()[0]
         print(f"  scatter of {title:4} over runs {spread[0]:.2g} % over {spread[1]:.2g} %")
 
 

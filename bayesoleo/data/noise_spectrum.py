@@ -120,7 +120,7 @@ def _windows(size: int, periods: int) -> tuple[NDArray[np.int64], NDArray[np.int
     """First line of each line's neighbourhood, and the first beyond it."""
     line = np.arange(size)
     half = np.maximum(HARMONICS * periods, PART * line).astype(np.int64)
-    half[:1] = max(1, int(np.ceil(AT_MEAN * periods)))
+    half[:1] = max(1, int(AT_MEAN * periods))
     high = np.minimum(line + half + 1, size)
     return np.maximum(line - half, 0), high
 

@@ -67,6 +67,8 @@ class Candidate:
         By shape parameter the values to scan, ascending, neighbours at most a factor of two apart.
         The null leaves shapes undefined; they are estimated (log-normal prior) once the effect is
         in. A grid of one value is not worth a scan.
+    usual : mapping of str to int
+        By amplitude: +1 or -1 where the other side of the null is possible, but hardly a cause.
     """
 
     effect: str
@@ -76,6 +78,7 @@ class Candidate:
     parameters: tuple[str, ...]
     sign: Mapping[str, int] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    usual: Mapping[str, int] = field(default_factory=dict)
 
 
 #: Symbols of the new parameters under their names in the effect.
@@ -83,7 +86,7 @@ Names = Mapping[str, sp.Symbol]
 
 
 def either_side(model: Model, target: str) -> int:
-    """Both sides of a null are physical."""
+    """Both sides of a null are as usual."""
     return 0
 
 
@@ -125,8 +128,7 @@ class Effect:
     shown : callable (scales) -> bool
         Whether there is anything in the runs to scan for.
     side : callable (model, target) -> int
-        +1 or -1 where only one side of the null is physical at a place, else 0; for amplitudes that
-        state no sign of their own.
+        +1 or -1 where one side of the null is the usual one at a place, else 0.
 
     Raises
     ------
@@ -227,7 +229,8 @@ class Effect:
             target=target,
             model=extended,
             parameters=tuple(names[item.name] for item in self.amplitudes),
-            sign={names[i.name]: i.sign or self.side(model, target) for i in self.amplitudes},
+            sign={names[item.name]: item.sign for item in self.amplitudes},
+            usual={names[item.name]: self.side(model, target) for item in self.amplitudes},
             shapes={names[own]: grid for own, grid in grids.items()},
         )
 

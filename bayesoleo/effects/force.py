@@ -55,8 +55,9 @@ OFFSET_BY_RUN = force_effect(
 
 
 def _side_of_mass(model: Model, target: str) -> int:
-    """Of a law without inertia only some can be missing: its force then has the sense in which the
-    law resists motion. Where the model has inertia, it may be stated too large as well."""
+    """Where a law has no inertia, some is missing: its force then has the sense in which the law
+    resists motion, unless a rig takes back more than there is. Inertia that a model has may be
+    stated too large."""
     place = force_places(model)[target]
     terms = balance_terms(model, place).values()
     if place.kind == "equation" or any(model.expand(one).has(acceleration(place)) for one in terms):

@@ -269,3 +269,16 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
     item = SimpleNamespace(effect="varies_by_run", gain=0.5, imitates=imitates)
     found, _ = confirmation.confirmed(None, item, refit, None, None, lambda _: None)
     assert (found is not None) == bool(seen) == asked
+
+
+def test_runs_that_speak_against_an_effect_are_not_outvoted():
+    """Halves of the fitted runs are asked where the others say little, not where they object."""
+    against = Fall(-1070.0, 150.0, 5000.0, 300.0)
+    assert against.speaks_against
+    assert not Fall(-100.0, 150.0, 5000.0).speaks_against
+    assert not Fall(-400.0, 150.0, 5000.0, 300.0).speaks_against
+
+
+def test_next_to_nothing_confirms_nothing_however_sure():
+    assert not Fall(2.5e-4, 1.7e-5, 1e-3).confirms
+    assert Fall(100.0, 13.0, 100.0).confirms

@@ -63,7 +63,7 @@ def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
     assert not _may_be_significant(noise, TESTS)
 
 
-def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact"):
+def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact", held_out=1):
     """A loop that added effects, the first explaining so much."""
     refit = SimpleNamespace(fall=fall, inflation=1.0)
     option = SimpleNamespace(candidate=SimpleNamespace(family=family))
@@ -76,6 +76,7 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
     final = SimpleNamespace(
         at_floor=floor,
         too_quiet=(),
+        hold_errors=SimpleNamespace(entries=[None] * held_out),
         assembly=SimpleNamespace(added=[("play", "stroke")] * effects),
     )
     return ClosedLoop((*added, after), None, final, None, ())
@@ -91,6 +92,7 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
         ({"effects": 2}, False),
         ({"effects": 0}, False),
         ({"family": "unnamed"}, False),
+        ({"held_out": 0}, False),
         # One in twenty of it would have to be found if a mere likeness had been named.
         ({"fall": 0.9 * 14.2 / (1 - SAME)}, False),
         ({"fall": 1.1 * 14.2 / (1 - SAME)}, True),

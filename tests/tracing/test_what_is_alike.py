@@ -20,21 +20,29 @@ NEARLY = np.array([1.0, 0.1])
 PRICE = float(np.log(8000))
 
 
-def estimated(fall, *, contribution=ALONG, reached=True, size=1, family="friction"):
+def estimated(
+    fall, *, contribution=ALONG, reached=True, size=1, family="friction", usual=None, value=0.0
+):
     """An effect after estimation that lowers the sum of squares by so much."""
-    candidate = SimpleNamespace(family=family)
+    candidate = SimpleNamespace(family=family, usual=usual or {})
     score = SimpleNamespace(
         fall=fall, size=size, inflation=1.0, option=SimpleNamespace(candidate=candidate)
     )
     remaining = 100.0 if reached else 1.0e5
-    return Refit(score, None, None, 0.5, contribution, remaining, 1.0, 0, fall, reached, PRICE)
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(names=("amplitude",)), point=SimpleNamespace(theta=(value,))
+    )
+    return Refit(score, None, fit, 0.5, contribution, remaining, 1.0, 0, fall, reached, PRICE)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_at_the_noise_the_likelihood_decides(factor):
     """Whatever the effects do: twenty to one is the edge."""
     best, other = estimated(200.0), estimated(200.0 - factor * AS_LIKELY, contribution=ACROSS)
-    assert best.resembles(other) == other.resembles(best) == (factor < 1)
+    assert best.resembles(other) == (factor < 1)
+    # What is better and was not taken is told apart by more: it was not excluded.
+    assert other.resembles(best)
+    assert not estimated(200.0 - 2.1 * AS_LIKELY).resembles(best)
     nearly = estimated(200.0 - factor * AS_LIKELY, contribution=NEARLY)
     assert best.resembles(nearly) == (factor < 1)
 
@@ -93,3 +101,15 @@ def test_a_driven_model_keeps_the_values_of_its_own():
     other = driven_by(native.with_values({"solubility": -2e-8}), "displacement")
     assert other.parameters["solubility"].value == -2e-8
     assert driven_by(native, "displacement").parameters == native.parameters
+
+
+@pytest.mark.parametrize(
+    ("value", "reached", "last"),
+    [(2.0, False, False), (-2.0, False, True), (-2.0, True, False)],
+    ids=["mass", "less than none", "nothing else explains it"],
+)
+def test_what_is_unusual_is_taken_where_it_is_needed(value, reached, last):
+    mass = estimated(200.0, reached=reached, usual={"amplitude": 1}, value=value)
+    spring = estimated(150.0, reached=reached)
+    refits = {id(r.score): r for r in (mass, spring)}
+    assert _only_imitates(Ranked(mass.score, 0.0, 0.5, True, ()), refits) == last

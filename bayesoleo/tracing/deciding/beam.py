@@ -27,7 +27,8 @@ from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 
 #: First effects followed besides the one that was taken; and how much less one of them may explain,
-#: beyond the price of its unknowns: where causes led down to the noise, and where they did not.
+#: beyond the price of its unknowns: where causes led down to the noise, and where they did not or
+#: a curve without a name did.
 MOST_FOLLOWED, TIED, NEAR = 2, 0.02, 0.1
 #: Names stand instead of a curve only if they are better by this much (Kass and Raftery 1995).
 DECISIVE = 10.0
@@ -88,7 +89,8 @@ def followed(progress: Progress) -> list[Ranked]:
     """
     opening, final = progress.rounds[0], progress.state
     taken = opening.accepted
-    alone = taken is not None and not taken.imitates and len(final.assembly.added) < 2
+    curve = any(step.effect.family == FAMILY for step in final.assembly.steps)
+    alone = taken is not None and not taken.imitates and len(final.assembly.added) < 2 and not curve
     if final.at_floor and (taken is None or alone):
         return []
     pool = [
@@ -101,7 +103,7 @@ def followed(progress: Progress) -> list[Ranked]:
         and item.score.option.candidate.family != FAMILY
     ]
     most = max((worth for worth, _ in pool), default=0.0)
-    clear = final.at_floor and not _imitates(progress)
+    clear = final.at_floor and not curve and not _imitates(progress)
     behind = TIED if clear else NEAR
     seen = set(final.assembly.added)
     alike = set() if taken is None else {taken.effect, *taken.same}

@@ -57,7 +57,8 @@ def confirmed(
     # Halves of a run share whatever is odd in it. They show that a parameter of its own repeats,
     # which is no news where that leaves more than noise.
     alike = item.imitates and not result.reached
-    halves = in_halves(roles) if fall.undecided and not alike else None
+    able = fall.undecided and not fall.speaks_against and not alike
+    halves = in_halves(roles) if able else None
     if halves is not None:
         # What happens at the end of the stroke shows only in runs that get there.
         say(f"runs held out hardly show {item.effect}: confirm it on the other half of the periods")

@@ -59,8 +59,14 @@ class Fall:
 
     @property
     def confirms(self) -> bool:
-        """Whether the fall exceeds its error as often as is asked for."""
-        return bool(self.value > ENOUGH * self.error)
+        """Whether the fall exceeds its error as often as is asked for, and what one unknown that is
+        not there would explain as often."""
+        return bool(self.value > max(ENOUGH * self.error, ENOUGH**2))
+
+    @property
+    def speaks_against(self) -> bool:
+        """Whether the squared error rises by more than its error, as often as is asked for."""
+        return bool(-self.value > ENOUGH * max(self.error, self.scatter))
 
     @property
     def undecided(self) -> bool:

@@ -88,9 +88,10 @@ class ClosedLoop:
 
         It explains everything by itself - at the floor, nothing else significant - the data can
         tell it from all others of the catalogue, and it is large enough that one which merely
-        resembles it would have left a significant remainder.
+        resembles it would have left a significant remainder. Runs that were not used must have
+        confirmed it.
         """
-        if not self.complete or self.final.too_quiet:
+        if not self.complete or self.final.too_quiet or not self.final.hold_errors.entries:
             return False
         accepted = [item.accepted for item in self.rounds if item.accepted]
         accepted = [item for item in accepted if (item.effect, item.target) in self.added]

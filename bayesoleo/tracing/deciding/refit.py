@@ -35,6 +35,9 @@ SHAPE_SPREAD = 1.0
 #: one as by the other; where one leaves more than noise, also if what they leave differs by less
 #: than this factor and they do nearly the same.
 AS_LIKELY, AS_WELL = 2.0 * float(np.log(20.0)), 1.25
+#: By so many times that an effect that was not taken may be better, and is not told apart yet: runs
+#: that were not used did not confirm it, which is less than to exclude it.
+BETTER = 2.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,8 @@ class Refit:
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
             return False
         gap = self.worth - other.worth
-        if abs(gap) < AS_LIKELY * max(self.inflation, other.inflation):
+        scale = AS_LIKELY * max(self.inflation, other.inflation)
+        if -BETTER * scale < gap < scale:
             return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
         if (self.reached and other.reached) or lengths == 0:
@@ -99,6 +103,15 @@ class Refit:
         cosine = float(self.contribution @ other.contribution) / float(lengths)
         low, high = sorted((self.remaining, other.remaining))
         return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
+
+    @property
+    def unusual(self) -> bool:
+        """Whether an amplitude lies on the side of its null where causes hardly are."""
+        usual = self.score.option.candidate.usual
+        return any(
+            usual.get(name.split("[")[0], 0) * value < 0
+            for name, value in zip(self.fit.problem.names, self.fit.point.theta, strict=True)
+        )
 
     def outdoes(self, other: Score) -> bool:
         """Whether noise alone is left, and an effect that was only scored explains less of it."""

@@ -12,7 +12,7 @@ from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.deciding.confirmation import confirmed
-from bayesoleo.tracing.deciding.refit import Refit, refit
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, refit
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.fitting.assembly import Option
 from bayesoleo.tracing.fitting.fit import Numerics
@@ -42,6 +42,9 @@ MOST_IMITATING = 3
 #: Effects after estimation within this share of the best are as good; the simplest of them is
 #: taken.
 AS_GOOD = 0.02
+#: Effects that runs not used are asked about where the first is not down to the noise on them, and
+#: by how many times what makes two effects equally likely they may be worth less than it.
+MOST_COMPARED, CLOSE = 4, 2.0
 
 INSIGNIFICANT = "no effect is significant after the correction for the search"
 #: Families of effects that take up a part of whatever is missing: what varies from run to run, and
@@ -316,14 +319,19 @@ def _only_imitates(item: Ranked, refits: dict[int, Refit]) -> bool:
     """Whether an effect merely takes up what another does, without need.
 
     Much that physics does differs between runs, so a parameter of each run's own takes a part of it
-    up, whatever is missing; and where runs are alike, so does what repeats with the drive. It is
-    needed where it explains all that is left and no effect of physics does, by more than its
-    additional unknowns are worth (Schwarz 1978).
+    up, whatever is missing; where runs are alike, so does what repeats with the drive; and a mass
+    of less than nothing looks like a spring. Such an effect is needed where it explains all that is
+    left and no effect of physics does, by more than its additional unknowns are worth (Schwarz
+    1978).
     """
-    if not item.imitates:
-        return False
     own = refits[id(item.score)]
-    physics = [r for r in refits.values() if r.score.option.candidate.family not in IMITATORS]
+    if not (item.imitates or own.unusual):
+        return False
+    physics = [
+        r
+        for r in refits.values()
+        if r.score.option.candidate.family not in IMITATORS and r is not own
+    ]
     return not (own.reached and own.worth > max((r.worth for r in physics), default=0.0))
 
 
@@ -347,21 +355,43 @@ def _choose(
     numerics: Numerics,
     say: Say,
 ) -> tuple[Ranked | None, State | None, str]:
-    """The best effect that the runs not used confirm."""
+    """The best effect that the runs not used confirm.
+
+    Of effects that leave nothing but noise on the fitted runs and are worth nearly as much there,
+    the first that does so on the others too.
+    """
     last = {id(r): _only_imitates(r, refits) for r in ranking if r.refitted}
     tried = sorted(
         (item for item in ranking if item.refitted and item.p_value < LEVEL),
         key=lambda item: (last[id(item)], -item.gain),
     )
-    reasons = []
-    while tried:
+    reasons: list[str] = []
+    found: tuple[Ranked, State, str] | None = None
+    more = MOST_COMPARED
+    while tried and more > 0:
         item = _next([one for one in tried if last[id(one)] == last[id(tried[0])]], refits)
         tried.remove(item)
-        after, reason = confirmed(state, item, refits[id(item.score)], roles, numerics, say)
-        if after is not None:
-            return item, after, reason
-        reasons.append(reason)
+        result = refits[id(item.score)]
+        if found is not None and not _as_good(result, refits[id(found[0].score)]):
+            continue
+        after, reason = confirmed(state, item, result, roles, numerics, say)
+        if after is None:
+            reasons.append(reason)
+        elif after.at_floor or not result.reached:
+            if found is None or after.at_floor:
+                return item, after, reason
+        elif found is None:
+            found = item, after, reason
+        more -= found is not None
+    if found is not None:
+        return found
     if not reasons:
         estimated = any(np.isfinite(one.share) for one in refits.values())
         reasons = [INSIGNIFICANT if estimated else "no candidate could be estimated"]
     return None, None, "; ".join(reasons)
+
+
+def _as_good(result: Refit, other: Refit) -> bool:
+    """Whether an effect leaves nothing but noise and is worth nearly as much as another one."""
+    less = other.worth - result.worth
+    return result.reached and less < CLOSE * AS_LIKELY * max(result.inflation, other.inflation)
