@@ -74,8 +74,10 @@ def leads_as_far(
     present = _with_two(progress).fit
     fall = _fall(reference, present)
     left = replace(reference, excess=reference.excess - max(fall, *falls))
-    scale = dispersion(left) * max(one.inflation for one in tried)
-    return max(worths) > _worth(reference, fall, present) - AS_LIKELY * scale
+    best = int(np.argmax(worths))
+    # Of what is compared: a rival that moves the mean alone may lie in far more noise.
+    scale = dispersion(left) * max(result.inflation, tried[best].inflation)
+    return worths[best] > _worth(reference, fall, present) - AS_LIKELY * scale
 
 
 def _best_seconds(
