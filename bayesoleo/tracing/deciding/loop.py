@@ -30,6 +30,10 @@ ON_LIMIT = "at the limit of their prior's support"
 #: How a note begins of a declared model that was estimated from another start than its own.
 OTHER_OPTIMUM = "from its declared values the model's estimate ended in a lesser optimum, lower"
 
+#: How a note begins of parameters whose sign is not the declared one, and by how many standard
+#: deviations.
+OTHER_SIGN, SURELY = "of the other sign than declared", 3.0
+
 Say = Callable[[str], None]
 
 
@@ -256,7 +260,8 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     """
     progress = progress.with_same_noise()
     state = progress.state
-    notes = [*progress.notes, *_warnings(state.fit), *unnamed_notes(progress.rounds)]
+    notes = [*progress.notes, *_warnings(state.fit), *_turned(progress.first.fit, state.fit)]
+    notes += unnamed_notes(progress.rounds)
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
     if not state.at_floor:
@@ -290,6 +295,18 @@ def _ratios(state: State) -> str:
         for output, values in table.items()
     ]
     return "ratio to what is expected: " + ", ".join(parts)
+
+
+def _turned(first: Fit, final: Fit) -> list[str]:
+    """Parameters that came out with the other sign than they were declared with."""
+    turned = []
+    for name, value, sd in zip(final.problem.names, final.point.theta, final.point.sd, strict=True):
+        declared = first.model.parameters.get(name)
+        if declared is not None and declared.value * value < 0 and abs(value) > SURELY * sd:
+            turned.append(f"{name} = {value:.3g}")
+    if not turned:
+        return []
+    return [f"{OTHER_SIGN}: {', '.join(turned)}; look at the signs of equations and channels"]
 
 
 def _warnings(fit: Fit) -> list[str]:
