@@ -29,12 +29,13 @@ def z_scores(found, chaos: Chaos) -> np.ndarray:
     ("name", "samples", "channels"),
     [("lorenz", 401, "xyz"), ("lorenz", 401, "x"), ("rossler", 401, "xyz"), ("rossler", 401, "y")],
 )
-def test_parameters_come_back_within_three_standard_errors(name, samples, channels):
+def test_parameters_come_back_within_their_standard_errors(name, samples, channels):
     """Every one of 50 seeds, started up to 20 % off, from all states or from one component.
 
-    150 draws of a normal distribution pass three in a third of all sets of seeds; these do not.
-    What holds for any is the mean square, one within four of its own standard errors. The three
-    parameters are correlated, so that counts as 50 draws.
+    150 draws of a normal distribution pass four standard errors in one set of seeds of a hundred.
+    They pass three in a third of all sets, and on which side a chaotic orbit ends, the processor's
+    rounding decides. What holds for any is the mean square, one within four of its own standard
+    errors. The three parameters are correlated, so that counts as 50 draws.
     """
     chaos = Chaos.of(name, samples)
     scores = []
@@ -46,7 +47,7 @@ def test_parameters_come_back_within_three_standard_errors(name, samples, channe
         scores.append(z_scores(found, chaos))
         assert found.trajectories[0].gap < 1e-9
         assert found.shift <= 0.1
-    assert np.abs(scores).max() < 3.0
+    assert np.abs(scores).max() < 4.0
     assert abs(np.mean(np.square(scores)) - 1.0) < 4 * np.sqrt(2 / SEEDS)
 
 
