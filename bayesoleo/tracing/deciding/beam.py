@@ -20,7 +20,7 @@ from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.lookahead import leads_as_far
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, compare, schwarz_price
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, fall_from, schwarz_price
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.fit import Numerics
@@ -204,8 +204,7 @@ def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
     base = one.first.base()
     price, falls, worth = schwarz_price(base), [], []
     for state in (one.state, other.state):
-        share, _ = compare(base, state.fit)
-        fall = share * base.fall_back if np.isfinite(share) else -np.inf
+        fall = fall_from(base, state.fit)
         falls.append(fall)
         worth.append(fall - price * len(state.fit.problem.names))
     left = replace(base, excess=base.excess - max(falls))

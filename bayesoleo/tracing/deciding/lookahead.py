@@ -17,7 +17,7 @@ from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, compare, refit, schwarz_price
+from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, fall_from, refit, schwarz_price
 from bayesoleo.tracing.deciding.rounds import Ranked
 from bayesoleo.tracing.deciding.state import State, state_of
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
@@ -69,10 +69,10 @@ def leads_as_far(
     if any(second.reached for second in seconds):
         return True
     tried = (result, *seconds)
-    falls = [_fall(reference, one.fit) for one in tried]
+    falls = [fall_from(reference, one.fit) for one in tried]
     worths = [_worth(reference, fall, one.fit) for fall, one in zip(falls, tried, strict=True)]
     present = _with_two(progress).fit
-    fall = _fall(reference, present)
+    fall = fall_from(reference, present)
     left = replace(reference, excess=reference.excess - max(fall, *falls))
     best = int(np.argmax(worths))
     # Of what is compared: a rival that moves the mean alone may lie in far more noise.
@@ -97,11 +97,6 @@ def _with_two(progress: Progress) -> State:
     """The model with the first two effects that were added, or the final one if it has fewer."""
     after = [entry.after for entry in progress.rounds if entry.after is not None]
     return after[1] if len(after) > 1 else progress.state
-
-
-def _fall(reference: Base, fit: Fit) -> float:
-    share, _ = compare(reference, fit)
-    return share * reference.fall_back if np.isfinite(share) else -np.inf
 
 
 def _worth(reference: Base, fall: float, fit: Fit) -> float:

@@ -356,6 +356,13 @@ def compare(base: Base, fit: Fit) -> tuple[float, list[Array]]:
     return (before - after) / base.fall_back, changes
 
 
+def fall_from(reference: Base, fit: Fit) -> float:
+    """Fall of the weighted sum of squares from a common model; minus infinity where it could not be
+    solved."""
+    share, _ = compare(reference, fit)
+    return share * reference.fall_back if np.isfinite(share) else -np.inf
+
+
 def _beside_data(fit: Fit) -> float:
     """Sum of squares of what is measured beside the data: nuisance parameters and constants known
     to a tolerance."""

@@ -21,7 +21,7 @@ from scipy import stats
 
 from bayesoleo.effects.unnamed import FAMILY, Axis
 from bayesoleo.tracing.deciding.confirmation import confirmed, speak_against
-from bayesoleo.tracing.deciding.refit import Refit, compare, refit
+from bayesoleo.tracing.deciding.refit import Refit, fall_from, refit
 from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.fitting.assembly import Step
@@ -248,18 +248,12 @@ def _merit(
 ) -> float:
     """What a function is worth beyond what was found so far; one that stands instead of names needs
     none of them, and is favoured by so much."""
-    gained = _fall(own.fit, reference) - _fall(present, reference)
+    gained = fall_from(reference, own.fit) - fall_from(reference, present)
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
     more = len(own.fit.problem.names) - len(present.problem.names)
     # What noise of one colour leaves scatters together: of so many values as many less are news.
     merit = gained / inflation - more * float(np.log(values))
     return merit + favour if instead else merit
-
-
-def _fall(fit: Fit, reference: Base) -> float:
-    """Of the weighted sum of squares from a common model."""
-    share, _ = compare(reference, fit)
-    return share * reference.fall_back if np.isfinite(share) else -np.inf
 
 
 def _accepting(
