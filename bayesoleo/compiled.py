@@ -31,7 +31,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: Points in a block, and the distance between rows.
 BLOCK = 64

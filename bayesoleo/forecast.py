@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.assessment import Score, score_draws
 from bayesoleo.assessment.series import judged_errors
 from bayesoleo.data import ReducedCampaign
@@ -34,8 +35,6 @@ from bayesoleo.solvers.status import Status, count, counted
 from bayesoleo.tracing.errors.errors_table import compared
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.masked import weights
-
-Array = NDArray[np.float64]
 
 #: Steps of the mesh in a period, and points of one at which the band is kept.
 STEPS, POINTS = 512, 200

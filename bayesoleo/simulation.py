@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo.data import Campaign, SimulatedRun, write_campaign
@@ -19,8 +18,6 @@ from bayesoleo.model import Model
 from bayesoleo.model.document import from_document
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.simulate import STEPS, RunPlan, Simulation, simulate_run
-
-Array = NDArray[np.float64]
 
 
 def model_of(tree: xr.DataTree) -> Model:

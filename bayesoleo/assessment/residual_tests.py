@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, stats
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 
 @dataclass(frozen=True)

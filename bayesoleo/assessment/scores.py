@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

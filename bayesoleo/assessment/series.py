@@ -7,17 +7,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.data.averaging import PeriodicAverage, periodic_average
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.prediction.input_noise import input_columns
-
-Array = NDArray[np.float64]
 
 _JUDGED = (
     schema.REPEATING,

@@ -12,9 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-
-Array = NDArray[np.float64]
 
 #: Harmonics told one by one; what lies above counts together, under the order after the last.
 ORDERS = 12

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

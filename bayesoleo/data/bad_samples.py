@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: Beyond the next sample by this factor a few samples are taken for mistakes: it is the resolution
 #: of a converter of twenty bits, and between the samples of a pulse there is no such step.

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.bad_samples import impossible_sample
 from bayesoleo.data.checked_table import FILE, choose
 from bayesoleo.data.declaration import Channel, Declaration, read_declaration
@@ -20,8 +21,6 @@ from bayesoleo.data.gaps import Stretches, bridged, masked
 from bayesoleo.data.registry import dataset_folder
 from bayesoleo.data.sampling import uniform_time, window
 from bayesoleo.errors import CampaignError
-
-Array = NDArray[np.float64]
 
 # Names of a time column in seconds that need not be declared.
 _TIME_COLUMNS = tuple(

@@ -6,12 +6,10 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.text import read_text
 from bayesoleo.errors import CampaignError
-
-Array = NDArray[np.float64]
 
 _SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.errors import CampaignError
 
-Array = NDArray[np.float64]
 Stretches = tuple[tuple[float, float], ...]
 
 #: Part of a record that has to be left.

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from bayesoleo._types import Array
 from bayesoleo.data.resolution import rounding_that_repeats, step_of
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.prediction.records import Harmonics
 from bayesoleo.prediction.spectrum import FEWEST_SAMPLES, lines_of, rounding_density
-
-Array = NDArray[np.float64]
 
 #: Expected share of false harmonics among those kept. A false one of high order is no small error:
 #: an inertia sees it times the order squared. One in ten thousand keeps a hundred campaigns of

@@ -11,13 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, stats
 
+from bayesoleo._types import Array
 from bayesoleo.data.averaging import periodic_average
 from bayesoleo.prediction.records import Record
-
-Array = NDArray[np.float64]
 
 #: Probability of naming a line in any channel of a run that has none.
 FALSE_ALARM = 1e-3

@@ -13,9 +13,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.smoothing import HIGHEST_DIFFERENCE, innovation_noise
-
-Array = NDArray[np.float64]
 
 #: Averages of a run, and samples in one at least.
 MOST_AVERAGES, FEWEST_SAMPLES = 200, 4

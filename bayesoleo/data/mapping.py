@@ -10,12 +10,11 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.averaging import periodic_average
 from bayesoleo.errors import InputError
 
-Array = NDArray[np.float64]
 Method = Literal["band-limited", "linear"]
 
 

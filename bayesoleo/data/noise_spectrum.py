@@ -19,7 +19,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: Lines that are averaged lie within this many periods' worth of lines, or this part of the
 #: frequency, whichever is wider: one harmonic on either side where noise may be steep.

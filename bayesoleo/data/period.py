@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from bayesoleo._types import Array
 from bayesoleo.data.harmonics import FALSE_DISCOVERY_RATE, coefficient_variances, significant_orders
 from bayesoleo.data.transforms import HarmonicBasis, highest_order
 from bayesoleo.errors import CampaignError
-
-Array = NDArray[np.float64]
 
 #: Least correlation between a record and itself one period later, in the channel that repeats best.
 LEAST_CORRELATION = 0.5

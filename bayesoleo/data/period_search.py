@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.period import autocovariance, coarse_period, residual_time_shift
-
-Array = NDArray[np.float64]
 
 #: Part of a period to either side of it that the zoom shows, and shifts at most in a curve.
 ZOOM, MOST_SHIFTS = 0.01, 4000

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.averaging import average_on
 from bayesoleo.data.campaign import Campaign, Run
 from bayesoleo.data.checked_table import choose
@@ -23,8 +23,6 @@ from bayesoleo.errors import CampaignError
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.band_limited import band_limited_channels, sample_noise
 from bayesoleo.prediction.records import Record
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

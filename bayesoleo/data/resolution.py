@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.records import Record
-
-Array = NDArray[np.float64]
 
 #: A step is worth a word if it is larger than this times the noise of a sample: below, rounding is
 #: a sixth of that noise's variance at most.

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
-
-Array = NDArray[np.float64]
 
 
 def uniform_time(time: Array, column: str, before: int = 0) -> Array:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, stats
 
+from bayesoleo._types import Array
 from bayesoleo.data.transforms import HarmonicBasis
-
-Array = NDArray[np.float64]
 
 #: Chance of dropping the first period of a settled channel whose noise is stationary.
 FALSE_ALARM = 1e-4

@@ -5,9 +5,8 @@ from __future__ import annotations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: Highest order of differences tried; beyond it white noise would be all that is left of any
 #: sensible sampling.

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 
 WHITESPACE = "whitespace"
 _NAMED = {"whitespace": WHITESPACE, " ": WHITESPACE, "tab": "\t", "comma": ",", "semicolon": ";"}

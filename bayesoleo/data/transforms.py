@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
+
 ComplexArray = NDArray[np.complex128]
 
 # Part of the largest curvature below which a direction's own is rounding.

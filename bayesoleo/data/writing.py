@@ -11,14 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.checked_table import FILE
 from bayesoleo.data.declaration import FORMAT
 from bayesoleo.errors import CampaignError
 from bayesoleo.units import parse_unit
-
-Array = NDArray[np.float64]
 
 TIME_COLUMN = "time_s"
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")

@@ -21,14 +21,13 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.parts import Amplitude
 from bayesoleo.effects.places import force_places
 from bayesoleo.effects.units import target_units
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import bspline, symbol
-
-Array = NDArray[np.float64]
 
 FAMILY = "unnamed"
 #: How the description of a coefficient begins, by which it is known in a model.

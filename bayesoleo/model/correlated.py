@@ -20,10 +20,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
 from bayesoleo.model.priors import Normal, Prior, TruncatedNormal
-
-Array = NDArray[np.float64]
 
 # Eigenvalues of the correlation matrix below this are rounding, not information.
 _SINGULAR = 1e-12

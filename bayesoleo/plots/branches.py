@@ -10,14 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
 from bayesoleo.plots import style
 from bayesoleo.plots.units import Scale, engineering, format_unit
 from bayesoleo.prediction.branch import AnswerBranch
 from bayesoleo.solvers.branches.follow import BranchPoint
-
-Array = NDArray[np.float64]
 
 HEIGHT = 4.6
 #: Marker and word of what is special on a branch.

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.shown import Shown
-
-Array = NDArray[np.float64]
 
 BINS = 120
 """Points shown over one period."""

@@ -6,9 +6,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.units import engineering
@@ -16,8 +16,6 @@ from bayesoleo.plots.units import engineering
 HEIGHT = 3.6
 #: Half-width of a band that holds 95 % of a normal density.
 BAND = 1.96
-
-Array = NDArray[np.float64]
 
 
 def unnamed_shape(found: xr.Dataset | xr.DataTree) -> Figure:

@@ -13,13 +13,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.stability import compared, count_unstable, is_jump, jumps, swings
 from bayesoleo.solvers.orbit import floquet_multipliers
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
 from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A start extrapolated too far is retried along a path of this many pieces.
 PATH_PIECES = (4, 16)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
 from bayesoleo.prediction.band_limited import band_limited_channels, sample_noise
 from bayesoleo.prediction.records import TRANSIENT, Record
-
-Array = NDArray[np.float64]
 
 #: A smoother needs that many samples.
 FEWEST_SAMPLES = 8

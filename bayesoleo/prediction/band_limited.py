@@ -12,14 +12,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.filtering import Band, filtered
 from bayesoleo.prediction.smoothing import Smoothed, smooth_signal
 from bayesoleo.prediction.spectrum import Spectrum, segment_length, spectrum_of
-
-Array = NDArray[np.float64]
 
 #: Highest derivative that a curve of its own is kept for; of a higher one it is the same.
 DERIVATIVES = 2

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels, kernels
@@ -23,8 +24,6 @@ from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME, scheme
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: What a branch can be followed along besides a parameter.
 FREQUENCY, AMPLITUDE = "frequency", "amplitude"

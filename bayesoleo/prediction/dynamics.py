@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model
@@ -15,8 +14,6 @@ from bayesoleo.prediction.inputs import harmonics_of, highest_derivatives
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.shooting.initial_value import Dynamics
 from bayesoleo.solvers.shooting.signals import Signal, periodic_signal
-
-Array = NDArray[np.float64]
 
 
 def dynamics_of(

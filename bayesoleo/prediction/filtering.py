@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.kalman import smooth
 from bayesoleo.prediction.quintic import evaluate_pieces, pieces
-
-Array = NDArray[np.float64]
 
 #: Periods of the highest frequency that the spline at an end is fitted to, half of which it is
 #: joined over, and by which a record is continued.

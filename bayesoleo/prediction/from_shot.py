@@ -8,8 +8,8 @@ sticks; an integrator sees that as it goes.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
@@ -18,8 +18,6 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.periodic.solve import Boundary, Solution, solve_periodic
 from bayesoleo.solvers.shooting.shoot import solve_shooting
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A start needs no more than the first; where that is too coarse for shooting to close, the second.
 TOLERANCES = (1e-6, 1e-8)

@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.derive import Derived
 from bayesoleo.model.expressions import (
@@ -20,9 +20,6 @@ from bayesoleo.model.expressions import (
 )
 from bayesoleo.prediction.inputs import harmonics_of
 from bayesoleo.prediction.records import Record
-
-Array = NDArray[np.float64]
-
 
 #: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.
 Motion = Callable[[Array], Array]

@@ -11,14 +11,12 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.inputs import harmonics_of, highest_derivatives
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.smoothing import Smoothed
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
 DRAWS = 16

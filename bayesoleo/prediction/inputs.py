@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.prediction.records import Harmonics, Record, Signal
-
-Array = NDArray[np.float64]
 
 
 def harmonics_of(record: Record, channel: str) -> Harmonics:

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, signal
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.prediction.band_limited import declared
 from bayesoleo.prediction.inputs import highest_derivatives, signal_of
@@ -22,8 +22,6 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.smoothing import Smoothed
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Bands in an octave, and the number of octaves below half the sampling rate.
 _PER_OCTAVE, _OCTAVES = 3, 12

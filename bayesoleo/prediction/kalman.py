@@ -15,11 +15,9 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import eliminate
-
-Array = NDArray[np.float64]
 
 #: Variance of the state before the first sample, over that of a sample's noise.
 DIFFUSE = 1e9

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model, Prior
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

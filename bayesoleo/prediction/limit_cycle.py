@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
@@ -16,8 +16,6 @@ from bayesoleo.solvers.branches.autonomous import LimitCycle, solve_limit_cycle,
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.transient.state_space import StateSpace
-
-Array = NDArray[np.float64]
 
 #: Of the motion towards a limit cycle, which only has to start Newton's method.
 RELATIVE_TOLERANCE = 1e-8

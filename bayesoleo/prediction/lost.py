@@ -12,14 +12,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo.prediction.band_limited import answered
 from bayesoleo.prediction.inputs import highest_derivatives
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.smoothing import Smoothed
-
-Array = NDArray[np.float64]
 
 #: Part of what an input holds, as root mean squares, that is worth a word.
 _PART = 0.05

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.dynamics import signal_of_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.run import RunPredictor
@@ -22,8 +22,6 @@ from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.schemes.mesh import equidistant
 from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.shooting.signals import evaluate
-
-Array = NDArray[np.float64]
 
 #: Error over the swing below which nothing more is resolved: what no channel shows.
 TOLERANCE = 1e-6

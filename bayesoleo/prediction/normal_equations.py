@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.segmented import LinearRun, SegmentedRun
 from bayesoleo.solvers.segments.constrained import ContinuousLeastSquares
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

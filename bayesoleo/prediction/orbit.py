@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels, kernels
@@ -21,8 +21,6 @@ from bayesoleo.solvers.adaptive.refine import AdaptiveSolution, Motion, Start, s
 from bayesoleo.solvers.adaptive.stiffening import solve_stiffening
 from bayesoleo.solvers.adaptive.switched import PeriodicProblem, Switches
 from bayesoleo.solvers.orbit import Orbit
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels, kernels
@@ -39,7 +40,6 @@ from bayesoleo.solvers.shooting.shoot import Shot, shoot_on_steps, solve_shootin
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
 
-Array = NDArray[np.float64]
 Rows = Callable[[Array], Array]
 
 METHODS = ("discretisation", "adaptive", "shooting", "hybrid", "library")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.parallel import thread_map
@@ -18,8 +19,6 @@ from bayesoleo.prediction.run import RunPredictor, Samples
 from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
 BLOCK = 32

@@ -5,9 +5,8 @@ from __future__ import annotations
 from math import perm
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 
 def pieces(states: Array, step: float) -> Array:

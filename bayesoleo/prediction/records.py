@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.smoothing import Smoothed
-
-Array = NDArray[np.float64]
 
 PERIODIC, TRANSIENT = "periodic", "transient"
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN
@@ -31,8 +32,6 @@ from bayesoleo.solvers.periodic.solve import (
 )
 from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Parameter vectors whose samples are evaluated together.
 CHUNK = 8

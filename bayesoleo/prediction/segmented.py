@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import parse, symbol
@@ -21,8 +21,6 @@ from bayesoleo.prediction.records import Record, Signal
 from bayesoleo.solvers.schemes.choose import scheme
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.segments.segments import LinearSteps, Segments
-
-Array = NDArray[np.float64]
 
 #: A smoother that follows the samples leaves next to nothing; noise is not taken for less than this
 #: part of a channel's spread.

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
@@ -17,8 +17,6 @@ from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Steps of the mesh: data must be finer than what is fitted to them.
 STEPS = 1024

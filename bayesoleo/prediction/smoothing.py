@@ -22,16 +22,14 @@ from functools import cached_property
 from math import perm
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize_scalar
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.prediction.filtering import Band, filtered
 from bayesoleo.prediction.kalman import innovations, process_noise, smooth, walk
 from bayesoleo.prediction.quintic import evaluate_pieces, pieces
-
-Array = NDArray[np.float64]
 
 #: Process noise over measurement noise, per sample: logarithms to base ten that are tried.
 ROUGHNESS = np.linspace(-16.0, 6.0, 23)

@@ -17,11 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 from scipy.ndimage import uniform_filter1d
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: Samples below which there is no spectrum worth the name.
 FEWEST_SAMPLES = 64

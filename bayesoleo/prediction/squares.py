@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import BLOCK, BlockKernel, pointer
 from bayesoleo.model.derive import Derived
 from bayesoleo.model.kernels import Kernels
@@ -20,8 +21,6 @@ from bayesoleo.solvers.periodic.measures import total
 from bayesoleo.solvers.schemes.collocation import Collocation, SamplePlan
 from bayesoleo.solvers.schemes.collocation_kernels import sample_block
 from bayesoleo.solvers.schemes.elimination import jit
-
-Array = NDArray[np.float64]
 
 
 class Places(NamedTuple):

@@ -16,11 +16,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.orbit import floquet_multipliers
 
 __all__ = ["Stability", "count_unstable"]
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 #: Nodes of a period at which two motions are compared: another branch differs at most of them.

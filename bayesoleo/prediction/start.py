@@ -13,6 +13,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import parse, split_derivative, symbol
 from bayesoleo.model.initial import EQUILIBRIUM, start_of
@@ -21,7 +22,6 @@ from bayesoleo.prediction.inputs import input_rows, signal_of
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30

@@ -6,8 +6,8 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
 from bayesoleo.prediction.guess import Motion
@@ -28,8 +28,6 @@ from bayesoleo.solvers.transient.solve import (
     transient_sensitivities,
 )
 from bayesoleo.solvers.transient.state_space import StateSpace
-
-Array = NDArray[np.float64]
 
 #: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
 WHOLE = 128

@@ -8,6 +8,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
@@ -17,8 +18,6 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 # Vectors that one batch of sensitivities is computed for: what they take is the raw samples of a
 # run times the unknowns.

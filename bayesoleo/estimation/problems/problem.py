@@ -13,10 +13,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.problem import Problem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.diagonal import log_likelihood, log_prior
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -31,8 +31,6 @@ from bayesoleo.estimation.trajectories.problem import ShootingProblem
 from bayesoleo.estimation.trajectories.step import Change, Local
 from bayesoleo.prediction.segmented import LinearRun
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Part of a step below which damping gives up.
 SMALLEST_PART = 1e-4

@@ -20,8 +20,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.point import PointEstimate
@@ -35,8 +36,6 @@ from bayesoleo.model import Model
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A mesh is fine enough when halving its steps moves no estimate by more of its standard deviation.
 LARGEST_SHIFT = 0.1

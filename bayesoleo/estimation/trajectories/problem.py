@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model, Prior
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.segmented import SegmentedRun
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.bounded import bounded_step
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.problem import ShootingProblem
 from bayesoleo.prediction.normal_equations import NormalEquations
 from bayesoleo.prediction.segmented import LinearRun
-
-Array = NDArray[np.float64]
 
 #: What the prior does: it is centred anew on every iterate and thus only limits the steps; it stays
 #: where it is and pulls; nothing.

@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.log_density import Density
-
-Array = NDArray[np.float64]
 
 #: Largest shape of the weights' tail (Vehtari et al. 2024, section 3.2.4).
 LARGEST_SHAPE = 0.7

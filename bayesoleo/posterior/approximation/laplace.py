@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import DEGREES_OF_FREEDOM, Mixture
 from bayesoleo.posterior.density.differences import derivatives
 from bayesoleo.posterior.density.information import information_at, residuals_at
 from bayesoleo.posterior.density.log_density import LogDensity
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A mode is found when the Newton step is shorter than this many standard deviations.
 TOLERANCE = 1e-3

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-
-Array = NDArray[np.float64]
 
 #: Tails heavy enough that the ratio target / proposal stays bounded where a normal approximation
 #: would let it grow.

@@ -24,13 +24,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.approximation.laplace import Mode
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.differences import derivatives
 from bayesoleo.posterior.density.log_density import Density
 from bayesoleo.solvers.status import Status
 
-Array = NDArray[np.float64]
 Height = Callable[[Array], Array]
 
 #: Scattered points for each climb, and how far they lie, in standard deviations of the start.

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.residuals import ResidualProblem
 from bayesoleo.posterior.density.error_models import ErrorModel
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 
 def residuals_at(problem: Problem, errors: ErrorModel, theta: Array) -> list[Array]:

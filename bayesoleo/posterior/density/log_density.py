@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Misfit, Problem, jumps_of
 from bayesoleo.estimation.problems.residuals import ResidualProblem
@@ -17,8 +18,6 @@ from bayesoleo.posterior.density.error_models import ErrorModel, error_model
 from bayesoleo.posterior.density.transforms import Transforms
 from bayesoleo.posterior.density.unknowns import PlainUnknowns, Unknowns
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Prefix of the names of the error variances' coordinates.
 LOG_VARIANCE = schema.log_variance("")

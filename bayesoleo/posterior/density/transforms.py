@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
+from bayesoleo._types import Array
 from bayesoleo.model.priors import Prior
-
-Array = NDArray[np.float64]
 
 
 class Shape(Enum):

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model.correlated import log_density_of, sample_of
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.density.transforms import Transforms
-
-Array = NDArray[np.float64]
 
 #: Finite-difference step in prior standard deviations.
 STEP = 0.25

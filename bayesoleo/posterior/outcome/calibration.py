@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.sampling.samples import Samples
-
-Array = NDArray[np.float64]
 
 #: Draws that a truth is ranked among: ranks 0 to 99.
 DRAWS = 99

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import ResultsError
 from bayesoleo.estimation.shown import columns
-
-Array = NDArray[np.float64]
 
 #: With what the posterior is compared.
 LINEARISED, MONTE_CARLO, REGION = "linearised", "monte carlo", "indifference"

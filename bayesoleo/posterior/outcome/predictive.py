@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.sampling.samples import Samples
-
-Array = NDArray[np.float64]
 
 
 def choose_draws(

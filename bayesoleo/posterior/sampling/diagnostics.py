@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 
 def autocorrelation_time(draws: Array) -> Array:

@@ -9,8 +9,8 @@ from itertools import pairwise
 import emcee
 import numpy as np
 from emcee.state import State
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.log_density import Density
@@ -22,8 +22,6 @@ from bayesoleo.posterior.sampling.moves import (
     differential_evolution,
 )
 from bayesoleo.posterior.sampling.segment import REASONS, Phase, Segment
-
-Array = NDArray[np.float64]
 
 #: Redraws of walkers whose log density is not finite before the start is given up.
 REDRAWS = 50

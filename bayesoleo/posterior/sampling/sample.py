@@ -9,7 +9,6 @@ from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from bayesoleo.errors import InputError
@@ -27,8 +26,6 @@ from bayesoleo.posterior.sampling.samples import Samples
 from bayesoleo.posterior.sampling.segment import Segment
 from bayesoleo.posterior.sampling.spread import SpreadDensity
 from bayesoleo.posterior.sampling.stopping import Quality, Schedule
-
-Array = NDArray[np.float64]
 
 #: Points from which other modes are looked for, and for a first look.
 CLIMBS, QUICK_CLIMBS = 32, 16

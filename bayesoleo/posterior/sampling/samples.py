@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.log_density import LOG_VARIANCE
 from bayesoleo.posterior.sampling.segment import REASONS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.solvers.status import Status
 
-Array = NDArray[np.float64]
 #: Reasons for a density of zero, in the order of :attr:`Segment.failed`.
 REASONS = tuple(status.name.lower() for status in Status if not status.ok)
 Phase = Literal["start", "warm-up", "kept"]

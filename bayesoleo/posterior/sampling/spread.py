@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.machines import Crew
 from bayesoleo.posterior.density.log_density import Density
 
 if TYPE_CHECKING:
     from distributed import Client
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

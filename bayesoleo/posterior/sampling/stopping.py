@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.sampling.diagnostics import rhat_limit
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

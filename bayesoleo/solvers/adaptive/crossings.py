@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize.elementwise import find_root
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 #: Positions in a step at which signs are compared.
 POSITIONS = np.arange(6) / 6.0

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.adaptive.moving_edges import linearised_change, moved
 from bayesoleo.solvers.adaptive.switched import (
@@ -35,8 +36,6 @@ from bayesoleo.solvers.periodic.solve import Boundary, Equations
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Points of a period at which equations are looked at, at least, and of a step: a pulse as short as
 #: three hundred-thousandths of the period is seen wherever it stands.

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.adaptive.switched import Level, Motion, PeriodicProblem, state_rows
 from bayesoleo.solvers.adaptive.warp import warp_between
@@ -21,8 +21,6 @@ from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 
 def solve_on(

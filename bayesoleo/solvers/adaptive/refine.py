@@ -18,8 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.adaptive.error_estimate import ErrorEstimate, estimate_error
 from bayesoleo.solvers.adaptive.moving_edges import solve_on
@@ -37,8 +37,6 @@ from bayesoleo.solvers.periodic.solve import Solution, sensitivities
 from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
 from bayesoleo.solvers.schemes.tableau import Tableau, tableau
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Equal steps tried in turn where no mesh is given.
 FIRST_STEPS = (64, 256, 1024)

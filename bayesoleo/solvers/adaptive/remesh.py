@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.adaptive.warp import warp_between
 from bayesoleo.solvers.schemes.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 #: Part of the tolerance that is aimed at.
 SAFETY = 0.3

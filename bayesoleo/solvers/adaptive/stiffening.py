@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.refine import (
     AdaptiveSolution,
     Motion,
@@ -16,8 +16,6 @@ from bayesoleo.solvers.adaptive.refine import (
 )
 from bayesoleo.solvers.adaptive.warp import SAME, extrapolate
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: How much softer each trial is until one succeeds, and how many there are.
 SOFTER, TRIALS = 0.01, 8

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings, find_crossings
 from bayesoleo.solvers.periodic.solve import Boundary, Equations
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,).
 Motion = Callable[[Array], Array]

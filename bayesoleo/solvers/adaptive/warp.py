@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.schemes.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

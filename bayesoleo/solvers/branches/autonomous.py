@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
     Condition,
@@ -25,8 +25,6 @@ from bayesoleo.solvers.branches.bordered import (
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 _LANE = np.zeros(1, dtype=np.int64)
 

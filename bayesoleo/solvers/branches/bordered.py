@@ -12,13 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: ``value -> (discretised problem, constants (np,))``: what depends on the other unknown.
 Family = Callable[[float], tuple[Boundary, Array]]

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
     Condition,
@@ -28,8 +29,6 @@ from bayesoleo.solvers.branches.bordered import (
 )
 from bayesoleo.solvers.orbit import floquet_multipliers
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A step with more iterations than these is followed by a shorter one, with fewer by a longer.
 MANY_ITERATIONS, FEW_ITERATIONS = 6, 4

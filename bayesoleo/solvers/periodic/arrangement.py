@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import BLOCK
 from bayesoleo.solvers.schemes.unrolled.emit import COLUMNS, REACH, WIDTH
 from bayesoleo.solvers.schemes.unrolled.program import Program, chunks
-
-Array = NDArray[np.float64]
 
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.periodic.solve import Boundary, Solution, solve_periodic
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 FIRST_STEP = 0.25
 SMALLEST_STEP = 1.0 / 512

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.periodic.arrangement import Layout
 from bayesoleo.solvers.schemes.elimination import jit
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

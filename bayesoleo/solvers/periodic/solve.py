@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import BlockKernel
 from bayesoleo.solvers.periodic import arrangement, measures, newton
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
@@ -22,7 +23,6 @@ from bayesoleo.solvers.periodic.trial import Trial
 from bayesoleo.solvers.schemes.scheme import Scheme
 from bayesoleo.solvers.status import Status
 
-Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.periodic import measures
 
 if TYPE_CHECKING:
     from bayesoleo.solvers.periodic.solve import Boundary
 
-Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
 
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.schemes.closure import close_and_sweep
 from bayesoleo.solvers.schemes.elimination import eliminate_each, eliminate_together, jit
 from bayesoleo.solvers.schemes.unrolled import program as unrolled
-
-Array = NDArray[np.float64]
 
 FIRST = np.array([1.5, -2.0, 0.5, 0.0])
 SECOND = np.array([2.0, -5.0, 4.0, -1.0])

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.schemes.backward import BackwardDifferences, CubicPlan
 from bayesoleo.solvers.schemes.sparse import Stencil
-
-Array = NDArray[np.float64]
 
 # Weights of the first derivative times the step, of the second times its square.
 CENTRAL_FIRST: Stencil = {-1: 0.5, 1: -0.5}

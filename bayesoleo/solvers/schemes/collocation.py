@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.schemes import collocation_kernels as kernels
 from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.schemes.unrolled import program as unrolled
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

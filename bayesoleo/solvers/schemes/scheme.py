@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.unrolled.program import Program
 
-Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
 
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.closure import LARGEST_GROWTH, balance
 from bayesoleo.solvers.schemes.tableau import Tableau
 
-Array = NDArray[np.float64]
 #: Weights by how many nodes they lie behind.
 Stencil = dict[int, float]
 

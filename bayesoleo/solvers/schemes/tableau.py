@@ -8,11 +8,9 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import Polynomial, legendre
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.collocation import Collocation, SamplePlan
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 #: Newton iterations for one step of an integration, and the relative change of the stages at which

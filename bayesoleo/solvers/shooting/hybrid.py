@@ -15,15 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.switched import Motion
 from bayesoleo.solvers.periodic.solve import Boundary, Solution, sensitivities
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.shooting.shoot import Shot
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 _LANE = np.zeros(1, dtype=np.int64)
 

@@ -13,14 +13,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import Kernel
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.shooting import march as loop
 from bayesoleo.solvers.shooting.radau_step import radau_method, workspace
 from bayesoleo.solvers.shooting.signals import Signal
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Room for steps at first; more is made where it does not do.
 CAPACITY = 1024

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
-
-Array = NDArray[np.float64]
 
 INTEGRATORS = ("LSODA", "Radau", "BDF", "DOP853")
 #: Periods that the motion settles first: a stable one attracts from further than Newton's method.

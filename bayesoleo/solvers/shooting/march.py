@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import jit
 from bayesoleo.solvers.shooting.inner import inner
 from bayesoleo.solvers.shooting.march_start import first_sizes, is_inside, starts
@@ -30,8 +31,6 @@ from bayesoleo.solvers.shooting.march_step import (
 from bayesoleo.solvers.shooting.march_switch import exchange, find_switch
 from bayesoleo.solvers.shooting.radau_step import Method, Workspace, copy_to
 from bayesoleo.solvers.shooting.signals import Signal
-
-Array = NDArray[np.float64]
 
 #: More ways for a march to end than a step's. ``COARSE``: given steps miss the tolerance; ``FULL``:
 #: out of memory given.

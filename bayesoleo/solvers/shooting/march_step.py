@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.shooting.inner import inner
 from bayesoleo.solvers.shooting.march_start import is_inside
 from bayesoleo.solvers.shooting.radau_step import (
@@ -21,8 +21,6 @@ from bayesoleo.solvers.shooting.radau_step import (
     stretch,
 )
 from bayesoleo.solvers.shooting.signals import rows_at
-
-Array = NDArray[np.float64]
 
 #: How a step ended, and a march with it.
 FINISHED, LOST, OUTSIDE, NOT_A_NUMBER, DEGENERATE = range(5)

@@ -12,14 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import BLOCK
 from bayesoleo.solvers.schemes.elimination import eliminate
 from bayesoleo.solvers.schemes.tableau import tableau
 from bayesoleo.solvers.shooting.inner import evaluate, inner
-
-Array = NDArray[np.float64]
 
 
 class Method(NamedTuple):

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.shooting.initial_value import Dynamics, Trajectory, solve_initial_value
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: Tolerance of the first pass.
 LOOSE = 1e-3

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import jit
-
-Array = NDArray[np.float64]
 
 
 class Signal(NamedTuple):

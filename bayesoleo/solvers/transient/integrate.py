@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.schemes.tableau import Tableau
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
-
-Array = NDArray[np.float64]
 
 #: Local error of the integrator over the size of each state: what its steps leave in a solution is
 #: of this order, far below what a channel resolves.

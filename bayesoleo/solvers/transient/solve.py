@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.periodic import measures
 from bayesoleo.solvers.periodic.solve import LAST_STEP, SMALL_STEP, Boundary, Solution
 from bayesoleo.solvers.periodic.trial import Trial
@@ -29,7 +30,6 @@ from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.schemes.mesh import Mesh
 from bayesoleo.solvers.status import Status
 
-Array = NDArray[np.float64]
 Lanes = NDArray[np.int64]
 
 #: Newton iterations on the whole time at once, before it is walked through piece by piece.

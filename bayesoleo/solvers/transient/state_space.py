@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import eliminate, jit
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 #: ``(times in s, shape (N,)) -> rows of inputs, shape (nu, N)``.

@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.masked import weights
-
-Array = NDArray[np.float64]
 
 #: Probability with which an effect is confirmed that does not lower the error.
 FALSE_ALARM = 0.025

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.model import LogNormal, Model, Normal, Parameter, TruncatedNormal
 from bayesoleo.prediction.layout import Layout
@@ -23,8 +24,6 @@ from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import squared_distance
 from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.scoring.significance import SAME
-
-Array = NDArray[np.float64]
 
 #: A new amplitude's prior is normal about its null, this many times as wide as the score expects it
 #: to be: weak, but proper.

@@ -10,9 +10,8 @@ Statistics 36(4), 672-683.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 
 def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[float, float]:

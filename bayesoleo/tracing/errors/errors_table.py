@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data import PeriodicAverage, periodic_average
 from bayesoleo.data.local_average import LocalAverage, local_average, local_means
 from bayesoleo.data.noise_spectrum import NoiseSpectrum, noise_spectrum
@@ -20,8 +20,6 @@ from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.errors.record_noise import borne_out, sample_noise
 from bayesoleo.tracing.fitting.masked import counted, of_those_counted, weights, without_masked
 from bayesoleo.tracing.fitting.roles import RecordNoise
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

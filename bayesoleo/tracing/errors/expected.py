@@ -28,6 +28,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.local_average import local_means
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
@@ -36,8 +37,6 @@ from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.errors.spread import curved
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
-
-Array = NDArray[np.float64]
 
 #: A run is expected to leave this part of its noise at least: the share that estimates take up is
 #: known by linearisation only.

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation import estimate
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.predictor import Predictor
@@ -16,8 +16,6 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.roles import halves
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.data.smoothing import innovation_noise
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fitting.masked import without_masked
 from bayesoleo.tracing.fitting.roles import RecordNoise
-
-Array = NDArray[np.float64]
 
 #: Bands that each hold the same part of the power which the input's noise is said to have.
 BANDS = 8

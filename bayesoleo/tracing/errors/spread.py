@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.local_average import local_means
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.masked import weights
-
-Array = NDArray[np.float64]
 
 #: Draws of the unknowns: a mean square of changes is known to a fifth where one direction rules.
 DRAWS = 64

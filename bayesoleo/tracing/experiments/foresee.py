@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
 from bayesoleo.prediction.input_noise import input_columns
@@ -17,8 +17,6 @@ from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.experiments.separation import Foreseen
 from bayesoleo.tracing.fitting.fit import Fit
-
-Array = NDArray[np.float64]
 
 #: Points of a period at which outputs are compared, and steps of the mesh: a choice between runs
 #: needs no more digits than it shows.

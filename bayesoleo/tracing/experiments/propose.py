@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.parallel import single_blas_thread, thread_map
 from bayesoleo.prediction.records import Record
@@ -23,8 +23,6 @@ from bayesoleo.tracing.experiments.foresee import (
 )
 from bayesoleo.tracing.experiments.rig import Limits, Motion, Planned, planned_runs
 from bayesoleo.tracing.experiments.separation import Separation, separate
-
-Array = NDArray[np.float64]
 
 #: A pair that no run separates by this many standard deviations does not count in the ranking.
 SEPARABLE = 1.0

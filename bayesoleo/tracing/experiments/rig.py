@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.simulate import motion
 
-Array = NDArray[np.float64]
 Range = tuple[float, float]
 
 #: Points of a period at which a motion is looked at.

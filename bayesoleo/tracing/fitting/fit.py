@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation import PointEstimate, estimate, polish
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Model
@@ -20,8 +20,6 @@ from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.other_starts import doubtful, from_other_starts
-
-Array = NDArray[np.float64]
 
 #: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior
 #: standard deviations.

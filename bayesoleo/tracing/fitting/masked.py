@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data import PeriodicAverage
 from bayesoleo.data.gaps import bridged
 from bayesoleo.prediction.records import Record
-
-Array = NDArray[np.float64]
 
 
 def weights(record: Record) -> Array:

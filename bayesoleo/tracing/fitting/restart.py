@@ -8,13 +8,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bayesoleo._types import Array
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.other_starts import promising
-
-Array = NDArray[np.float64]
 
 #: Log density by which another optimum has to be better: less is what an estimate that ends early
 #: leaves.

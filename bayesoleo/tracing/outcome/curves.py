@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.effects.titles import in_sentence
 from bayesoleo.effects.unnamed import Spline, UnnamedEffect, tensor
 from bayesoleo.errors import ModelError
@@ -25,8 +25,6 @@ from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.unnamed.directions import DISTINCT, VISIBLE
 from bayesoleo.tracing.unnamed.forcing import Forced
 from bayesoleo.tracing.unnamed.quantities import Motions, quantities_of
-
-Array = NDArray[np.float64]
 
 #: A parameter is shared with a curve where the data know less than this part of it beside any
 #: curve of the same quantities: its standard deviation would be three times what it seems.

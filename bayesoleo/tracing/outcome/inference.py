@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation import multistart
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
@@ -19,8 +19,6 @@ from bayesoleo.posterior.approximation.laplace import Mode, find_mode, start_coo
 from bayesoleo.posterior.density.error_models import ERROR_MODELS, check_word
 from bayesoleo.posterior.density.hierarchy import hierarchical
 from bayesoleo.tracing.fitting.fit import Fit
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

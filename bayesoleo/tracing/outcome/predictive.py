@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior import Samples
 from bayesoleo.posterior.density.error_models import ErrorModel
@@ -20,8 +20,6 @@ from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.fit import Fit
-
-Array = NDArray[np.float64]
 
 #: Points of a period, and draws of the posterior.
 PHASES, DRAWS = 200, 100

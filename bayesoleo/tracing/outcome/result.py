@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.data import Campaign
 from bayesoleo.estimation import to_dataset
 from bayesoleo.model import Coordinate
@@ -26,8 +26,6 @@ from bayesoleo.tracing.fitting.masked import weights
 from bayesoleo.tracing.outcome.predictive import PHASES, predictive_group
 from bayesoleo.tracing.outcome.shapes import shape_group
 from bayesoleo.tracing.outcome.summary import titles_of, told
-
-Array = NDArray[np.float64]
 
 _OUTPUT_UNIT = "SI unit of each output"
 

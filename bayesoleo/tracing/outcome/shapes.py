@@ -7,14 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.effects.unnamed import Axis, UnnamedEffect, balance_unit_at
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.state import State
-
-Array = NDArray[np.float64]
 
 #: Points at which a function of one quantity is shown, and of each of two.
 POINTS, POINTS_OF_TWO = 201, 31

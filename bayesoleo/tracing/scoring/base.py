@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.data.noise_spectrum import NoiseSpectrum
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -18,8 +19,6 @@ from bayesoleo.tracing.errors.errors_table import RunError
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import counted, weights
 from bayesoleo.tracing.scoring.sensitivities import present_constants
-
-Array = NDArray[np.float64]
 
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.

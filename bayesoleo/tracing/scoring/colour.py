@@ -7,16 +7,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.data import periodic_average
 from bayesoleo.data.noise_spectrum import NoiseSpectrum, noise_spectrum
 
 if TYPE_CHECKING:
     from bayesoleo.tracing.scoring.base import Base, RunBase
 
-Array = NDArray[np.float64]
 
 #: Probability with which stationary noise may be taken for one that is not.
 UNSTEADY = 0.05

@@ -11,15 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, optimize, stats
 
+from bayesoleo._types import Array
 from bayesoleo.data.lines import FALSE_ALARM
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
-
-Array = NDArray[np.float64]
 
 #: Lines on either side from whose median the level beside a line is taken; cycles over the record
 #: below which a line is a drift.

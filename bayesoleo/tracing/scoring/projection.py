@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 #: A squared residual norm below this part of the squared norm is no direction of its own: the
 #: sensitivities themselves are good to some seven digits beside those of the model.

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.parallel import thread_map
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.assembly import Option
@@ -25,8 +25,6 @@ from bayesoleo.tracing.scoring.base import Base, flat
 from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import coefficients, remains
 from bayesoleo.tracing.scoring.sensitivities import Block, sensitivities_of
-
-Array = NDArray[np.float64]
 
 #: Why an effect has no score.
 SPANNED = "the model can already do what it would"

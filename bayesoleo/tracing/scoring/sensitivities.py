@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.scoring.visible import without_round_off
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

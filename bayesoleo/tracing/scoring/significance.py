@@ -6,13 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo.parallel import single_blas_thread
 from bayesoleo.tracing.scoring.score import Score
-
-Array = NDArray[np.float64]
 
 #: Effects whose contributions agree to this squared cosine are one class.
 SAME = 0.95

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.prediction.run import RunPredictor, Samples
 from bayesoleo.solvers.status import Status
-
-Array = NDArray[np.float64]
 
 #: A sensitivity is looked at again if a parameter that moves a state by all of its size moves an
 #: output by less of its own: solutions are good to some 1e-13 of their size, and what is real is

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from bayesoleo._types import Array
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.projection import coefficients
-
-Array = NDArray[np.float64]
 
 #: A direction of which the present parameters can do all but this part is theirs.
 OWN = 0.03

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.effects.unnamed import balance_places
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model.expressions import symbol
@@ -27,7 +27,6 @@ from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit
 
-Array = NDArray[np.float64]
 #: Courses of a term in one run: at phases ``(N,)`` an array ``(K, N)``.
 Courses = Callable[[Array], Array]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.effects.units import parse_unit, unit_of, unit_text
 from bayesoleo.effects.unnamed import Axis, bspline_values
 from bayesoleo.errors import ModelError
@@ -19,8 +19,6 @@ from bayesoleo.prediction.inputs import signal_of
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit
-
-Array = NDArray[np.float64]
 
 #: Two quantities whose ranks agree to this are one and the same to a smooth function of either.
 ALIKE = 0.9995

@@ -15,9 +15,9 @@ from functools import cache, partial
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.effects import Scales
 from bayesoleo.effects.unnamed import Axis, Spline, balance_places, tensor
 from bayesoleo.errors import ModelError
@@ -31,8 +31,6 @@ from bayesoleo.tracing.scoring.score import Score
 from bayesoleo.tracing.unnamed.directions import Known, known_beside
 from bayesoleo.tracing.unnamed.forcing import Forced
 from bayesoleo.tracing.unnamed.quantities import Motions, quantities_of
-
-Array = NDArray[np.float64]
 
 #: Pieces of the range of one quantity, and of each of two; each number divides the last, so that
 #: the splines of all are sums of the finest.

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.density.transforms import Transform
-
-Array = NDArray[np.float64]
 
 #: Spread of the logarithm of a variance before anything is known of it: walkers start from the
 #: residuals' own size, and Newton's method needs a scale only.

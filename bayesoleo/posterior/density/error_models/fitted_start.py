@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.density.differences import derivatives
-
-Array = NDArray[np.float64]
 
 # Differences are taken over so much, in coordinates of about unit spread.
 _SCALE = 0.2

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from emcee.moves import MHMove
-from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.posterior.approximation.mixture import Mixture
-
-Array = NDArray[np.float64]
 
 
 class IndependenceMove(MHMove):

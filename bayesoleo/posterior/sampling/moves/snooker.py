@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from emcee.moves import RedBlueMove
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bayesoleo._types import Array
 
 
 class SnookerMove(RedBlueMove):
