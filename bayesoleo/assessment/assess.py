@@ -15,9 +15,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.assessment import residual_tests as tests
 from bayesoleo.assessment.means import ACROSS, between_means
-from bayesoleo.assessment.series import Array, Series, series_of_problem, series_of_tree
+from bayesoleo.assessment.series import Series, series_of_problem, series_of_tree
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.problem import Problem

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.assessment.residual_tests import memory
-from bayesoleo.assessment.series import Array, Series
+from bayesoleo.assessment.series import Series
 
 #: What is found, in words.
 ACROSS = {

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -116,8 +117,8 @@ def _dress(above: Axes, below: Axes, every: Sequence[AnswerBranch], y: str) -> N
     below.set_xlabel(unit.label(style.plain(words)), fontsize=style.TEXT)
 
 
-def _legend(every: Sequence[AnswerBranch]) -> list[style.Artist]:
-    handles: list[style.Artist] = [style.line(style.AFTER, "stable")]
+def _legend(every: Sequence[AnswerBranch]) -> list[Artist]:
+    handles: list[Artist] = [style.line(style.AFTER, "stable")]
     if any(each.unstable.any() for each in every):
         handles.append(style.line(style.BEFORE, "unstable: no rig stays on it", 1.6, "--"))
     for kind, (marker, words) in MARKS.items():

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -55,7 +56,7 @@ def by_run(each: xr.Dataset) -> Figure:
         )
         style.dress(axes)
         _panel(axes, each.sel({schema.PARAMETER: name}), view, name, good)
-    handles: list[style.Artist] = [
+    handles: list[Artist] = [
         style.line(style.INK, "run ± 2 sd", 1.0),
         style.line(style.AFTER, "mean over runs"),
         style.band(style.SIMILAR, "± 2 sd between runs"),

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from bayesoleo.plots import reading, style
+from bayesoleo._types import Array
+from bayesoleo.plots import style
 from bayesoleo.plots.draws import chosen, draws, point_table, unit_of
 from bayesoleo.plots.units import Scale, engineering, format_number
 
@@ -78,7 +79,7 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
     return figure
 
 
-def _range(values: reading.Array, truth: float | None) -> tuple[float, float]:
+def _range(values: Array, truth: float | None) -> tuple[float, float]:
     """All but the outermost draws, and the point in any case; never of zero width."""
     low, high = np.quantile(values, [0.002, 0.998])
     if truth is not None and np.isfinite(truth):
@@ -111,7 +112,7 @@ def _arrange(figure: Figure, margin: float) -> None:
     )  # fmt: skip
 
 
-def _tidy(figure: Figure, labels: list[str], shown: reading.Array) -> None:
+def _tidy(figure: Figure, labels: list[str], shown: Array) -> None:
     """Titles with value and spread, names and units on the outer axes, readable numbers."""
     count, size = len(labels), figure.get_figwidth()
     axes = np.array(figure.axes).reshape(count, count)

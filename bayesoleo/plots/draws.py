@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading
 from bayesoleo.plots.rankings import chosen as accepted
 
@@ -50,7 +51,7 @@ def chosen(tree: xr.DataTree, most: int) -> list[str]:
     return sorted(sorted(names, key=rank)[:most], key=names.index)
 
 
-def draws(tree: xr.DataTree, name: str) -> reading.Array:
+def draws(tree: xr.DataTree, name: str) -> Array:
     """Draws of one parameter, shape (chain, draw)."""
     values = (
         reading.variable(tree, schema.POSTERIOR, name).transpose(schema.CHAIN, schema.DRAW).values

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
@@ -139,7 +141,7 @@ def _bracket(axes: Axes, role: str, middle: float, colour: str) -> None:
     )
 
 
-def _logarithmic(axes: Axes, values: reading.Array) -> None:
+def _logarithmic(axes: Axes, values: Array) -> None:
     """A logarithmic axis of at least half a decade with plain numbers at 1, 2 and 5."""
     low, high = 0.8 * values.min(), 1.25 * values.max()
     if high / low < 3.0:
@@ -164,7 +166,7 @@ def _unit(tree: xr.DataTree, output: str) -> str:
     return "" if data is None or output not in data else reading.unit(data[output])
 
 
-def _handles(two: bool) -> list[style.Artist]:
+def _handles(two: bool) -> list[Artist]:
     """What the marks mean."""
 
     hollow = Line2D([], [], marker="o", ls="", ms=6.5, mfc="white", mec=style.BEFORE, mew=1.6)

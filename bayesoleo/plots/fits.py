@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
@@ -57,7 +58,7 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
     return grid.figure
 
 
-def _draw(axes: Axes, position: reading.Array, curves: list[reading.Array]) -> None:
+def _draw(axes: Axes, position: Array, curves: list[Array]) -> None:
     """Measured broad and pale, so that a prediction that lies on it can be seen on it."""
     if reading.is_resolved(position, curves[0]):
         lines = [reading.fold(position, curve) for curve in curves]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
@@ -45,7 +46,7 @@ def forecast(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None)
         _band(figure, bottom, one.sel(run=run), scale.factor)
         _transform(figure, bottom, one.sel(run=run))
     level = f"{100 * float(data.attrs['level']):.3g} % interval"
-    handles: list[style.Artist] = [
+    handles: list[Artist] = [
         style.band(style.SIMILAR, level),
         style.line(style.AFTER, "mean"),
         style.line(style.INK, "measured", 1.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -73,7 +74,7 @@ def _row(axes: Axes, row: int, values: np.ndarray, point: tuple[float, float, st
     return float(1.08 * max(*np.abs(outer), abs(place) + reach))
 
 
-def _handles() -> list[style.Artist]:
+def _handles() -> list[Artist]:
     """What the lines mean."""
     return [
         style.line(style.AFTER, "posterior, 50 %", 5.0),

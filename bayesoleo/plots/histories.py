@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -40,7 +41,7 @@ def history(data: xr.Dataset) -> Figure:
         axes.set_title(style.plain(name, 30), fontsize=style.TEXT, loc="left")
     _way(panels[len(names)], data[schema.OBJECTIVE].values, methods, stages)
     panels[len(names)].set_title("objective", fontsize=style.TEXT, loc="left")
-    lines: list[style.Artist] = [
+    lines: list[Artist] = [
         style.line(colour, name) for name, colour in zip(stages, style.ENSEMBLES, strict=False)
     ]
     style.legend(figure, [*lines, style.band(style.NOISE, "estimate ± sd")])

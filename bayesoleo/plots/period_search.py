@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -52,7 +53,7 @@ def period_search(search: PeriodSearch, unit: str = "", name: str = "signal") ->
     zoom.plot(step * (fine + search.period_in_samples), parabola, color=style.BEFORE, lw=1.2)
     zoom.axvline(step * search.period_in_samples, color=style.BEFORE, lw=0.8)
     _dress(zoom, "shift in s", f"residual time shift{scale[1]}")
-    handles: list[style.Artist] = [
+    handles: list[Artist] = [
         style.line(style.AFTER, name),
         style.line(style.BEFORE, "quadratic and its minimum, the period"),
     ]

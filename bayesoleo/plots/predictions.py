@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy import special
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import ResultsError
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
@@ -23,10 +24,10 @@ HALVINGS = 30
 class _Row:
     """One run about the prediction at the estimate, all of shape (points,)."""
 
-    phase: reading.Array
-    measured: reading.Array
-    model: tuple[reading.Array, reading.Array]
-    average: tuple[reading.Array, reading.Array]
+    phase: Array
+    measured: Array
+    model: tuple[Array, Array]
+    average: tuple[Array, Array]
 
 
 def predictive(tree: xr.DataTree, output: str, level: float = 0.95) -> Figure:
@@ -123,7 +124,7 @@ def _row(tree: xr.DataTree, data: xr.Dataset, output: str, run: reading.Run, lev
     return _Row(centres, measured, (model[0], model[1]), (average[0], average[1]))
 
 
-def _quantile(centres: reading.Array, sd: reading.Array, probability: float) -> reading.Array:
+def _quantile(centres: Array, sd: Array, probability: float) -> Array:
     """Quantile of an equal mixture of normals (K, p) with standard deviations (K,), shape (p,).
 
     Of draws of the average themselves it would be as ragged as they are few.

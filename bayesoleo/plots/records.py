@@ -6,6 +6,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import engineering
 
@@ -72,7 +73,7 @@ def _channel(
         axes.tick_params(bottom=False)
 
 
-def _limits(values: reading.Array) -> tuple[float, float]:
+def _limits(values: Array) -> tuple[float, float]:
     low, high = style.np.nanmin(values), style.np.nanmax(values)
     margin = 0.06 * (high - low) or 1.0
     return float(low - margin), float(high + margin)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -58,7 +59,7 @@ def sampling_distribution(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
             0.98, 0.97, text, transform=axes.transAxes, ha="right", va="top",
             fontsize=style.SMALL, color=style.FAINT,
         )  # fmt: skip
-    handles: list[style.Artist] = [
+    handles: list[Artist] = [
         style.band(style.SIMILAR, f"{int(good.sum())} replications"),
         style.line(style.AFTER, "Cramér-Rao bound"),
         style.line(style.BEFORE, "linearised estimator", 1.2, "--"),

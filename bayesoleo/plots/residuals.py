@@ -6,10 +6,12 @@ from typing import Literal
 
 import numpy as np
 import xarray as xr
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.units import Scale, engineering
 
@@ -66,7 +68,7 @@ def residual(tree: xr.DataTree, output: str, against: Against = "phase") -> Figu
 
 def _curve(
     tree: xr.DataTree, data: xr.Dataset, name: str, run: reading.Run, against: Against
-) -> tuple[reading.Array, reading.Array]:
+) -> tuple[Array, Array]:
     """What is drawn of one run, in SI."""
     mean = schema.mean(name)
     if against == "phase":
@@ -85,7 +87,7 @@ def _curve(
     return _by_value(coordinate, e)
 
 
-def _by_value(coordinate: reading.Array, e: reading.Array) -> tuple[reading.Array, reading.Array]:
+def _by_value(coordinate: Array, e: Array) -> tuple[Array, Array]:
     """Averages in bins of the coordinate with equally many samples each."""
     keep = np.flatnonzero(np.isfinite(coordinate) & np.isfinite(e))
     parts = np.array_split(keep[np.argsort(coordinate[keep])], min(60, max(keep.size // 20, 1)))
@@ -95,14 +97,14 @@ def _by_value(coordinate: reading.Array, e: reading.Array) -> tuple[reading.Arra
     )
 
 
-def _phases(data: xr.Dataset) -> reading.Array:
+def _phases(data: xr.Dataset) -> Array:
     """The grid of the averages; if the tree has none it is regular."""
     if schema.PHASE in data.coords:
         return np.asarray(data[schema.PHASE].values, dtype=float)
     return (np.arange(data.sizes[schema.PHASE]) + 0.5) / data.sizes[schema.PHASE]
 
 
-def _scale(variable: xr.DataArray, curves: list[reading.Array]) -> Scale:
+def _scale(variable: xr.DataArray, curves: list[Array]) -> Scale:
     return engineering(reading.unit(variable), style.magnitude(*curves))
 
 
@@ -123,7 +125,7 @@ def _noise(axes: Axes, data: xr.Dataset, output: str, run: reading.Run, scale: S
 
 def _explain(figure: Figure, kinds: int, remark: str, noise: bool) -> None:
     """What the colours mean."""
-    handles: list[style.Artist] = [style.line(style.BEFORE, "before" if kinds > 1 else "residual")]
+    handles: list[Artist] = [style.line(style.BEFORE, "before" if kinds > 1 else "residual")]
     if kinds > 1:
         handles.append(style.line(style.AFTER, "after"))
     if noise:

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.plots import reading, style
 from bayesoleo.plots.draws import chosen, draws, unit_of
 from bayesoleo.plots.units import engineering
@@ -59,9 +60,7 @@ def trace(tree: xr.DataTree, most: int = 7) -> Figure:
     return figure
 
 
-def _chains(
-    axes: Axes, name: str, unit: str, values: reading.Array, ensembles: reading.Array
-) -> None:
+def _chains(axes: Axes, name: str, unit: str, values: Array, ensembles: Array) -> None:
     """A few walkers, thinned to what a screen can show."""
     style.dress(axes, ticks=3)
     spread = values.std()
@@ -82,7 +81,7 @@ def _chains(
     axes.set_title(text, loc="left", fontsize=style.SMALL, pad=3, color=style.INK)
 
 
-def _ensembles(tree: xr.DataTree, chains: int) -> reading.Array:
+def _ensembles(tree: xr.DataTree, chains: int) -> Array:
     """To which ensemble each chain belongs; one for all where the tree does not say."""
     posterior = tree[schema.POSTERIOR]
     if schema.ENSEMBLE in posterior.coords:

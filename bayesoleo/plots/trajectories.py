@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
@@ -61,7 +62,7 @@ def trajectory(
         axes.tick_params(labelbottom=k == count - 1)
         axes.set_xlabel("time in s" if k == count - 1 else "", fontsize=style.TEXT)
         axes.yaxis.set_label_coords(-0.05, 0.5)
-    handles: list[style.Artist] = [style.line(style.AFTER, "found")]
+    handles: list[Artist] = [style.line(style.AFTER, "found")]
     mark = style.line(style.BEFORE, "measured")
     mark.set(marker=".", ls="none", ms=6)
     if set(names) & set(found.outputs):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.iterate import iterate
 from bayesoleo.estimation.estimators.known import with_measured, without_measured
@@ -20,7 +21,7 @@ from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.summarise import summarise
 from bayesoleo.estimation.objectives.diagonal import output_counts
 from bayesoleo.estimation.objectives.objective import Objective, objective_of
-from bayesoleo.estimation.problems.problem import Array, Problem, jumps_of, measured_of
+from bayesoleo.estimation.problems.problem import Problem, jumps_of, measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.solvers.status import added
 

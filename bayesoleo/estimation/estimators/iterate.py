@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.estimators.newton import newton_equations
 from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.pace import Pace
@@ -23,7 +24,7 @@ from bayesoleo.estimation.objectives.bounded import is_cut
 from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts
 from bayesoleo.estimation.objectives.equations import Equations
 from bayesoleo.estimation.objectives.objective import Objective
-from bayesoleo.estimation.problems.problem import Array, Evaluation, Problem
+from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.parallel import single_blas_thread
 from bayesoleo.solvers.status import Status

@@ -16,10 +16,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.objectives.equations import Equations
 from bayesoleo.estimation.objectives.linearise import RANK
-from bayesoleo.estimation.problems.problem import Array
 
 # A step may miss the radius by this part of it, which saves iterations of the secular equation.
 _SLACK = 0.1

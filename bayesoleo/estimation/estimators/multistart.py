@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import Method, estimate, polish
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.shown import columns
 from bayesoleo.model.correlated import sample_of
 from bayesoleo.parallel import thread_map

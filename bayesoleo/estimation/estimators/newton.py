@@ -19,10 +19,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.diagonal import output_counts
 from bayesoleo.estimation.objectives.equations import Equations
 from bayesoleo.estimation.objectives.error_models import ErrorModel
-from bayesoleo.estimation.problems.problem import Array, Evaluation, Problem
+from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 
 # Part of a linearised standard deviation: the third derivative costs its square, and a solver's

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from bayesoleo.estimation.problems.problem import Array, Evaluation
+from bayesoleo._types import Array
+from bayesoleo.estimation.problems.problem import Evaluation
 from bayesoleo.solvers.status import Status
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 
 # A step that turns back by more than this part of the last one overshoots: linear equations that
 # lack the residual's second derivatives can do so for ever, each step lowering the merit a little.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.status import Status
 

@@ -18,8 +18,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.equations import Equations
-from bayesoleo.estimation.problems.problem import Array
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.estimators.outcome import Outcome
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
@@ -17,7 +18,7 @@ from bayesoleo.estimation.objectives.linearise import (
     pseudo_inverse_gram,
 )
 from bayesoleo.estimation.objectives.objective import Objective
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.parallel import single_blas_thread
 from bayesoleo.prediction.stability import Stability

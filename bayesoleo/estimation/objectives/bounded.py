@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.linearise import least_squares
-from bayesoleo.estimation.problems.problem import Array
 
 # A step goes at most this part of the way to a limit, so that a limit is approached, not hit.
 _PART = 0.9

@@ -15,8 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array, Evaluation
+from bayesoleo.estimation.problems.problem import Evaluation
 from bayesoleo.model.correlated import log_density_of
 from bayesoleo.model.priors import Prior
 

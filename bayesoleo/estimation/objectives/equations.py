@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.bounded import bounded_step, on_limit
 from bayesoleo.estimation.objectives.linearise import RANK, inverse_gram
-from bayesoleo.estimation.problems.problem import Array
 
 
 @dataclass(frozen=True)

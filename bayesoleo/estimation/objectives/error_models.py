@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.objectives.diagonal import (
     log_likelihood,
@@ -27,7 +28,7 @@ from bayesoleo.estimation.objectives.diagonal import (
     sums_of_squares,
 )
 from bayesoleo.estimation.objectives.linearise import Linearised, triangle
-from bayesoleo.estimation.problems.problem import Array, Evaluation
+from bayesoleo.estimation.problems.problem import Evaluation
 
 Counts = NDArray[np.int64]
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import Array, Evaluation
+from bayesoleo._types import Array
+from bayesoleo.estimation.problems.problem import Evaluation
 
 # Rows of one block of a tall matrix.
 _BLOCK = 1024

@@ -14,7 +14,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo._types import Array
+from bayesoleo.estimation.problems.problem import Problem
 
 
 @dataclass(frozen=True)

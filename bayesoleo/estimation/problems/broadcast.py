@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array
 
 # A sum in another order rounds differently; a function that broadcasts wrongly is off by far more.
 _SAME = 1e-9

@@ -8,14 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import (
-    Array,
-    Evaluation,
-    Misfit,
-    Problem,
-    jumps_of,
-    measured_of,
-)
+from bayesoleo._types import Array
+from bayesoleo.estimation.problems.problem import Evaluation, Misfit, Problem, jumps_of, measured_of
 from bayesoleo.model.correlated import Correlated, JointNormal, joint_groups
 from bayesoleo.model.priors import Prior
 

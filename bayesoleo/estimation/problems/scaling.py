@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array
 from bayesoleo.model.correlated import Correlated, log_density_of, scaled_root
 from bayesoleo.model.priors import LogNormal, Normal, Prior
 

@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array
 
 #: A run says nothing of a parameter where its data alone leave the standard deviation a thousand
 #: times larger than the prior does: in a mean over runs its weight would be a millionth.

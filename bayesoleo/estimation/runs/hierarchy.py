@@ -28,8 +28,8 @@ import xarray as xr
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array
 from bayesoleo.estimation.runs.comparable import check_definite, comparable
 from bayesoleo.estimation.runs.scatter import (
     generalised_mean,

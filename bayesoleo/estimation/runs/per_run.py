@@ -13,10 +13,11 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.parallel import thread_map
 
 Residuals = tuple[Array, ...]

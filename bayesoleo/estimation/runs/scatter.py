@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize, stats
 
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 
 
 def generalised_mean(y: Array, S: Array, T: Array) -> tuple[Array, Array, Array]:

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.sensitivity.features import Feature, Features
 from bayesoleo.estimation.shown import Shown, columns
 from bayesoleo.model.priors import LogNormal, Normal, Prior, TruncatedNormal, Uniform

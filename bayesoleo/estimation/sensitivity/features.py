@@ -8,9 +8,10 @@ from typing import Any, cast
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 
 #: A number of one run, from its predicted outputs by name, each shape (n,).
 Feature = Callable[[Mapping[str, Array]], float]

@@ -14,10 +14,11 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import curvature
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.shown import Shown, columns
 
 Scale = Literal["prior", "value"]

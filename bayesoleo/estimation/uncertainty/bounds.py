@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 from bayesoleo.estimation.uncertainty.redraw import NoiseBlock
 
 

@@ -18,10 +18,11 @@ import xarray as xr
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import curvature
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.shown import Shown
 from bayesoleo.estimation.uncertainty.axes import axes_text, over_variances, principal_axes
 from bayesoleo.estimation.uncertainty.drop import Drop, Kind

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import (
@@ -19,7 +20,7 @@ from bayesoleo.estimation.objectives.curvature import (
     noise_of_gradient,
     prior_precision,
 )
-from bayesoleo.estimation.problems.problem import Array, Problem, measured_of
+from bayesoleo.estimation.problems.problem import Problem, measured_of
 from bayesoleo.estimation.shown import Shown, columns
 
 Form = Literal["posterior", "propagated"]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.curvature import inverse_scaled
 from bayesoleo.estimation.problems.held import Held
-from bayesoleo.estimation.problems.problem import Array
 from bayesoleo.estimation.uncertainty.drop import Drop
 from bayesoleo.estimation.uncertainty.profile import Line
 from bayesoleo.estimation.uncertainty.rays import first_crossing

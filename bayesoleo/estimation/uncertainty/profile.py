@@ -15,9 +15,10 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.problems.problem import Array, Problem
+from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.shown import Shown, columns
 from bayesoleo.estimation.uncertainty.drop import Drop, Kind
 

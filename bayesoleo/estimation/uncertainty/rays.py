@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 
 # In units of the radius that the second-order expansion foresees.
 _FARTHEST = 30.0

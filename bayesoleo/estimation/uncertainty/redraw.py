@@ -13,10 +13,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.batch import BatchProblem
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.problems.problem import Array, Evaluation, Misfit, Problem
+from bayesoleo.estimation.problems.problem import Evaluation, Misfit, Problem
 from bayesoleo.model.priors import Prior
 from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.prediction.predictor import Predictor

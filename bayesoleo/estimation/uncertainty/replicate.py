@@ -18,13 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.known import without_measured
 from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.problems.batch import BatchProblem
-from bayesoleo.estimation.problems.problem import Array, measured_of
+from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.uncertainty.walk_together import Lanes, Walk
 from bayesoleo.parallel import single_blas_thread, thread_map

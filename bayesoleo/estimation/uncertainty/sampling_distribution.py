@@ -18,13 +18,14 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.methods import method as find_method
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import prior_precision
 from bayesoleo.estimation.problems.batch import BatchProblem
-from bayesoleo.estimation.problems.problem import Array, Problem, measured_of
+from bayesoleo.estimation.problems.problem import Problem, measured_of
 from bayesoleo.estimation.shown import Shown
 from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
 from bayesoleo.estimation.uncertainty.redraw import DataSource, NoiseBlock, data_source

@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from bayesoleo import schema
-from bayesoleo.estimation.problems.problem import Array
+from bayesoleo._types import Array
 from bayesoleo.estimation.shown import columns
 from bayesoleo.storage.slots import Arrays
 

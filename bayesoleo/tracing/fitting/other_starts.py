@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from bayesoleo._types import Array
 from bayesoleo.estimation import PointEstimate, estimate, polish
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.problems.problem import Array
 from bayesoleo.estimation.problems.scaling import PriorScale
 
 #: Vectors drawn from the priors, and the best of them from which estimates start.

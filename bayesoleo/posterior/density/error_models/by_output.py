@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models.base import Array, ErrorModel, Frame, log_mean_squares
+from bayesoleo.posterior.density.error_models.base import ErrorModel, Frame, log_mean_squares
 from bayesoleo.posterior.density.error_models.fitted_start import climb
 
 #: Coordinates of a share from which the climb to its most likely value starts: a fifth, a half, and

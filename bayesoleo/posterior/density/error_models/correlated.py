@@ -31,9 +31,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal, Uniform
-from bayesoleo.posterior.density.error_models.base import Array, Frame, Quantity
+from bayesoleo.posterior.density.error_models.base import Frame, Quantity
 from bayesoleo.posterior.density.error_models.by_output import ByOutput
 
 SQRT_2 = math.sqrt(2.0)

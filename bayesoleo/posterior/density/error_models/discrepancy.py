@@ -34,9 +34,10 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal, Uniform
-from bayesoleo.posterior.density.error_models.base import Array, Frame, Quantity
+from bayesoleo.posterior.density.error_models.base import Frame, Quantity
 from bayesoleo.posterior.density.error_models.by_output import ByOutput
 
 #: Harmonics of the series: the shortest length that it shows is about a fiftieth of a cycle.

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.special import betaln
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.posterior.density.error_models.base import (
-    Array,
     ErrorModel,
     Frame,
     Quantity,

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal
 from bayesoleo.posterior.density.error_models.base import (
-    Array,
     ErrorModel,
     Frame,
     Quantity,

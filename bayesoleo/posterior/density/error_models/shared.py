@@ -34,9 +34,10 @@ import numba
 import numpy as np
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Uniform
-from bayesoleo.posterior.density.error_models.base import Array, Frame, Quantity
+from bayesoleo.posterior.density.error_models.base import Frame, Quantity
 from bayesoleo.posterior.density.error_models.discrepancy import (
     DiscrepancyErrors,
     factorise,
