@@ -7,3 +7,8 @@ from numpy.typing import NDArray
 
 #: Real numbers in double precision; docstrings give the shape and the unit.
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+#: Indices and counts.
+Integers = NDArray[np.int64]
+#: What holds and what does not.
+Flags = NDArray[np.bool_]

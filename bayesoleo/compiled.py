@@ -31,7 +31,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 
 #: Points in a block, and the distance between rows.
 BLOCK = 64
@@ -158,13 +158,13 @@ def _flat(result: Array) -> Array:
     return flat
 
 
-def _pointer(typing_context, array, offset):
+def _pointer(typing: Any, array: Any, offset: Any) -> tuple[Any, Any]:
     """Pointer to the element of a contiguous array that lies ``offset`` elements behind its first.
 
     Unlike ``array[k].ctypes`` it counts no references: that costs more than a kernel's call.
     """
 
-    def generate(context, builder, signature, arguments):
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         structure = context.make_array(signature.args[0])(context, builder, arguments[0])
         return builder.gep(structure.data, [arguments[1]])
 
@@ -195,8 +195,8 @@ def caller(signature: Any) -> Any:
     than many a block takes.
     """
 
-    def call(typing_context, address, arguments):
-        def generate(context, builder, types_, values):
+    def call(typing: Any, address: Any, arguments: Any) -> tuple[Any, Any]:
+        def generate(context: Any, builder: Any, types_: Any, values: Any) -> Any:
             kinds = [context.get_value_type(kind) for kind in signature.args]
             returned = signature.return_type
             result = ir.VoidType() if returned == types.void else context.get_value_type(returned)
@@ -215,7 +215,9 @@ call_kernel: Any = caller(SIGNATURE)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _fill(kernel, z, u, p, lanes, first, second):
+def _fill(
+    kernel: int, z: Array, u: Array, p: Array, lanes: Integers, first: Array, second: Array
+) -> None:
     nz, nu, points = z.shape[1], u.shape[0], first.shape[2]
     rows, more = first.shape[1], second.shape[1]
     # At least one row: a pointer must point to something.

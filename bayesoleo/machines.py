@@ -164,7 +164,7 @@ class Crew:
     @property
     def size(self) -> int:
         """Threads of all workers together, at least one."""
-        return max(sum(self.client.nthreads().values()), 1)
+        return int(max(sum(self.client.nthreads().values()), 1))
 
     def each(self, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Results of the function for items, as :func:`each_done`.
@@ -214,7 +214,7 @@ def _is_loss(error: BaseException) -> bool:
     """Whether a task failed because of where it was, not because of what it is."""
     from distributed import KilledWorker
     from distributed.client import FutureCancelledError
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
     kinds = (KilledWorker, CancelledError, FutureCancelledError, CommClosedError)
     return isinstance(error, kinds)

@@ -9,6 +9,7 @@ the residual is measured and taken into account.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ def autocorrelation(values: Array, lags: int) -> Array:
     length = fft.next_fast_len(2 * values.size)
     sums = fft.irfft(np.abs(fft.rfft(centred, length)) ** 2, length)[: lags + 1]
     overlap = values.size - np.arange(lags + 1)
-    return sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny)
+    return cast(Array, sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny))
 
 
 def memory(values: Array, power: int = 1) -> float:

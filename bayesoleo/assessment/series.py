@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 import xarray as xr
@@ -90,7 +91,7 @@ class Series:
             return self.residual
         # The average takes a share of the noise with it.
         loss = 1 - average.number / average.samples
-        return (self.residual - average.values) / np.sqrt(loss)
+        return cast(Array, (self.residual - average.values) / np.sqrt(loss))
 
     def period_means(self) -> Array:
         """Mean residual of each whole period, shape (periods,); of all where nothing repeats."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -133,7 +133,7 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
                 f" {status['mesh_shift']:.2g} sd"
             )
         lines.append(mesh)  # of another mesh the notes speak
-    return lines + json.loads(status["notes"])
+    return cast(list[str], lines + json.loads(status["notes"]))
 
 
 def sample(

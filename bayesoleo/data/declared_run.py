@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from bayesoleo.data.checked_table import FILE, check_keys, choose, get_unit, get_value
 from bayesoleo.data.gaps import Stretches, read_stretches
@@ -80,7 +80,7 @@ def _run(table: Mapping[str, Any], place: str) -> RunDeclaration:
                 value=value,
                 hint="write it in Hz",
             )
-        return value
+        return cast(float | None, value)
 
     kind = _one_of(text("kind", default="periodic"), KINDS, "kind", label)
     run = RunDeclaration(

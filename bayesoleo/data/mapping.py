@@ -7,7 +7,7 @@ the grid, so that it adds no error of its own to a signal without higher ones.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -75,4 +75,4 @@ def on_grid(
         )
     index = np.arange(signal.size + 1, dtype=float)
     closed = np.append(signal, np.interp(signal.size - length, index[:-1], signal))
-    return np.interp(place, index, closed)
+    return cast(Array, np.interp(place, index, closed))

@@ -9,6 +9,7 @@ the late periods against the early ones and would pass for noise that does not r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,7 @@ def autocovariance(values: Array, shifts: NDArray[np.int64]) -> Array:
     centred = values - np.mean(values)
     power = np.abs(fft.rfft(centred, fft.next_fast_len(2 * values.size))) ** 2
     sums = fft.irfft(power, fft.next_fast_len(2 * values.size))[shifts]
-    return sums / (values.size - shifts)
+    return cast(Array, sums / (values.size - shifts))
 
 
 def find_frequency(values: Array, time_step: float, nominal: float) -> Frequency:
@@ -173,7 +174,7 @@ def _joint_residual(scaled: Array, shifts: NDArray[np.int64]) -> Array:
     """Shift function of all channels, those that repeat best weighing most."""
     each = np.array([residual_time_shift(channel, shifts) for channel in scaled])
     weight = 1.0 / np.maximum(each.min(axis=1), 1e-6)
-    return weight @ each / weight.sum()
+    return cast(Array, weight @ each / weight.sum())
 
 
 def _valley(shifts: NDArray[np.int64], residual: Array) -> float | None:
@@ -312,4 +313,4 @@ def _coloured_power(slope: Array, residual: Array, share: float, bins: int = 24)
     if samples % 2 == 0:
         double[-1] = 1.0
     # Bins on harmonics are empty in the residual; the smoothed spectrum is lower by their share.
-    return np.sum(double * transfer * smooth, axis=1) / samples / (1.0 - share)
+    return cast(Array, np.sum(double * transfer * smooth, axis=1) / samples / (1.0 - share))

@@ -8,6 +8,8 @@ is nearly diagonal, so that a few conjugate-gradient iterations solve it.
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -44,10 +46,13 @@ class ChirpTransform:
         kernel[self._length - inputs + 1 :] = chirp[inputs - 1 : 0 : -1].conj()
         self._kernel = fft.fft(kernel)
 
-    def __call__(self, values: NDArray) -> ComplexArray:
+    def __call__(self, values: Array | ComplexArray) -> ComplexArray:
         """Transform along the last axis: ``(..., inputs)`` to ``(..., outputs)``."""
         spectrum = fft.fft(values * self._before, self._length, axis=-1)
-        return fft.ifft(spectrum * self._kernel, axis=-1)[..., : self.outputs] * self._after
+        return cast(
+            ComplexArray,
+            fft.ifft(spectrum * self._kernel, axis=-1)[..., : self.outputs] * self._after,
+        )
 
 
 class HarmonicBasis:
@@ -101,7 +106,7 @@ class HarmonicBasis:
     def _multiply(self, vector: ComplexArray) -> ComplexArray:
         length = self._gram.size
         product = fft.ifft(fft.fft(vector, length, axis=-1) * self._gram, axis=-1)
-        return product[..., : vector.shape[-1]]
+        return cast(ComplexArray, product[..., : vector.shape[-1]])
 
     def _solve(self, moments: ComplexArray) -> ComplexArray:
         """Conjugate gradients on the normal equations, several right-hand sides at once."""
@@ -158,4 +163,4 @@ def _toeplitz_spectrum(samples: int, step: float, highest: int) -> Array:
     circulant[0] = samples
     circulant[1 : 2 * highest + 1] = column
     circulant[length - 2 * highest :] = column[::-1]
-    return fft.fft(circulant).real
+    return cast(Array, fft.fft(circulant).real)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 
 import sympy as sp
@@ -18,7 +18,7 @@ import sympy as sp
 from bayesoleo.errors import ModelError
 
 
-class bspline(sp.Function):  # noqa: N801 - its name in expressions
+class bspline(sp.Function):  # type: ignore[misc] # noqa: N801 - its name in expressions
     r"""The cardinal cubic B-spline: a bump on -2 to 2, twice continuously differentiable.
 
     :math:`B(t) = \frac{1}{6}[(2 - |t|)_+^3 - 4 (1 - |t|)_+^3]` (de Boor 1978). Shifted by whole
@@ -43,7 +43,7 @@ class bspline(sp.Function):  # noqa: N801 - its name in expressions
         return rf"B\left({printer.doprint(self.args[0])}\right)"
 
 
-class bspline_slope(sp.Function):  # noqa: N801
+class bspline_slope(sp.Function):  # type: ignore[misc] # noqa: N801
     """First derivative of :class:`bspline`.
 
     A function of its own: written with powers of maxima it takes computer algebra minutes to see
@@ -150,14 +150,14 @@ def without_impulses(expression: sp.Expr) -> sp.Expr:
     return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
 
 
-class _RealModulus(sp.Function):
+class _RealModulus(sp.Function):  # type: ignore[misc] # SymPy has no types
     """Modulus of what is real, whatever SymPy knows of it."""
 
     def fdiff(self, argindex: int = 1) -> sp.Expr:
         return _RealSign(self.args[0])
 
 
-class _RealSign(sp.Function):
+class _RealSign(sp.Function):  # type: ignore[misc] # SymPy has no types
     """Sign of what is real, its impulse dropped."""
 
     def fdiff(self, argindex: int = 1) -> sp.Expr:
@@ -221,7 +221,7 @@ def parse(
     return built
 
 
-_OPERATORS = {
+_OPERATORS: dict[type[ast.operator], Callable[[sp.Expr, sp.Expr], sp.Expr]] = {
     ast.Add: lambda a, b: a + b,
     ast.Sub: lambda a, b: a - b,
     ast.Mult: lambda a, b: a * b,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
 
 
-class _Printer(PythonCodePrinter):
+class _Printer(PythonCodePrinter):  # type: ignore[misc] # SymPy has no types
     """Prints NumPy functions, which Numba compiles for scalars, and small powers as products."""
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
@@ -78,7 +79,7 @@ class _Printer(PythonCodePrinter):
         text = self._print(arguments[0])
         for argument in arguments[1:]:
             text = f"np.{name}({text}, {self._print(argument)})"
-        return text
+        return cast(str, text)
 
     def _print_Max(self, expr: sp.Max) -> str:
         return self._extremum("maximum", expr.args)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, log_ndtr, ndtri_exp
 
+from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
 
 #: chi-square quantile with one degree of freedom at 99 %: "theta +- delta at 99 %" means a variance
@@ -235,4 +236,4 @@ class TruncatedNormal:
         with np.errstate(divide="ignore"):  # the logarithm of zero is minus infinity, as it should
             logarithm = np.logaddexp(log_ndtr(low) + np.log1p(-part), log_ndtr(high) + np.log(part))
         drawn = self.centre + self.spread * sign * ndtri_exp(logarithm)
-        return np.clip(drawn, self.low, self.high)
+        return cast(Array, np.clip(drawn, self.low, self.high))

@@ -6,7 +6,7 @@ import sympy as sp
 from sympy.printing.str import StrPrinter
 
 
-class _Text(StrPrinter):
+class _Text(StrPrinter):  # type: ignore[misc] # SymPy has no types
     """Prints what :func:`bayesoleo.model.expressions.parse` reads."""
 
     def _print_Abs(self, expr: sp.Abs) -> str:

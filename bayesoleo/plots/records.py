@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -74,7 +75,7 @@ def _channel(
 
 
 def _limits(values: Array) -> tuple[float, float]:
-    low, high = style.np.nanmin(values), style.np.nanmax(values)
+    low, high = np.nanmin(values), np.nanmax(values)
     margin = 0.06 * (high - low) or 1.0
     return float(low - margin), float(high + margin)
 

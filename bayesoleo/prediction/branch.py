@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -237,7 +238,7 @@ class _Answers:
         y = np.zeros((1, len(derived.outputs), points))
         self.scheme.rows(point.x[None], lane, problem.step(self.steps), z)
         self.kernels.output(z, problem.inputs, p[None], lane, y)
-        return y[0, derived.outputs.index(name)]
+        return cast(Array, y[0, derived.outputs.index(name)])
 
 
 def collocation_scheme(name: str, orders: tuple[int, ...]) -> Collocation:

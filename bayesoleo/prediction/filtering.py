@@ -14,6 +14,7 @@ Shannon, C. E. (1949). Communication in the presence of noise. Proceedings of th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy import fft
@@ -87,7 +88,7 @@ def filtered(
     inside = _transformed(values, step, band, per_sample, exponent, first[0], last[0])
     backward = np.array([1.0, -1.0, 1.0])
     states = _joined(inside, first, step, per_sample)
-    return _joined(states[::-1] * backward, last, step, per_sample)[::-1] * backward
+    return cast(Array, _joined(states[::-1] * backward, last, step, per_sample)[::-1] * backward)
 
 
 def _end(values: Array, step: float, band: Band) -> Array:
@@ -133,7 +134,7 @@ def _reflected(values: Array, bend: float) -> Array:
     place, width = np.arange(1, values.size), values.size / 4.0
     even = bend * place**2 / (1.0 + (place / width) ** 2)
     fade = np.clip(2.0 * (1.0 - place / values.size), 0.0, 1.0)
-    return (2.0 * even - values[1:]) * np.sin(0.5 * np.pi * fade) ** 2
+    return cast(Array, (2.0 * even - values[1:]) * np.sin(0.5 * np.pi * fade) ** 2)
 
 
 def _joined(states: Array, spline: Array, step: float, per_sample: int) -> Array:

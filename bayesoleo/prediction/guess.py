@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 import sympy as sp
@@ -89,7 +90,7 @@ def _evaluate(
             columns.append(found[channel, order])
         else:
             columns.append(np.asarray(constants[channel]))
-    return np.zeros(phase.size) + np.asarray(function(*columns), dtype=float)
+    return cast(Array, np.zeros(phase.size) + np.asarray(function(*columns), dtype=float))
 
 
 @lru_cache(maxsize=256)

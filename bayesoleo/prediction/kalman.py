@@ -29,7 +29,7 @@ def process_noise() -> Array:
 
 
 @numba.njit(nogil=True, cache=True)
-def _advance(x, p, roughness, noise, ahead):
+def _advance(x: Array, p: Array, roughness: float, noise: Array, ahead: Array) -> None:
     """One step of the state ``x (3,)`` and its covariance ``p (3, 3)``, in place."""
     x[0] += x[1] + 0.5 * x[2]
     x[1] += x[2]
@@ -52,7 +52,7 @@ def _advance(x, p, roughness, noise, ahead):
 
 
 @numba.njit(nogil=True, cache=True)
-def _update(x, p, innovation, gain):
+def _update(x: Array, p: Array, innovation: float, gain: Array) -> float:
     """Take in one sample with unit noise; returns the innovation's variance."""
     variance = p[0, 0] + 1.0
     for i in range(3):
@@ -63,11 +63,13 @@ def _update(x, p, innovation, gain):
         for j in range(i, 3):
             p[i, j] -= gain[i] * gain[j] * variance
             p[j, i] = p[i, j]
-    return variance
+    return float(variance)
 
 
 @numba.njit(nogil=True, cache=True)
-def _filter(values, roughness, noise, kept, covariances, store):
+def _filter(
+    values: Array, roughness: float, noise: Array, kept: Array, covariances: Array, store: bool
+) -> tuple[float, float]:
     """Forward pass; returns the sum of squared innovations and of log variances after three."""
     x, p, ahead, gain = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     x[0] = values[0]
@@ -107,7 +109,7 @@ def smooth(values: Array, roughness: float) -> Array:
 
 
 @numba.njit(nogil=True, cache=True)
-def _backward(kept, covariances, roughness, noise):
+def _backward(kept: Array, covariances: Array, roughness: float, noise: Array) -> None:
     ahead, x = np.zeros((3, 3)), np.zeros(3)
     for n in range(kept.shape[0] - 2, -1, -1):
         x[:] = kept[n]
@@ -123,7 +125,7 @@ def _backward(kept, covariances, roughness, noise):
 
 
 @numba.njit(nogil=True, cache=True)
-def walk(steps):
+def walk(steps: Array) -> Array:
     """States of the process from its increments ``(N, 3)``, from zero."""
     states = np.zeros_like(steps)
     for n in range(1, steps.shape[0]):

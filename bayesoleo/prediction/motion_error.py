@@ -7,7 +7,7 @@ is asked for once, at the estimate.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -94,4 +94,4 @@ def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:
     y = np.empty((1, len(run.kernels.derived.outputs), position.size))
     with np.errstate(all="ignore"):
         run.kernels.output(z, run.sample_inputs, anchor.p[None], np.array([0]), y)
-    return y[0]
+    return cast(Array, y[0])

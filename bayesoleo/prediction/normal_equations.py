@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -81,7 +82,9 @@ class NormalEquations:
         """Changes of all unknowns ``(n, w)`` from those of states (scaled) and parameters."""
         columns, na = self.linear.steps.columns, self.run.segments.active
         total = columns[..., 0] + columns[..., 1 : 1 + na] @ change
-        return total + np.einsum("nwd,nd->nw", columns[..., 1 + na :], states * self.scale)
+        return cast(
+            Array, total + np.einsum("nwd,nd->nw", columns[..., 1 + na :], states * self.scale)
+        )
 
     def initial_sd(self, covariance: Array) -> Array:
         """Standard deviations ``(D,)`` of the first state, given those of the parameters."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from bayesoleo.prediction.guess import guess_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.simulate import RunPlan, record_of
-from bayesoleo.solvers.adaptive.refine import AdaptiveSolution, Motion, Start, solve_adaptive
+from bayesoleo.solvers.adaptive.refine import AdaptiveSolution, Start, solve_adaptive
 from bayesoleo.solvers.adaptive.stiffening import solve_stiffening
-from bayesoleo.solvers.adaptive.switched import PeriodicProblem, Switches
+from bayesoleo.solvers.adaptive.switched import Motion, PeriodicProblem, Switches
 from bayesoleo.solvers.orbit import Orbit
 
 
@@ -62,7 +63,7 @@ class PeriodicAnswer:
             raise InputError("no such dof", key=name, hint=f"there are {', '.join(derived.dofs)}")
         k = derived.dofs.index(name)
         first = sum(order + 1 for order in derived.orders[:k])
-        return self.solution.motion(phase)[first + derivative]
+        return cast(Array, self.solution.motion(phase)[first + derivative])
 
     def outputs(self, phase: Array) -> dict[str, Array]:
         """All outputs at phases in cycles, each of shape (N,); SI."""
@@ -194,7 +195,7 @@ def _in_pieces(model: Model, compiled: Kernels, backend: str) -> tuple[Kernels, 
         y = np.empty((1, len(derived.outputs), z.shape[1]))
         with np.errstate(all="ignore"):
             chosen.output(z[None], u, p[None], lane, y)
-        return y[0]
+        return cast(Array, y[0])
 
     def slopes(z: Array, u: Array, p: Array) -> Array:
         count = len(derived.outputs)
@@ -202,7 +203,7 @@ def _in_pieces(model: Model, compiled: Kernels, backend: str) -> tuple[Kernels, 
         yp = np.empty((1, count, len(derived.active), z.shape[1]))
         with np.errstate(all="ignore"):
             chosen.output_jacobian(z[None], u, p[None], lane, yz, yp)
-        return yz[0]
+        return cast(Array, yz[0])
 
     return chosen, Switches(values, slopes, tuple(derived.inputs.index((m, 0)) for m in modes))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -224,7 +225,7 @@ def _first_steps(record: Record) -> int:
     """Equal steps to begin with: a few for each harmonic of the inputs, a power of two."""
     highest = max((int(h.orders.max(initial=1)) for h in record.harmonics.values()), default=1)
     wanted = max(FEWEST_STEPS, STEPS_PER_HARMONIC * highest)
-    return min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted))))
+    return int(min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted)))))
 
 
 def _lanes(model: Model, values: Mapping[str, ArrayLike]) -> list[dict[str, float]]:
@@ -452,6 +453,6 @@ def _sampled(run: RunPredictor, x: Array, single: bool) -> Rows:
 
     def rows(phase: Array) -> Array:
         found = scheme.sample(x[None], scheme.plan(phase, n), step)[0]
-        return found[:, 0] if single else found
+        return cast(Array, found[:, 0] if single else found)
 
     return rows

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,7 +153,7 @@ class Record:
     @property
     def phase(self) -> Array:
         """Phase of every sample in cycles since the first one, shape (N,)."""
-        return self.frequency * (self.time - self.time[0])
+        return cast(Array, self.frequency * (self.time - self.time[0]))
 
     @property
     def periodic(self) -> bool:
@@ -180,4 +180,4 @@ class Record:
     @property
     def position(self) -> Array:
         """Every sample's place in spans since the first one, shape (N,): the phase, if periodic."""
-        return self.rate * (self.time - self.time[0])
+        return cast(Array, self.rate * (self.time - self.time[0]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -297,7 +297,7 @@ class RunPredictor:
         if left.any():
             with _COUNTING:
                 self.jumps += int(left.sum())
-        return left
+        return cast(NDArray[np.bool_], left)
 
     def evaluate(self, p: Array) -> Samples:
         """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it.

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import sympy as sp
@@ -141,7 +142,7 @@ class SegmentedRun:
         method, steps = self.segments.scheme, self.segments.steps
         times = (np.arange(steps) / steps, method.phases(steps))
         nodes, points = (self._guess(self._phase(part), p) for part in times)
-        return method.from_motion(nodes[None], points[None])[0]
+        return cast(Array, method.from_motion(nodes[None], points[None])[0])
 
     def _guess(self, phase: Array, p: Array) -> Array:
         derived, rows = self.kernels.derived, []
@@ -174,7 +175,7 @@ class SegmentedRun:
             self.segments.sample(x[..., None], self.segments.plan(phase * self.segments.duration))
             for phase in times
         )
-        return method.from_motion(nodes[None, :, 0], points[None, :, 0])[0]
+        return cast(Array, method.from_motion(nodes[None, :, 0], points[None, :, 0])[0])
 
     # -- prediction ---------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.compiled import BLOCK, BlockKernel, pointer
 from bayesoleo.model.derive import Derived
 from bayesoleo.model.kernels import Kernels
@@ -126,7 +126,7 @@ def squared_distances(measured: Array, y: Array) -> Array:
 
 
 @jit
-def _distances(measured, y, sums):
+def _distances(measured: Array, y: Array, sums: Array) -> None:
     for lane in range(y.shape[0]):
         for k in range(y.shape[1]):
             error = measured[k] - y[lane, k]
@@ -154,9 +154,10 @@ def _places(plan: SamplePlan, order: NDArray[np.int64]) -> Places:
 
 @jit
 def _compare(
-    output, admissible, conditions, order, inputs, places, orders, needed,
-    measured, x, p, step, lanes, sums, inside, defined,
-):  # fmt: skip
+    output: Any, admissible: Any, conditions: int, order: Integers, inputs: Array, places: Places,
+    orders: Integers, needed: Flags, measured: Array, x: Array, p: Array, step: float,
+    lanes: Integers, sums: Array, inside: Flags, defined: Flags,
+) -> None:  # fmt: skip
     """Block by block, and in each lane by lane: all but the solutions stays in the cache.
 
     Squares are added point by point, and the points of a block only at the end: in an order that

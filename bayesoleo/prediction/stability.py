@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers.orbit import floquet_multipliers
 
 __all__ = ["Stability", "count_unstable"]
@@ -40,7 +40,9 @@ NEAR = -0.9
 
 
 @numba.njit(nogil=True, cache=True)
-def jumps(x0, x_p, swing, nodes, change, x, found):
+def jumps(
+    x0: Array, x_p: Array, swing: Array, nodes: Integers, change: Array, x: Array, found: Flags
+) -> None:
     """Lane by lane, whether solutions ``x (L, n, w)`` are off their prediction by more than it
     moved and more than a part of the swing ``(D,)``; ``x0 (n, w)`` and ``x_p (na, n, w)`` predict.
     """

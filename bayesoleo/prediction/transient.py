@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import Kernels
+from bayesoleo.prediction.anchor import Anchor
 from bayesoleo.prediction.guess import Motion
 from bayesoleo.prediction.inputs import RowCache, highest_derivatives, input_rows, signal_of
 from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.run import Anchor, RunPredictor, Samples
+from bayesoleo.prediction.run import RunPredictor, Samples
 from bayesoleo.prediction.start import InitialState
 from bayesoleo.solvers.periodic.solve import Boundary, Solution
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
@@ -267,7 +268,7 @@ class TransientRun(RunPredictor):
     def _integrated(self, states: Motion, p: Array) -> Motion:
         def rows(position: Array) -> Array:
             time = position * self.period
-            return self.space.complete(time, states(time)[None], p[None])[0][0]
+            return cast(Array, self.space.complete(time, states(time)[None], p[None])[0][0])
 
         return rows
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -20,7 +21,7 @@ from bayesoleo.machines import connected, each_done
 from bayesoleo.storage.atomic import replacing
 from bayesoleo.storage.lock import only_writer
 
-Arrays = dict[str, NDArray]
+Arrays = dict[str, NDArray[Any]]
 _FINGERPRINT = "fingerprint"
 
 
@@ -73,7 +74,7 @@ class Slots:
             )
         return arrays
 
-    def write(self, number: int, arrays: Mapping[str, NDArray]) -> None:
+    def write(self, number: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep a piece, as a whole or not at all.
 
         Raises

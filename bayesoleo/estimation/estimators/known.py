@@ -10,6 +10,7 @@ covariance is :math:`(J'WJ)^{-1} + S \Sigma S'` with the tolerances' covariance 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,4 +123,4 @@ def _shift(
     prior = scaled_root([problem.priors[k] for k in own], unit[own])
     weighted = np.vstack((rows[:, own], prior))
     target = np.vstack((rows[:, held], np.zeros((len(own), len(held)))))
-    return -unit[own, None] * least_squares(weighted, target) / unit[held]
+    return cast(Array, -unit[own, None] * least_squares(weighted, target) / unit[held])

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def _differences(
         columns.append((ends[0] - ends[1]) / (2 * step[k]))
     matrix = np.array(columns)
     # next to where the model ends there is no second derivative to be had: Gauss and Newton's
-    return np.nan_to_num(0.5 * (matrix + matrix.T), nan=0.0, posinf=0.0, neginf=0.0)
+    return cast(Array, np.nan_to_num(0.5 * (matrix + matrix.T), nan=0.0, posinf=0.0, neginf=0.0))
 
 
 def _slope(problem: Problem, scale: PriorScale, theta: Array, weighted: Sequence[Array]) -> Array:

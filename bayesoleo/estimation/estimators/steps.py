@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -134,7 +134,9 @@ class ModifiedMinimumVarianceStep(PriorStep):
     def rows(self, state: Array, jacobian: Array) -> Array:
         # S = L L' gives S^-1 = P'P with P = L^-1
         identity = np.eye(state.shape[1])
-        return solve_triangular(cholesky(state[0] + state[1], lower=True), identity, lower=True)
+        return cast(
+            Array, solve_triangular(cholesky(state[0] + state[1], lower=True), identity, lower=True)
+        )
 
     def accept(self, state: Array, jacobian: Array, ratio: float, taken: Array) -> Array:
         triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")

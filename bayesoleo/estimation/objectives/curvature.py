@@ -6,6 +6,7 @@ Everything is about ``phi = (theta, v)``: parameters first, then the error varia
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
@@ -114,7 +115,7 @@ def prior_precision(priors: Sequence[Prior], theta: Array) -> Array:
     for k, (prior, value) in enumerate(zip(priors, theta, strict=True)):
         if not isinstance(prior, Correlated):
             precision[k, k] = _precision(prior, float(value))
-    return precision
+    return cast(Array, precision)
 
 
 def inverse_scaled(matrix: Array) -> Array:
@@ -124,7 +125,7 @@ def inverse_scaled(matrix: Array) -> Array:
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     if values.size == 0 or np.abs(values).min() <= 1e-14 * np.abs(values).max():
         return np.full_like(matrix, np.nan)
-    return (vectors / values) @ vectors.T / np.outer(scale, scale)
+    return cast(Array, (vectors / values) @ vectors.T / np.outer(scale, scale))
 
 
 def _gram(evaluation: Evaluation, variance: Array) -> Array:
@@ -149,7 +150,7 @@ def _second(problem: Problem, theta: Array, variance: Array, here: Evaluation) -
         columns.append((behind - ahead) / (2 * step))
     problem.evaluate(theta)  # a campaign's solver starts the next solution from the last one
     matrix = np.array(columns)
-    return 0.5 * (matrix + matrix.T)
+    return cast(Array, 0.5 * (matrix + matrix.T))
 
 
 def _precision(prior: Prior, value: float) -> float:

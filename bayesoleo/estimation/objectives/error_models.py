@@ -15,6 +15,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +141,7 @@ class FullErrors(ErrorModel):
             staged_variance(np.diag(moments), counts, unknowns, bias_corrected=bias_corrected)
         )
         degrees = counts[0] - unknowns / len(counts) if bias_corrected else counts[0]
-        return moments / degrees + _RIDGE * floor
+        return cast(Array, moments / degrees + _RIDGE * floor)
 
     def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
         determinant = np.linalg.slogdet(covariance)[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class Held:
     @property
     def start(self) -> Array:
         """Where an estimate starts, in the free unknowns."""
-        return self.full_start[self.free]
+        return cast(Array, self.full_start[self.free])
 
     @property
     def outputs(self) -> tuple[str, ...]:

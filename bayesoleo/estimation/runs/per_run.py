@@ -8,6 +8,7 @@ uncertainty, or follows frequency or position, is the trace of physics that the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -164,7 +165,7 @@ def _about(name: str, unit: str) -> dict[str, str]:
     return {schema.LONG_NAME: name, schema.UNITS: unit}
 
 
-def _residual_variables(residuals: Sequence[Residuals]) -> dict[str, tuple]:
+def _residual_variables(residuals: Sequence[Residuals]) -> dict[str, tuple[Any, ...]]:
     dims, unit = (schema.RUN, schema.OUTPUT), "SI unit of each output"
 
     def each(function: Callable[[Array], float]) -> Array:

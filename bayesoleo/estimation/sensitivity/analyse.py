@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 import xarray as xr
@@ -220,16 +220,16 @@ def quantile(prior: Prior, part: ArrayLike) -> Array:
     """Value below which a part of the prior lies, any shape."""
     u = np.asarray(part, dtype=float)
     if isinstance(prior, Normal):
-        return stats.norm.ppf(u, prior.centre, prior.spread)
+        return cast(Array, stats.norm.ppf(u, prior.centre, prior.spread))
     if isinstance(prior, Uniform):
         return prior.low + (prior.high - prior.low) * u
     if isinstance(prior, LogNormal):
-        return prior.median * np.exp(prior.log_spread * stats.norm.ppf(u))
+        return cast(Array, prior.median * np.exp(prior.log_spread * stats.norm.ppf(u)))
     if isinstance(prior, TruncatedNormal):
         ends = ((end - prior.centre) / prior.spread for end in (prior.low, prior.high))
-        return stats.truncnorm.ppf(u, *ends, loc=prior.centre, scale=prior.spread)
+        return cast(Array, stats.truncnorm.ppf(u, *ends, loc=prior.centre, scale=prior.spread))
     # A prior of one's own has draws at least.
-    return np.quantile(prior.sample(np.random.default_rng(0), _DRAWS), u)
+    return cast(Array, np.quantile(prior.sample(np.random.default_rng(0), _DRAWS), u))
 
 
 def _quantiles(priors: Sequence[Prior], uniform: Array) -> Array:

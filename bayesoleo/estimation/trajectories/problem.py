@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,10 @@ class ShootingProblem:
 
     def between_intervals(self, r: int) -> NDArray[np.bool_]:
         """Which of a run's inner nodes are shooting nodes, shape (n - 1,)."""
-        return np.arange(1, self.runs[r].segments.steps) % self.steps_per_interval[r] == 0
+        return cast(
+            NDArray[np.bool_],
+            np.arange(1, self.runs[r].segments.steps) % self.steps_per_interval[r] == 0,
+        )
 
     def sums(self, theta: Array, x: Sequence[Array]) -> Array:
         """Sums of squared residuals of each output, shape (s,)."""

@@ -8,6 +8,7 @@ a product of parameters does, which rays from the estimate would leave at the fi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,9 @@ class Plane:
         half = np.sqrt(2 * epsilon / np.maximum(values, _LEAST_CURVATURE))
         turn = 2 * np.pi * np.arange(points) / points
         circle = np.stack((np.cos(turn), np.sin(turn)))
-        return self.centre + (self.spread[:, None] * (vectors @ (half[:, None] * circle))).T
+        return cast(
+            Array, self.centre + (self.spread[:, None] * (vectors @ (half[:, None] * circle))).T
+        )
 
     def half_widths(self, epsilon: float) -> Array:
         """How far the ellipse reaches in either parameter, shape (2,)."""
@@ -170,7 +173,7 @@ class Plane:
             theta[:, second] += sign * radius * expected[index]
             return (self._falls(theta) - fall[index]) / rest[index]
 
-        return first_crossing(climb, len(floor), 1.0) * expected
+        return cast(Array, first_crossing(climb, len(floor), 1.0) * expected)
 
     def _falls(self, theta: Array) -> Array:
         """Fall at points of the plane; the other parameters start from where they stand."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,7 +261,7 @@ class CampaignSource:
     def _outputs(self, r: int, rng: np.random.Generator) -> Array:
         """New samples of one run, shape (s, n)."""
         y = self.truth[r].y
-        return y + self.sd[r][:, None] * rng.standard_normal(y.shape)
+        return cast(Array, y + self.sd[r][:, None] * rng.standard_normal(y.shape))
 
     def draw(self, rng: np.random.Generator) -> Problem:
         old = self.problem.predictor

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,12 +71,12 @@ class Replications:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """Which estimates converged, shape (R,)."""
-        return self.status == Status.CONVERGED
+        return cast(NDArray[np.bool_], self.status == Status.CONVERGED)
 
     @property
     def sd(self) -> Array:
         """Linearised standard deviations, shape (R, l)."""
-        return np.sqrt(np.einsum("rkk->rk", self.covariance))
+        return cast(Array, np.sqrt(np.einsum("rkk->rk", self.covariance)))
 
     def __getitem__(self, name: str) -> Array:
         """Estimates of one unknown, shape (R,)."""
@@ -85,7 +86,7 @@ class Replications:
 def estimate_many(
     problem: BatchProblem,
     data_sets: ArrayLike | Sequence[ArrayLike],
-    method: str | Step = "mbe",
+    method: str | Step[Any] = "mbe",
     *,
     start: ArrayLike | None = None,
     tolerance: float = 1e-6,

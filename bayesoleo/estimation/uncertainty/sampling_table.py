@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -61,7 +63,7 @@ def moments(found: Array, truth: Array, expected: Array, bound: Array) -> dict[s
     return {name: _variable(*item) for name, item in table.items()}
 
 
-def _variable(dims: tuple[str, ...], values: NDArray, name: str, unit: str) -> xr.Variable:
+def _variable(dims: tuple[str, ...], values: NDArray[Any], name: str, unit: str) -> xr.Variable:
     return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,7 @@ class Walk:
     """The iteration of one batch."""
 
     problem: BatchProblem
-    step: Step
+    step: Step[Any]
     scale: PriorScale
     tolerance: float
     max_iterations: int
@@ -127,7 +128,7 @@ class Walk:
         """``A`` in scaled unknowns, shape (L, l, l)."""
         unit = self.scale.unit(theta)
         gram = np.einsum("lbjk,lb->ljk", equations.gram, 1 / variance)
-        return gram * unit[:, :, None] * unit[:, None, :]
+        return cast(Array, gram * unit[:, :, None] * unit[:, None, :])
 
     def _proposal(
         self, theta: Array, equations: NormalEquations, variance: Array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
@@ -63,12 +64,12 @@ class Mixture:
     @property
     def dimension(self) -> int:
         """Number of coordinates."""
-        return self.centres.shape[1]
+        return int(self.centres.shape[1])
 
     @cached_property
     def weights(self) -> Array:
         """Normalised weights, shape (K,)."""
-        return np.exp(self.log_weights - logsumexp(self.log_weights))
+        return cast(Array, np.exp(self.log_weights - logsumexp(self.log_weights)))
 
     @cached_property
     def _factors(self) -> Array:
@@ -92,7 +93,7 @@ class Mixture:
         constant = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * np.log(nu * np.pi)
         kernel = -0.5 * (nu + d) * np.log1p(self.distances(phi) / nu)
         with np.errstate(divide="ignore"):
-            return np.log(self.weights) + constant - log_det + kernel
+            return cast(Array, np.log(self.weights) + constant - log_det + kernel)
 
     def log_density(self, phi: Array) -> Array:
         """Normalised log density, shape (W,), at rows of shape (W, d).
@@ -101,7 +102,7 @@ class Mixture:
         ----------
         Kotz and Nadarajah (2004), *Multivariate t Distributions*, eq. 1.1.
         """
-        return logsumexp(self.log_components(phi), axis=1)
+        return cast(Array, logsumexp(self.log_components(phi), axis=1))
 
     def sample(self, random: np.random.Generator | np.random.RandomState, size: int) -> Array:
         """Independent draws, shape (size, d)."""
@@ -112,7 +113,7 @@ class Mixture:
         stretch = np.sqrt(degrees / random.chisquare(degrees))
         # einsum over each row's own factor: no product whose rounding depends on the other rows
         steps = np.einsum("wij,wj->wi", self._factors[picks], normal)
-        return self.centres[picks] + stretch[:, None] * steps
+        return cast(Array, self.centres[picks] + stretch[:, None] * steps)
 
     def defended(self) -> Mixture:
         """Each component almost normal, with a lighter one of heavy tails about it.

@@ -41,6 +41,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -325,7 +326,7 @@ class HierarchicalUnknowns(Unknowns):
             own, (first, second) = u[population.members], self._places(k)
             natural[first] = population.transform.natural(np.array([own.mean()]))[0]
             natural[second] = max(float(own.std(ddof=1)), _LEAST_SPREAD * population.scale)
-        return self.coordinates(natural[None])[0]
+        return cast(Array, self.coordinates(natural[None])[0])
 
     def jacobian(self, block: Array) -> Array:
         steps = _STEP * np.eye(len(block))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import cast
 
 import numpy as np
 from scipy.special import expit
@@ -66,7 +67,7 @@ class Transform:
                 case Shape.BELOW:
                     return self.high - np.exp(u)
                 case Shape.BETWEEN:
-                    return self.low + (self.high - self.low) * expit(u)
+                    return cast(Array, self.low + (self.high - self.low) * expit(u))
 
     def unbounded(self, value: Array) -> Array:
         """Coordinate of a parameter; infinite or NaN on and outside the bounds."""
@@ -90,7 +91,10 @@ class Transform:
             case Shape.ABOVE | Shape.BELOW:
                 return np.array(u, dtype=float)
             case Shape.BETWEEN:
-                return np.log(self.high - self.low) - np.logaddexp(0.0, u) - np.logaddexp(0.0, -u)
+                return cast(
+                    Array,
+                    np.log(self.high - self.low) - np.logaddexp(0.0, u) - np.logaddexp(0.0, -u),
+                )
 
     def derivative(self, u: Array) -> Array:
         """Derivative of the parameter with respect to the coordinate, with its sign; same shape."""

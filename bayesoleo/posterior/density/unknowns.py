@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -110,7 +111,7 @@ class PlainUnknowns(Unknowns):
         return sample_of(self.priors, rng, size)
 
     def start(self, theta: Array) -> Array:
-        return self.transforms.unbounded(np.asarray(theta, dtype=float)[None])[0]
+        return cast(Array, self.transforms.unbounded(np.asarray(theta, dtype=float)[None])[0])
 
     def jacobian(self, block: Array) -> Array:
         return np.diag(self.transforms.derivative(block[None])[0])

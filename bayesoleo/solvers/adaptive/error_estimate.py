@@ -17,6 +17,7 @@ Ordinary Differential Equations, SIAM, section 9.3 (defects and halved meshes).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +148,9 @@ def estimate_error(
 def _unknowns(boundary: Boundary, method: Tableau, mesh: Mesh, motion: Motion) -> Array:
     """Unknowns of the scheme, shape (n, w), for a motion: at a kink, from the side of the step."""
     inside = mesh.points(np.minimum(method.c, 1.0 - ONE_SIDE))
-    return boundary.scheme.from_motion(motion(mesh.edges[:-1])[None], motion(inside)[None])[0]
+    return cast(
+        Array, boundary.scheme.from_motion(motion(mesh.edges[:-1])[None], motion(inside)[None])[0]
+    )
 
 
 def _apart(mesh: Mesh) -> Mesh:

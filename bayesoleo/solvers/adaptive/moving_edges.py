@@ -9,6 +9,7 @@ trial motion changes the equations, and every step keeps the order of the method
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def solve_on(
 def unknowns(boundary: Boundary, mesh: Mesh, start: Motion) -> Array:
     """The scheme's unknowns, shape (n, w), that represent a motion."""
     nodes, points = start(mesh.edges[:-1]), start(boundary.scheme.phases(mesh.steps))
-    return boundary.scheme.from_motion(nodes[None], points[None])[0]
+    return cast(Array, boundary.scheme.from_motion(nodes[None], points[None])[0])
 
 
 MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 40, 12

@@ -16,6 +16,7 @@ Verbeek (1993), section 4.3.1, recommends error-controlled meshes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -109,13 +110,13 @@ class AdaptiveSolution:
         """
         zero = np.zeros(1, dtype=np.int64)
         found = Solution(self.level.x[None], zero, zero)
-        return sensitivities(self.level.boundary, self.p[None], found)[1][0]
+        return cast(Array, sensitivities(self.level.boundary, self.p[None], found)[1][0])
 
     def motion_by_parameter(self, phase: Array) -> Array:
         """Derivatives of :meth:`motion` by the active parameters, shape (nz, na, N)."""
         n = self.level.x.shape[0]
         plan, step = self.level.scheme.plan(phase, n), self.level.boundary.step(n)
-        return self.level.scheme.sample(self.sensitivities()[None], plan, step)[0]
+        return cast(Array, self.level.scheme.sample(self.sensitivities()[None], plan, step)[0])
 
 
 def solve_adaptive(

@@ -9,11 +9,10 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.refine import (
     AdaptiveSolution,
-    Motion,
-    PeriodicProblem,
     Start,
     solve_adaptive,
 )
+from bayesoleo.solvers.adaptive.switched import Motion, PeriodicProblem
 from bayesoleo.solvers.adaptive.warp import SAME, extrapolate
 from bayesoleo.solvers.status import Status
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,7 @@ class _Switching:
 
     @property
     def admissible(self) -> Callable[..., Any]:
-        return self.equations.admissible
+        return cast(Callable[..., Any], self.equations.admissible)
 
 
 def switched(switches: Switches, z: Array, u: Array, p: Array) -> Array:
@@ -192,7 +192,7 @@ class Level:
         n, size = self.mesh.steps, self.scheme.state_size + len(self.scheme.orders)
         z = np.empty((1, size, n * self.scheme.method.stages))
         self.scheme.rows(self.x[None], np.array([0]), self.boundary.step(n), z)
-        return z[0]
+        return cast(Array, z[0])
 
     def gaps(self) -> Array:
         """From each step's end to the state at the next node, shape (D, n)."""

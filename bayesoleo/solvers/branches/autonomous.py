@@ -11,6 +11,7 @@ Seydel, R. (2010). Practical Bifurcation and Stability Analysis, 3rd ed., sectio
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -164,4 +165,4 @@ def _period_theta(family: Family, solution: BorderedSolution, condition: Conditi
         [[np.eye(D) - solution.monodromy, -solution.by_value[:, None]], [condition.row[None]]]
     )
     right = np.concatenate([end_states(problem, dx[0]), np.zeros((1, problem.active))])
-    return np.linalg.solve(border, right)[D]
+    return cast(Array, np.linalg.solve(border, right)[D])

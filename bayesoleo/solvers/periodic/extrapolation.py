@@ -53,7 +53,7 @@ class Extrapolation:
 
 
 @jit
-def _extrapolate(x, x_p, change, start):
+def _extrapolate(x: Array, x_p: Array, change: Array, start: Array) -> None:
     """Lane by lane: the order of summation of a matrix product would vary with the batch."""
     for lane in range(change.shape[0]):
         for i in range(x.size):

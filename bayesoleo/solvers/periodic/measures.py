@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers.schemes.elimination import jit
 
 
 @jit
-def total(row):
+def total(row: Array) -> float:
     """Sum in eight interleaved partial sums: in fixed order, without waiting for each addition."""
     a = b = c = d = e = f = g = h = 0.0
     whole = row.size - row.size % 8
@@ -32,7 +33,7 @@ def total(row):
 
 
 @jit
-def measure(z, g, gz, lanes, squares, terms):
+def measure(z: Array, g: Array, gz: Array, lanes: Integers, squares: Array, terms: Array) -> None:
     """Mean squares of residuals and of terms, both ``(L, d)``; not finite where anything is not."""
     d, nz, points = gz.shape[1:]
     row = np.empty(points)
@@ -49,7 +50,7 @@ def measure(z, g, gz, lanes, squares, terms):
 
 
 @jit
-def positive(a, lanes, inside, defined):
+def positive(a: Array, lanes: Integers, inside: Flags, defined: Flags) -> None:
     """Whether no condition ``a (L, nc, N)`` is broken; whether all are numbers: both (L,)."""
     for lane in lanes:
         outside = odd = 0
@@ -67,7 +68,7 @@ LEAST_MOTION = 1e-6
 
 
 @jit
-def unit(motion, level, change):
+def unit(motion: float, level: float, change: float) -> float:
     """What a change of a state is small against: its motion about a level, not the level itself.
 
     A preload or an ambient temperature says nothing of how far a solution is from its own motion.
@@ -77,7 +78,9 @@ def unit(motion, level, change):
 
 
 @jit
-def step_size(x, dx, lanes, state_size, size, least):
+def step_size(
+    x: Array, dx: Array, lanes: Integers, state_size: int, size: Array, least: Array
+) -> None:
     """Largest change of a state over its :func:`unit`, and over its largest value, both of shape
     (L,); NaN where one is not finite."""
     n, w = x.shape[1:]
@@ -98,7 +101,7 @@ def step_size(x, dx, lanes, state_size, size, least):
 
 
 @jit
-def take(base, dx, lanes, fractions, x):
+def take(base: Array, dx: Array, lanes: Integers, fractions: Array, x: Array) -> None:
     """``x = base + fraction * dx`` in the chosen lanes."""
     n, w = x.shape[1:]
     for k in range(lanes.size):
@@ -109,7 +112,7 @@ def take(base, dx, lanes, fractions, x):
 
 
 @jit
-def keep(source, lanes, target):
+def keep(source: Array, lanes: Integers, target: Array) -> None:
     """Copy the chosen lanes."""
     n, w = source.shape[1:]
     for lane in lanes:

@@ -4,10 +4,14 @@ lane needs in the processor's cache, and last steps with old derivatives.
 
 from __future__ import annotations
 
-import numpy as np
-from numba import carray
+from typing import Any
 
+import numpy as np
+from numba import carray  # type: ignore[attr-defined] # not in its __all__
+
+from bayesoleo._types import Array, Integers
 from bayesoleo.compiled import pointer
+from bayesoleo.solvers.periodic.arrangement import Line, Options, Pieces, Sizes, Sweep, Work
 from bayesoleo.solvers.periodic.measures import unit
 from bayesoleo.solvers.periodic.recursion import (
     CONVERGED,
@@ -48,7 +52,10 @@ WITHOUT_SIGN = np.int64(2**63 - 1)
 
 
 @jit
-def solve_lanes(pieces, sizes, sweep, work, options, p, x, line, status, iterations):
+def solve_lanes(
+    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options, p: Array, x: Array,
+    line: Line, status: Integers, iterations: Integers,
+) -> None:  # fmt: skip
     """Newton's method for every lane of ``x (L, n, w)``, in place; see ``solve``."""
     now = work.now
     for lane in range(x.shape[0]):
@@ -66,7 +73,7 @@ def solve_lanes(pieces, sizes, sweep, work, options, p, x, line, status, iterati
 
 
 @jit
-def _in_order(sizes, sweep, now, x):
+def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
     """Copy a solution, step by step and unknown by unknown."""
     unknowns, row = sizes.unknowns, now.shape[1]
     x, swept = carray(x, (sizes.steps * unknowns,)), carray(pointer(now, 0), (now.size,))
@@ -81,7 +88,7 @@ def _in_order(sizes, sweep, now, x):
 
 
 @jit
-def _extrapolate(line, lane, now):
+def _extrapolate(line: Line, lane: int, now: Array) -> None:
     """``now = base + slopes change``, two slopes at a time."""
     size, count = now.size, line.change.shape[1]
     to, base = carray(pointer(now, 0), (size,)), carray(pointer(line.base, 0), (size,))
@@ -100,7 +107,9 @@ def _extrapolate(line, lane, now):
 
 
 @jit
-def _iterate(pieces, sizes, sweep, work, options):
+def _iterate(
+    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options
+) -> tuple[int, int]:
     """Newton's method from ``work.now``; returns how it ended and the number of steps."""
     outcome, iteration = evaluate(pieces, sizes, sweep, work), 0
     last, chords = np.inf, True
@@ -135,7 +144,9 @@ def _iterate(pieces, sizes, sweep, work, options):
 
 
 @jit
-def _chords(pieces, sizes, sweep, work, options, size):
+def _chords(
+    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
+) -> tuple[int, float]:
     """Take the step, and further ones with the same derivatives and closure.
 
     Returns their number and the last one's size: zero where they converged, infinite where they did
@@ -161,7 +172,7 @@ def _chords(pieces, sizes, sweep, work, options, size):
 
 
 @jit
-def _chord_suffices(size, last):
+def _chord_suffices(size: float, last: float) -> bool:
     """Whether one more step with these derivatives leaves round-off, if Newton's error is squared:
     ``k size**2`` with ``k = size / last**2``, which old derivatives contract by ``2 k size``.
     """
@@ -170,7 +181,9 @@ def _chord_suffices(size, last):
 
 
 @jit
-def _advance(pieces, sizes, sweep, work, monotone, size):
+def _advance(
+    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
+) -> tuple[int, float, float]:
     """Take the step, halved while it is inadmissible or does not reduce the residual; returns how
     that ended, the fraction taken and the residual's size after it."""
     keep(work.now, work.base)
@@ -193,7 +206,7 @@ def _advance(pieces, sizes, sweep, work, monotone, size):
 
 
 @jit
-def _step(pieces, sizes, sweep, work, initial):
+def _step(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
     """The Newton step at all positions, from the recursion of the last evaluation."""
     outcome = CONVERGED if initial else close(pieces, sizes, work)
     if outcome == CONVERGED:
@@ -203,7 +216,7 @@ def _step(pieces, sizes, sweep, work, initial):
 
 
 @jit
-def _size(x, dx, begin, measured, scratch):
+def _size(x: Array, dx: Array, begin: int, measured: int, scratch: Array) -> tuple[float, float]:
     """Largest change of a state, over what :func:`unit` says; not finite where one is not.
 
     Also over its largest value, which digits are lost against.
@@ -224,7 +237,7 @@ def _size(x, dx, begin, measured, scratch):
 
 
 @jit
-def _largest(values, count, level, scratch):
+def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
     """Largest distance from a level, not a number where one is not.
 
     Without their sign, floating-point numbers are ordered as the integers with their bits, and what
@@ -238,11 +251,11 @@ def _largest(values, count, level, scratch):
         magnitude = bits[i] & WITHOUT_SIGN
         largest = magnitude if magnitude > largest else largest
     bits[0] = largest
-    return scratch[0]
+    return float(scratch[0])
 
 
 @jit
-def _reduces(before, after, d):
+def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
     """Whether the residual fell, in units of the equations' terms, and its size in its own.
 
     It falls in the larger of the terms before and after: terms before alone would be nothing for an

@@ -6,10 +6,14 @@ Models and schemes come as compiled pieces of fixed signature (``bayesoleo.compi
 
 from __future__ import annotations
 
-import numpy as np
-from numba import carray
+from typing import Any
 
+import numpy as np
+from numba import carray  # type: ignore[attr-defined] # not in its __all__
+
+from bayesoleo._types import Array, Integers
 from bayesoleo.compiled import BLOCK, after, call_kernel, caller, pointer
+from bayesoleo.solvers.periodic.arrangement import Pieces, Sizes, Sweep, Work
 from bayesoleo.solvers.periodic.measures import total
 from bayesoleo.solvers.schemes.closure import LARGEST_GROWTH, close_balanced
 from bayesoleo.solvers.schemes.closure import close as solve_closure
@@ -35,12 +39,12 @@ _call_update = caller(SIGNATURES["update"])
 
 
 @jit
-def keep(source, target):
+def keep(source: Array, target: Array) -> None:
     _copy(pointer(source, 0), pointer(target, 0), source.size)
 
 
 @jit
-def _copy(source, target, count):
+def _copy(source: Any, target: Any, count: int) -> None:
     """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
     count references; and indices that may be negative allow no vector instructions."""
     source, target = carray(source, (count,)), carray(target, (count,))
@@ -49,7 +53,7 @@ def _copy(source, target, count):
 
 
 @jit
-def take(base, dx, fraction, now):
+def take(base: Array, dx: Array, fraction: float, now: Array) -> None:
     """``now = base + fraction dx``, two different arrays."""
     size = now.size
     to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
@@ -59,7 +63,7 @@ def take(base, dx, fraction, now):
 
 
 @jit
-def move(now, dx):
+def move(now: Array, dx: Array) -> None:
     """``now += dx``. In :func:`take` they would overlap, which forbids vector instructions."""
     size = now.size
     to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
@@ -68,7 +72,7 @@ def move(now, dx):
 
 
 @jit
-def evaluate(pieces, sizes, sweep, work):
+def evaluate(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work) -> int:
     """Equations at the present unknowns, and the recursion that solves them linearised."""
     steps, stages = sizes.block, sizes.stages
     reach = steps + (sizes.front + 1) * WIDTH
@@ -105,7 +109,7 @@ def evaluate(pieces, sizes, sweep, work):
 
 
 @jit
-def evaluate_again(pieces, sizes, sweep, work):
+def evaluate_again(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
     """Equations alone at the present unknowns, solved with the last derivatives; whether the
     unknowns are admissible."""
     steps, stages = sizes.block, sizes.stages
@@ -131,14 +135,14 @@ def evaluate_again(pieces, sizes, sweep, work):
 
 
 @jit
-def _gather(now, row, x, unknowns, reach):
+def _gather(now: Any, row: int, x: Any, unknowns: int, reach: int) -> None:
     """Copy a block's unknowns, and those before it that its steps reach."""
     for k in range(unknowns):
         _copy(after(now, k * row), after(x, k * REACH), reach)
 
 
 @jit
-def _outside(a, sizes, count):
+def _outside(a: Any, sizes: Sizes, count: int) -> int:
     """How many points break a condition; one that is not a number shows in the equations."""
     outside = 0
     for k in range(sizes.conditions):
@@ -150,7 +154,7 @@ def _outside(a, sizes, count):
 
 
 @jit
-def _silence(sizes, lengths, b, count, z, out):
+def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out: Array) -> None:
     """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
 
     They are equations of a step that stands elsewhere, and can be solved; nothing uses the result.
@@ -168,7 +172,7 @@ def _silence(sizes, lengths, b, count, z, out):
 
 
 @jit
-def close(pieces, sizes, work):
+def close(pieces: Pieces, sizes: Sizes, work: Work) -> int:
     """Invert the closure of the period, from the recursion's matrices alone."""
     inverse, closure, products = work.inverse, work.closure, work.products
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
@@ -185,14 +189,14 @@ def close(pieces, sizes, work):
 
 
 @jit
-def _set_identity(matrix):
+def _set_identity(matrix: Array) -> None:
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
             matrix[i, k] = 1.0 if i == k else 0.0
 
 
 @jit
-def start_chunks(pieces, sizes, work, initial):
+def start_chunks(pieces: Pieces, sizes: Sizes, work: Work, initial: bool) -> None:
     """First state of every chunk: that of the period from its closure, or zero."""
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
     inverse, start = pointer(work.inverse, 0), pointer(work.start, 0)
@@ -200,7 +204,7 @@ def start_chunks(pieces, sizes, work, initial):
 
 
 @jit
-def update(update, sizes, sweep, work):
+def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
     """The Newton step block by block, and at positions that repeat a step."""
     steps, dx = sizes.block, work.dx
     per_row = sizes.new * (sizes.state + 1) * WIDTH

@@ -19,6 +19,7 @@ from bayesoleo._types import Array
 from bayesoleo.compiled import BlockKernel
 from bayesoleo.solvers.periodic import arrangement, measures, newton
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
+from bayesoleo.solvers.periodic.recursion import NEEDS_EXCHANGE
 from bayesoleo.solvers.periodic.trial import Trial
 from bayesoleo.solvers.schemes.scheme import Scheme
 from bayesoleo.solvers.status import Status
@@ -179,7 +180,7 @@ def _with_exchange(
     monotone: bool,
 ) -> Solution:
     """Solve by the general iteration what the compiled one cannot eliminate."""
-    again = np.flatnonzero(solution.status == newton.NEEDS_EXCHANGE)
+    again = np.flatnonzero(solution.status == NEEDS_EXCHANGE)
     if again.size:
         other = _Newton(problem, p[again], starts(again), max_iterations, monotone).run()
         solution.x[again] = other.x

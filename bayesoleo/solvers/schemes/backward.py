@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers.schemes import sparse
 from bayesoleo.solvers.schemes.closure import close_and_sweep
 from bayesoleo.solvers.schemes.elimination import eliminate_each, eliminate_together, jit
@@ -139,7 +139,9 @@ class BackwardDifferences:
 
 
 @jit
-def _rows(x, lanes, h, orders, first, second, z):
+def _rows(
+    x: Array, lanes: Integers, h: float, orders: Integers, first: Array, second: Array, z: Array
+) -> None:
     """``z (L, nz, n)``: values and differences; indices below zero count from the period's end."""
     n = x.shape[1]
     for lane in lanes:
@@ -163,7 +165,10 @@ BLOCK = 32
 
 
 @jit
-def _linear(gz, right, lanes, h, orders, first, second, initial, dx, monodromy, ok):
+def _linear(
+    gz: Array, right: Array, lanes: Integers, h: float, orders: Integers, first: Array,
+    second: Array, initial: bool, dx: Array, monodromy: Array, ok: Flags,
+) -> None:  # fmt: skip
     d, n, k = orders.size, gz.shape[3], right.shape[2]
     D = 3 * d
     work, scale = np.empty((d, d + D + k, BLOCK)), np.empty((2, d, BLOCK))
@@ -196,7 +201,10 @@ def _linear(gz, right, lanes, h, orders, first, second, initial, dx, monodromy, 
 
 
 @jit
-def _assemble(gz, right, begin, count, h, orders, first, second, work):
+def _assemble(
+    gz: Array, right: Array, begin: int, count: int, h: float, orders: Integers, first: Array,
+    second: Array, work: Array,
+) -> None:  # fmt: skip
     """Equations of ``count`` nodes: ``work (d, 4 d + k, block)``, [node, three before | right]."""
     d, k = orders.size, right.shape[1]
     for e in range(d):

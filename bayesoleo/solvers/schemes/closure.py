@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import eliminate, jit
 
 #: What cancellation in the product of a period's steps leaves of an exact zero, over the size of
@@ -25,7 +26,7 @@ _SWEEPS = 20
 
 
 @jit
-def balance(matrix, size, scale):
+def balance(matrix: Array, size: int, scale: Array) -> None:
     """Make rows as large as columns by a change of units: ``S^-1 matrix S`` in place, in powers of
     two, which round nothing; ``scale (size,)`` becomes the diagonal of S.
 
@@ -55,7 +56,7 @@ def balance(matrix, size, scale):
 
 
 @jit
-def close(product, right, closure):
+def close(product: Array, right: Array, closure: Array) -> tuple[bool, float]:
     """Solve ``(I - product) x = right`` in place, ``product (D, >= D)``, ``right (D, k)``.
 
     Returns whether it is regular, and the product's norm. ``closure (D, D)`` is work space.
@@ -74,7 +75,9 @@ def close(product, right, closure):
 
 
 @jit
-def close_balanced(product, right, closure, scale):
+def close_balanced(
+    product: Array, right: Array, closure: Array, scale: Array
+) -> tuple[bool, float]:
     """As :func:`close`, in balanced units; ``product`` is balanced in place."""
     D, width = right.shape
     balance(product, D, scale)
@@ -89,7 +92,7 @@ def close_balanced(product, right, closure, scale):
 
 
 @jit
-def close_and_sweep(transfer, monodromy, states, initial):
+def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: bool) -> bool:
     """Close the period and run through it once more.
 
     Parameters: ``transfer (D, D + k, n)`` holds ``[M_m | r_m]``; on return ``monodromy (D, D)`` is

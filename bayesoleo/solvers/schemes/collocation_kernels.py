@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.compiled import BLOCK as POINTS
 from bayesoleo.solvers.schemes.closure import close_and_sweep
 from bayesoleo.solvers.schemes.elimination import eliminate_each, eliminate_together, jit
 
 
 @jit
-def sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
+def sample(
+    x: Array, lanes: Integers, index: Integers, position: Array, w0: Array, w1: Array, w2: Array,
+    h: float, orders: Integers, z: Array,
+) -> None:  # fmt: skip
     """``z (L, nz, C, N)`` at positions inside steps from the unknowns ``x (L, n, w, C)``."""
     d, s = orders.size, w0.shape[0]
     D = orders.sum()
@@ -54,7 +58,10 @@ def sample(x, lanes, index, position, w0, w1, w2, h, orders, z):
 
 
 @jit
-def sample_block(x, lane, block, index, position, w0, w1, w2, h, orders, needed, z):
+def sample_block(
+    x: Array, lane: int, block: int, index: Integers, position: Array, w0: Array, w1: Array,
+    w2: Array, h: float, orders: Integers, needed: Flags, z: Array,
+) -> None:  # fmt: skip
     """The same for one lane and one block of samples, with plans cut into blocks: ``index (blocks,
     POINTS)`` and weights ``(blocks, s, POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are
     ``needed``; without a view of any array, which would cost more than what it is for."""
@@ -96,7 +103,9 @@ def sample_block(x, lane, block, index, position, w0, w1, w2, h, orders, needed,
 
 
 @jit
-def rows(x, lanes, h, a, aa, c, orders, z):
+def rows(
+    x: Array, lanes: Integers, h: Array, a: Array, aa: Array, c: Array, orders: Integers, z: Array
+) -> None:
     """``z (L, nz, n s)`` at the stages, with steps of the lengths ``h (n,)``."""
     d, s, n = orders.size, c.size, x.shape[1]
     D = orders.sum()
@@ -127,7 +136,9 @@ def rows(x, lanes, h, a, aa, c, orders, z):
 
 
 @jit
-def _integrals(own, h, first, second, once, twice):
+def _integrals(
+    own: Array, h: Array, first: Array, second: Array, once: Array, twice: Array
+) -> None:
     """First and second integrals over steps of stage values ``own (s, n)``."""
     s, n = own.shape
     once[:] = 0.0
@@ -147,8 +158,10 @@ BLOCK = 32
 
 @jit
 def linear(
-    gz, right, x, newton, jumps, lanes, h, a, aa, b, ba, c, orders, initial, dx, monodromy, ok
-):  # fmt: skip
+    gz: Array, right: Array, x: Array, newton: bool, jumps: Array, lanes: Integers, h: Array,
+    a: Array, aa: Array, b: Array, ba: Array, c: Array, orders: Integers, initial: bool, dx: Array,
+    monodromy: Array, ok: Flags,
+) -> None:  # fmt: skip
     """Eliminate every step's stages, close the period, and recover the stages."""
     d, s = orders.size, b.size
     D, n, k = orders.sum(), dx.shape[1], right.shape[2]
@@ -182,7 +195,10 @@ def linear(
 
 
 @jit
-def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
+def _assemble(
+    gz: Array, right: Array, first: int, count: int, h: Array, a: Array, aa: Array, c: Array,
+    orders: Integers, work: Array,
+) -> None:  # fmt: skip
     """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
     d, s = orders.size, c.size
     D, k = orders.sum(), right.shape[1]
@@ -226,7 +242,9 @@ def _assemble(gz, right, first, count, h, a, aa, c, orders, work):
 
 
 @jit
-def _transfer(stages, h, b, ba, orders, transfer):
+def _transfer(
+    stages: Array, h: Array, b: Array, ba: Array, orders: Integers, transfer: Array
+) -> None:
     """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
     d, s, n = orders.size, b.size, transfer.shape[2]
     transfer[:] = 0.0
@@ -251,7 +269,9 @@ def _transfer(stages, h, b, ba, orders, transfer):
 
 
 @jit
-def _add_jumps(x, h, b, ba, orders, initial, transfer):
+def _add_jumps(
+    x: Array, h: Array, b: Array, ba: Array, orders: Integers, initial: bool, transfer: Array
+) -> None:
     """Add the jump from each step's end to the next node to the right-hand side (one column).
 
     A transient's last step has no next node.
@@ -277,7 +297,7 @@ def _add_jumps(x, h, b, ba, orders, initial, transfer):
 
 
 @jit
-def _recover(stages, states, dx):
+def _recover(stages: Array, states: Array, dx: Array) -> None:
     """Stage unknowns from the node states: ``dx (n, w, k)``."""
     D, k, n = states.shape
     total = np.empty(n)

@@ -8,11 +8,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from bayesoleo._types import Array
+
 jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit
-def eliminate(matrix, right, least):
+def eliminate(matrix: Array, right: Array, least: float) -> bool:
     """Solve ``matrix @ x = right`` in place by elimination with row scaling and partial pivoting.
 
     ``matrix (m, m)`` is destroyed, ``right (m, k)`` becomes the solution. Returns False where a
@@ -67,7 +69,7 @@ SMALL_PIVOT = 1e-4
 
 
 @jit
-def eliminate_together(work, scale, count, m):
+def eliminate_together(work: Array, scale: Array, count: int, m: int) -> bool:
     """Solve ``count`` systems at once, without exchanging rows: ``work (m, m + k, block)`` holds
     ``[matrix | right]``, systems last.
 
@@ -106,7 +108,7 @@ def eliminate_together(work, scale, count, m):
 
 
 @jit
-def eliminate_each(work, count, m):
+def eliminate_each(work: Array, count: int, m: int) -> bool:
     """The same system by system, with exchange of rows; returns False where one is singular."""
     width = work.shape[1]
     matrix, right = np.empty((m, m)), np.empty((m, width - m))

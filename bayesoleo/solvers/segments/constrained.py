@@ -18,6 +18,7 @@ Differentialgleichungen. Bonner Mathematische Schriften 183.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ class ContinuousLeastSquares:
         """
         total = hessian + np.einsum("nab,nac->bc", self.coupling, self.states)
         total -= np.einsum("nab,nac->bc", self.by_parameter, self.multipliers)
-        return 0.5 * (total + total.T)
+        return cast(Array, 0.5 * (total + total.T))
 
     def descent(self, gradient: Array, states: Array, multipliers: Array) -> Array:
         """Descent direction by the parameters, ``(l,)``, states eliminated.
@@ -121,7 +122,7 @@ class ContinuousLeastSquares:
         n, D, _ = self.states.shape
         units = np.zeros((n, D, D))
         units[0] = np.eye(D)
-        return self._substitute(units, np.zeros((n - 1, D, D)))[0][0]
+        return cast(Array, self._substitute(units, np.zeros((n - 1, D, D)))[0][0])
 
     def _substitute(self, gradient: Array, gap: Array) -> tuple[Array, Array]:
         n, D, columns = gradient.shape

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ class Segments:
 
     def sample(self, columns: Array, plan: SamplePlan) -> Array:
         """Values and derivatives ``(nz, C, N)`` at planned times from unknowns ``(n, w, C)``."""
-        return self.scheme.sample(columns[None], plan, self.length)[0]
+        return cast(Array, self.scheme.sample(columns[None], plan, self.length)[0])
 
     def ends(self, columns: Array) -> Array:
         """States ``(n, D, C)`` at the right ends of steps from unknowns ``(n, w, C)``."""

@@ -17,6 +17,7 @@ from bayesoleo._types import Array
 from bayesoleo.compiled import Kernel
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.shooting import march as loop
+from bayesoleo.solvers.shooting.march_step import DEGENERATE, FINISHED, LOST, NOT_A_NUMBER, OUTSIDE
 from bayesoleo.solvers.shooting.radau_step import radau_method, workspace
 from bayesoleo.solvers.shooting.signals import Signal
 from bayesoleo.solvers.status import Status
@@ -24,11 +25,11 @@ from bayesoleo.solvers.status import Status
 #: Room for steps at first; more is made where it does not do.
 CAPACITY = 1024
 STATUS = {
-    loop.FINISHED: Status.CONVERGED,
-    loop.LOST: Status.NO_CONVERGENCE,
-    loop.OUTSIDE: Status.INADMISSIBLE,
-    loop.NOT_A_NUMBER: Status.NOT_FINITE,
-    loop.DEGENERATE: Status.SINGULAR,
+    FINISHED: Status.CONVERGED,
+    LOST: Status.NO_CONVERGENCE,
+    OUTSIDE: Status.INADMISSIBLE,
+    NOT_A_NUMBER: Status.NOT_FINITE,
+    DEGENERATE: Status.SINGULAR,
     loop.CHATTERS: Status.NO_CONVERGENCE,
     loop.COARSE: Status.NO_CONVERGENCE,
 }

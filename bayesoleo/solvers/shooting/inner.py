@@ -6,18 +6,25 @@ the integrator's functions compile in a fraction of the time: each of them takes
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import numba
 
+from bayesoleo._types import Array
 from bayesoleo.compiled import call_kernel, pointer
 
 #: Options that Numba has and its annotations lack.
 _NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-inner = numba.njit(nogil=True, cache=True, error_model="numpy", **_NO_WRAPPERS)
+
+
+def inner[F: Callable[..., Any]](function: F) -> F:
+    """Compile a function that only compiled code calls."""
+    options = {"nogil": True, "cache": True, "error_model": "numpy", **_NO_WRAPPERS}
+    return cast(F, numba.njit(**options)(function))
 
 
 @inner
-def evaluate(kernel, z, u, p, out, count):
+def evaluate(kernel: int, z: Array, u: Array, p: Array, out: Array, count: int) -> None:
     """Call the kernel at an address for ``count`` points in rows of ``z``, ``u`` and ``out``."""
     call_kernel(kernel, (pointer(z, 0), pointer(u, 0), pointer(p, 0), pointer(out, 0), count))

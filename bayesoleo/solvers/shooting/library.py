@@ -8,7 +8,7 @@ method closes the period.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -61,7 +61,7 @@ class LibraryShot:
     def sample(self, phases: Array) -> Array:
         """Values and derivatives ``(nz, N)`` of all dofs at phases in cycles."""
         times, table = self._at(phases)
-        return self.space.complete(times, table[None, :, 0], self.p[None])[0][0]
+        return cast(Array, self.space.complete(times, table[None, :, 0], self.p[None])[0][0])
 
     def sample_theta(self, phases: Array) -> Array:
         """Derivatives ``(nz, na, N)`` of these by the active parameters."""

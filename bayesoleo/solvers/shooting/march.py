@@ -170,11 +170,15 @@ def _room(task: Task, front: Front) -> Path:
 
 
 @jit
-def _walk(task, system, front, path, work):
+def _walk(
+    task: Task, system: System, front: Front, path: Path, work: Workspace
+) -> tuple[int, int, int]:
     """Step after step to the last node: number of steps, outcome, points."""
     t, end, s = task.nodes[0], task.nodes[-1], system.method.c.size
     shortest = 1e-14 * (end - t + abs(t))
-    node, n = np.int64(1), np.int64(0)  # of one type throughout, or all is compiled twice
+    # Of one type throughout, or all is compiled twice; annotated because it is not Python's int.
+    node: Any = np.int64(1)
+    n: Any = np.int64(0)
     points, flips, reason = 1, 0, LOST
     if not starts(front, t, task.first_step, system, work):
         inside = is_inside(work.z1, work.u1, 1, system, work)
@@ -223,7 +227,7 @@ def _walk(task, system, front, path, work):
 
 
 @inner
-def _aim(task, length, node, t, shortest):
+def _aim(task: Task, length: float, node: int, t: float, shortest: float) -> tuple[int, float]:
     """Number of the node ahead and time at which the next step is to end."""
     if not task.adaptive:
         while task.nodes[node] <= t + shortest:
@@ -234,7 +238,7 @@ def _aim(task, length, node, t, shortest):
 
 
 @inner
-def _keep(dense, state, columns, path, n, t):
+def _keep(dense: bool, state: Array, columns: Array, path: Path, n: int, t: float) -> None:
     path.times[n] = t
     for j in range(state.size):
         path.states[n, j] = state[j]

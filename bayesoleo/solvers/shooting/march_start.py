@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from bayesoleo._types import Array, Integers
 from bayesoleo.solvers.schemes.elimination import eliminate
 from bayesoleo.solvers.shooting.inner import evaluate, inner
+from bayesoleo.solvers.shooting.radau_step import Workspace
 from bayesoleo.solvers.shooting.signals import rows_at
+
+if TYPE_CHECKING:
+    from bayesoleo.solvers.shooting.march import System
+    from bayesoleo.solvers.shooting.march_step import Front
 
 
 @inner
-def rate_at_start(state, top, t, system, work):
+def rate_at_start(state: Array, top: Array, t: float, system: System, work: Workspace) -> bool:
     """Highest derivatives ``top (d,)`` at one time; false where there are none."""
     orders, p = system.orders, system.p
     d, row, first = orders.size, 0, 0
@@ -48,7 +56,7 @@ def rate_at_start(state, top, t, system, work):
 
 
 @inner
-def is_inside(z, u, count, system, work):
+def is_inside(z: Array, u: Array, count: int, system: System, work: Workspace) -> bool:
     """Whether all points lie in the admissible region."""
     if system.conditions == 0:
         return True
@@ -61,7 +69,7 @@ def is_inside(z, u, count, system, work):
 
 
 @inner
-def starts(front, t, h, system, work):
+def starts(front: Front, t: float, h: float, system: System, work: Workspace) -> bool:
     """Rates and modes at the start; false if there are none or it is not admissible."""
     for _ in range(2 if system.modes.size > 0 else 1):
         # Modes depend on the rates only where a state starts on a switch.
@@ -73,7 +81,9 @@ def starts(front, t, h, system, work):
 
 
 @inner
-def _initial_modes(state, top, t, h, system, work):
+def _initial_modes(
+    state: Array, top: Array, t: float, h: float, system: System, work: Workspace
+) -> None:
     """Modes by the signs of the switching functions at the start, or just after it."""
     orders, modes, p = system.orders, system.modes, system.p
     if modes.size == 0:
@@ -99,7 +109,7 @@ def _initial_modes(state, top, t, h, system, work):
 
 
 @inner
-def first_sizes(state, rate, scale, orders, h):
+def first_sizes(state: Array, rate: Array, scale: Array, orders: Integers, h: float) -> None:
     """From rest, a state is as large as its rates make it in the first step."""
     first = 0
     for j in range(orders.size):

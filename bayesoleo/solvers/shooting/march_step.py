@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from bayesoleo.solvers.shooting.radau_step import (
     SINGULAR,
     SOLVED,
     UNDEFINED,
+    Workspace,
     copy_to,
     differentiate_step,
     end_of_step,
@@ -21,6 +22,10 @@ from bayesoleo.solvers.shooting.radau_step import (
     stretch,
 )
 from bayesoleo.solvers.shooting.signals import rows_at
+
+if TYPE_CHECKING:
+    from bayesoleo.solvers.shooting.march import Path, System
+
 
 #: How a step ended, and a march with it.
 FINISHED, LOST, OUTSIDE, NOT_A_NUMBER, DEGENERATE = range(5)
@@ -70,7 +75,10 @@ def front_of(
 
 
 @inner
-def attempt(adaptive, tolerance, enough, system, front, t, h, work):
+def attempt(
+    adaptive: bool, tolerance: float, enough: float, system: System, front: Front, t: float,
+    h: float, work: Workspace,
+) -> tuple[int, float, int]:  # fmt: skip
     """Solve a step: outcome, error over tolerance, iterations. Shorten the next one if it fails."""
     s, pace, method = system.method.c.size, front.pace, system.method
     rows_at(system.signal, t, h, method.c, work.u)
@@ -108,7 +116,9 @@ def attempt(adaptive, tolerance, enough, system, front, t, h, work):
 
 
 @inner
-def advance(dense, system, front, path, n, length, work):
+def advance(
+    dense: bool, system: System, front: Front, path: Path, n: int, length: float, work: Workspace
+) -> bool:
     """Differentiate the step, keep its stages and go to its end; false if it is singular."""
     s, d = front.stages.shape
     if front.columns.shape[1] > 0:
@@ -135,7 +145,7 @@ def advance(dense, system, front, path, n, length, work):
 
 
 @inner
-def next_length(pace, size, h, stages):
+def next_length(pace: Array, size: float, h: float, stages: int) -> None:
     """Predictive control of the step's length (Hairer and Wanner 1996, eq. IV.8.25)."""
     small = max(size, 1e-12)
     factor = 0.9 * small ** (-1.0 / (stages + 1))

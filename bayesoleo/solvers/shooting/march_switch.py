@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from bayesoleo.solvers.shooting.inner import inner
 from bayesoleo.solvers.shooting.march_start import rate_at_start
-from bayesoleo.solvers.shooting.march_step import KNOWN
+from bayesoleo.solvers.shooting.march_step import KNOWN, Front
+from bayesoleo.solvers.shooting.radau_step import Workspace
 from bayesoleo.solvers.shooting.switching import (
     first_switch,
     jump_of_derivatives,
@@ -12,9 +15,14 @@ from bayesoleo.solvers.shooting.switching import (
     step_to_switch,
 )
 
+if TYPE_CHECKING:
+    from bayesoleo.solvers.shooting.march import System
+
 
 @inner
-def find_switch(enough, system, front, t, h, work):
+def find_switch(
+    enough: float, system: System, front: Front, t: float, h: float, work: Workspace
+) -> tuple[int, float, float]:
     """Switch in the solved step, or -1, with the length up to it and the switching function's
     slope there; the step is solved again to end there. A negative length is a failure, zero a
     switch where the step begins.
@@ -40,7 +48,10 @@ def find_switch(enough, system, front, t, h, work):
 
 
 @inner
-def exchange(system, front, switch, slope, length, t, work):
+def exchange(
+    system: System, front: Front, switch: int, slope: float, length: float, t: float,
+    work: Workspace,
+) -> bool:  # fmt: skip
     """Exchange a mode: rates are new, and derivatives jump where they do; false without rates."""
     mode = system.modes[switch]
     system.p[mode] = 1.0 - system.p[mode]

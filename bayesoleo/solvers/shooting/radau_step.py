@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.compiled import BLOCK
 from bayesoleo.solvers.schemes.elimination import eliminate
 from bayesoleo.solvers.schemes.tableau import tableau
@@ -109,7 +109,7 @@ def workspace(
 
 
 @inner
-def copy_to(source, target):
+def copy_to(source: Array, target: Array) -> None:
     """Copy a table; compiles in a fraction of the time of an assignment, which checks shapes."""
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
@@ -117,7 +117,9 @@ def copy_to(source, target):
 
 
 @inner
-def rows_of_stages(state, top, h, method, orders, z):
+def rows_of_stages(
+    state: Array, top: Array, h: float, method: Method, orders: Integers, z: Array
+) -> None:
     """Values and derivatives ``z (nz, s)`` at the stages."""
     s = method.c.size
     row = first = 0
@@ -139,7 +141,7 @@ def rows_of_stages(state, top, h, method, orders, z):
 
 
 @inner
-def assemble(g, h, method, orders, matrix):
+def assemble(g: Array, h: float, method: Method, orders: Integers, matrix: Array) -> None:
     """Derivatives of the stages' equations by the stages' unknowns, ``(s d, s d)``."""
     d, s = orders.size, method.c.size
     nz = d + orders.sum()
@@ -166,7 +168,10 @@ ROUND_OFF = 1e-10
 
 
 @inner
-def solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work):
+def solve_stages(
+    jacobian: int, state: Array, top: Array, h: float, scale: Array, enough: float, method: Method,
+    orders: Integers, p: Array, work: Workspace,
+) -> tuple[int, int]:  # fmt: skip
     """Newton's method for the stages' unknowns, from ``top (s, d)`` as given.
 
     ``scale (D,)`` are the sizes of the state components; iterations end when what they would still
@@ -208,7 +213,7 @@ def solve_stages(jacobian, state, top, h, scale, enough, method, orders, p, work
 
 
 @inner
-def end_of_step(work, s, orders, state):
+def end_of_step(work: Workspace, s: int, orders: Integers, state: Array) -> None:
     """State at the last stage, from ``work.z``."""
     row = first = 0
     for j in range(orders.size):
@@ -219,7 +224,10 @@ def end_of_step(work, s, orders, state):
 
 
 @inner
-def local_error(state, top0, h, scale, method, orders, work, error):
+def local_error(
+    state: Array, top0: Array, h: float, scale: Array, method: Method, orders: Integers,
+    work: Workspace, error: Array,
+) -> float:  # fmt: skip
     """Largest filtered error ``(D,)`` of a solved step over ``scale``; ``top0 (d,)`` at its start.
 
     Hairer and Wanner (1996), eq. IV.8.19, for implicit equations: the unfiltered difference of two
@@ -269,8 +277,9 @@ def local_error(state, top0, h, scale, method, orders, work, error):
 
 @inner
 def differentiate_step(
-    jacobian, parameters, before, top_by, after, h, method, orders, p, work, active
-):
+    jacobian: int, parameters: int, before: Array, top_by: Array, after: Array, h: float,
+    method: Method, orders: Integers, p: Array, work: Workspace, active: int,
+) -> bool:  # fmt: skip
     """Exact derivatives of a solved step: ``after (D, C)`` at its end from ``before (D, C)``.
 
     The last ``active`` of the C columns are derivatives by parameters, to which the step adds its
@@ -316,7 +325,9 @@ def differentiate_step(
 
 
 @inner
-def interpolate(state, top, h, position, method, orders, z):
+def interpolate(
+    state: Array, top: Array, h: float, position: float, method: Method, orders: Integers, z: Array
+) -> None:
     """Rows ``z (nz, 1)`` at a position in the step, in units of its length, or beyond it."""
     d, s = orders.size, method.c.size
     row = first = 0
@@ -342,7 +353,7 @@ def interpolate(state, top, h, position, method, orders, z):
 
 
 @inner
-def stretch(top, ratio, method, following):
+def stretch(top: Array, ratio: float, method: Method, following: Array) -> None:
     """Stage unknowns of the next step, ``ratio`` times as long, by extrapolation.
 
     With ``ratio`` negative: of a step from the same start that is ``-ratio`` times as long.

@@ -9,6 +9,7 @@ and Newton's method ends in round-off instead of in the noise of choosing steps.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ class Shot:
     @property
     def start(self) -> Array:
         """State at phase zero, shape (D,)."""
-        return self.trajectory.states[0]
+        return cast(Array, self.trajectory.states[0])
 
     @property
     def period(self) -> float:
@@ -85,7 +86,7 @@ class Shot:
         """
         D = self.start.size
         by = self.trajectory.sample_derivatives((phases % 1.0) * self.period)
-        return np.einsum("zdn,da->zan", by[:, :D], self.start_theta) + by[:, D:]
+        return cast(Array, np.einsum("zdn,da->zan", by[:, :D], self.start_theta) + by[:, D:])
 
     def orbit(self) -> Orbit:
         """The motion as every solver returns it; by itself shooting estimates no error of it."""

@@ -68,7 +68,7 @@ def evaluate(signal: Signal, times: Array) -> Array:
 
 
 @jit
-def rows_at(signal, start, step, positions, u):
+def rows_at(signal: Signal, start: float, step: float, positions: Array, u: Array) -> None:
     """Fill ``u (nu, N)`` with the rows at ``start + step * positions``."""
     for i in range(positions.size):
         t = start + step * positions[i]
@@ -79,7 +79,7 @@ def rows_at(signal, start, step, positions, u):
 
 
 @jit
-def _add_harmonics(signal, t, u, i):
+def _add_harmonics(signal: Signal, t: float, u: Array, i: int) -> None:
     """Cosines and sines of all harmonics by rotation: round-off grows with the order only."""
     count, harmonics = signal.cosine.shape
     if harmonics == 0:
@@ -93,9 +93,9 @@ def _add_harmonics(signal, t, u, i):
 
 
 @jit
-def _add_piece(signal, t, u, i):
+def _add_piece(signal: Signal, t: float, u: Array, i: int) -> None:
     pieces = signal.pieces.shape[0]
-    m = np.searchsorted(signal.knots, t, side="right") - 1
+    m = int(np.searchsorted(signal.knots, t, side="right")) - 1
     m = min(max(m, 0), pieces - 1)
     x = t - signal.knots[m]
     for row in range(u.shape[0]):

@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesoleo._types import Array, Integers
 from bayesoleo.solvers.shooting.inner import evaluate, inner
 from bayesoleo.solvers.shooting.radau_step import (
     SOLVED,
+    Method,
+    Workspace,
     copy_to,
     interpolate,
     solve_stages,
     stretch,
 )
-from bayesoleo.solvers.shooting.signals import rows_at
+from bayesoleo.solvers.shooting.signals import Signal, rows_at
 
 #: A switching function beyond zero by less than this, over its largest value, has not switched:
 #: with analytic pieces the difference is of that size.
@@ -27,16 +30,22 @@ SLACK = 1e-13
 
 
 @inner
-def sigma_at(switches, k, t, state, top, h, position, method, orders, signal, p, work):
+def sigma_at(
+    switches: int, k: int, t: float, state: Array, top: Array, h: float, position: float,
+    method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+) -> float:  # fmt: skip
     """Switching function ``k`` on the step's polynomial."""
     interpolate(state, top, h, position, method, orders, work.z1)
     rows_at(signal, t, h, np.full(1, position), work.u1)
     evaluate(switches, work.z1, work.u1, p, work.y, 1)
-    return work.y[k, 0]
+    return float(work.y[k, 0])
 
 
 @inner
-def first_switch(switches, t, state, top, h, modes, largest, method, orders, signal, p, work):
+def first_switch(
+    switches: int, t: float, state: Array, top: Array, h: float, modes: Integers, largest: Array,
+    method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+) -> tuple[float, int]:  # fmt: skip
     """Position (in the solved step) and number of the first switch, or -1 for none.
 
     Of a switch that has its mode's sign nowhere before, the position is zero. ``largest (ns,)``
@@ -79,8 +88,9 @@ def first_switch(switches, t, state, top, h, modes, largest, method, orders, sig
 
 @inner
 def _root(
-    switches, k, sign, low, high, t, state, top, h, method, orders, signal, p, work
-):  # fmt: skip
+    switches: int, k: int, sign: float, low: float, high: float, t: float, state: Array, top: Array,
+    h: float, method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+) -> float:  # fmt: skip
     """Zero of a switching function between two positions, by regula falsi (Illinois)."""
     below = sign * sigma_at(switches, k, t, state, top, h, low, method, orders, signal, p, work)
     above = sign * sigma_at(switches, k, t, state, top, h, high, method, orders, signal, p, work)
@@ -109,9 +119,10 @@ def _root(
 
 @inner
 def step_to_switch(
-    jacobian, switches, k, position, t, state, top, h,
-    scale, enough, largest, method, orders, signal, p, work,
-):  # fmt: skip
+    jacobian: int, switches: int, k: int, position: float, t: float, state: Array, top: Array,
+    h: float, scale: Array, enough: float, largest: Array, method: Method, orders: Integers,
+    signal: Signal, p: Array, work: Workspace,
+) -> float:  # fmt: skip
     """Solve the step again so that it ends at switch ``k``; returns its length, or -1."""
     guess = np.empty_like(top)
     for _ in range(8):
@@ -133,7 +144,10 @@ def step_to_switch(
 
 
 @inner
-def slope_of_switch(switches, k, t, state, top, h, method, orders, signal, p, work):
+def slope_of_switch(
+    switches: int, k: int, t: float, state: Array, top: Array, h: float, method: Method,
+    orders: Integers, signal: Signal, p: Array, work: Workspace,
+) -> float:  # fmt: skip
     """Time derivative of a switching function at the end of a step, along its polynomial."""
     ahead = sigma_at(switches, k, t, state, top, h, 1.0 + 1e-4, method, orders, signal, p, work)
     behind = sigma_at(switches, k, t, state, top, h, 1.0 - 1e-4, method, orders, signal, p, work)
@@ -142,8 +156,9 @@ def slope_of_switch(switches, k, t, state, top, h, method, orders, signal, p, wo
 
 @inner
 def jump_of_derivatives(
-    slopes, k, slope, top_by, before, after, columns, s, switches, orders, p, work, active
-):  # fmt: skip
+    slopes: int, k: int, slope: float, top_by: Array, before: Array, after: Array, columns: Array,
+    s: int, switches: int, orders: Integers, p: Array, work: Workspace, active: int,
+) -> None:  # fmt: skip
     """Carry derivatives ``columns (D, C)`` across a switch at the end of the step in ``work``.
 
     The switch moves by ``dt = -(d sigma)/slope``, and between its old and its new time the state

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,7 +154,7 @@ def _right_side(space: StateSpace, p: Array) -> Callable[[float, Array], Array]:
                 break
             z[0, highest, 0] += step
             if space.affine or _is_last(step, z[0, :, 0], gz[0, :, :, 0], highest):
-                return z[0, rows + 1, 0].copy()
+                return cast(Array, z[0, rows + 1, 0].copy())
         return np.full(s.size, np.nan)
 
     return f
@@ -166,7 +166,7 @@ def _solve(matrix: Array, right: Array) -> Array:
         return np.linalg.solve(matrix, right)
     if matrix[0, 0] == 0.0:
         raise np.linalg.LinAlgError
-    return right / matrix[0]
+    return cast(Array, right / matrix[0])
 
 
 def _is_last(step: Array, z: Array, gz: Array, highest: NDArray[np.int64]) -> bool:

@@ -265,7 +265,7 @@ def _solve_at_points(gz: Array, right: Array, highest: NDArray[np.int64]) -> tup
 
 
 @jit
-def _eliminate_points(matrix, right, ok):
+def _eliminate_points(matrix: Array, right: Array, ok: Flags) -> None:
     for lane in range(ok.shape[0]):
         for i in range(ok.shape[1]):
             # Rows are scaled to one: what is left of an exact zero is round-off below 1e-14.

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import scipy.fft
@@ -114,12 +115,12 @@ class _Run:
         """Trace of ``J C J' W N`` in one output, ``C`` the response of the estimates."""
         own = self.weight[output] * float(np.sum(response * self.through[output]))
         mixed = self.averaged[output] @ self.inputs[output].T
-        return own + float(np.sum(mixed * (response @ self.pulled)))
+        return cast(float, own + float(np.sum(mixed * (response @ self.pulled))))
 
     def spread(self, output: int, covariance: Array) -> float:
         """Mean over the samples of the diagonal of ``J Sigma J'`` in one output."""
         J = self.averaged[output]
-        return float(np.sum(covariance * (J @ J.T))) / J.shape[1]
+        return cast(float, float(np.sum(covariance * (J @ J.T))) / J.shape[1])
 
 
 def _through(entry: RunError, columns: Array) -> Array:

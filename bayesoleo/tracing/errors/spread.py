@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from bayesoleo._types import Array
@@ -68,4 +70,4 @@ def _inside(prediction: Prediction, root: Array) -> Array:
         low, high = prior.support
         room = 1e-3 * prior.sd
         draws[:, k] = np.clip(draws[:, k], low + room, high - room)
-    return draws
+    return cast(Array, draws)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def without_masked(record: Record, residual: Array) -> Array:
         return residual
     cycles = (record.time[-1] - record.time[0]) / (record.time.size - 1) * record.frequency
     step = float(cycles) if record.periodic else None
-    return bridged(residual[None], ~record.kept, step)[0]
+    return cast(Array, bridged(residual[None], ~record.kept, step)[0])
 
 
 def of_those_counted(record: Record, average: PeriodicAverage) -> PeriodicAverage:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from bayesoleo.tracing.fitting.fit import Fit
 PHASES, DRAWS = 200, 100
 
 _CHAINS = (schema.CHAIN, schema.DRAW)
-_KINDS = {
+_KINDS: dict[str, tuple[Callable[[str], str], tuple[str, ...], str]] = {
     "sample": (lambda output: output, (*_CHAINS, schema.RUN, schema.PHASE), "a sample of {}"),
     "expected": (
         schema.expected,

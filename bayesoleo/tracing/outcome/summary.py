@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -74,7 +74,7 @@ def summarise(
     }
     clean = _finite(summary)
     schema.validate_summary(clean)
-    return clean
+    return cast(dict[str, Any], clean)
 
 
 def titles_of(loop: ClosedLoop) -> dict[str, str]:

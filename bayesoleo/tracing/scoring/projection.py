@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +29,7 @@ def coefficients(gram: Array, cross: Array) -> Array:
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
     floor = 10 * len(gram) * np.finfo(float).eps * max(values.max(), 1e-300)
     inverse = vectors / np.maximum(values, floor)
-    return (inverse @ (vectors.T @ (cross / scale[:, None]))) / scale[:, None]
+    return cast(Array, (inverse @ (vectors.T @ (cross / scale[:, None]))) / scale[:, None])
 
 
 def remains(gram: Array, project: Array, own: Array, information: Array) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -113,4 +114,4 @@ def _of_run(fit: Fit, r: int, run: RunPredictor, p: Array) -> Array | Status:
 
 def present_constants(fit: Fit, r: int) -> Array:
     """Constants of a fitted run at the estimate, shape (np,)."""
-    return fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0]
+    return cast(Array, fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0])

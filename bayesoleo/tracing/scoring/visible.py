@@ -7,6 +7,7 @@ computed sensitivity is not zero but some last digits, and a score divides by it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,4 +77,4 @@ def _suspects(run: RunPredictor, y_p: Array) -> NDArray[np.bool_]:
     reach = relative.max(axis=1)
     output = np.abs(run.measured).max(axis=1)
     found = np.abs(y_p).max(axis=-1)
-    return (found > 0) & (found <= SUSPECT * output[:, None] * reach)
+    return cast(NDArray[np.bool_], (found > 0) & (found <= SUSPECT * output[:, None] * reach))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import sympy as sp
@@ -128,7 +128,7 @@ class Forced:
         samples = run.evaluate(p)
         if samples.status[0] != Status.CONVERGED.value or samples.y_p is None:
             return Status(int(samples.status[0]))
-        return samples.y_p[0]
+        return cast(Array, samples.y_p[0])
 
 
 def _with_terms(native: Model, target: str) -> Model:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import sympy as sp
@@ -195,7 +196,7 @@ def _row(run: RunPredictor, present: Array, item: sp.Symbol, phase: Array) -> Ar
     motions = run.known_motions()
     if name in motions:
         rows: Array = motions[name](phase)
-        return rows[order]
+        return cast(Array, rows[order])
     if name in run.model.inputs:
         return signal_of(run.record, name, order).evaluate(phase, run.record.rate, order)
     constants = run.kernels.derived.constants

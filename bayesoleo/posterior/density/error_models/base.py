@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -314,4 +314,4 @@ def log_mean_squares(residuals: Sequence[Array]) -> Array:
     """
     squares = np.sum([np.sum(e * e, axis=1) for e in residuals], axis=0)
     count = sum(e.shape[1] for e in residuals)
-    return np.log(np.maximum(squares / count, np.finfo(float).tiny))
+    return cast(Array, np.log(np.maximum(squares / count, np.finfo(float).tiny)))

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models.base import ErrorModel, Frame, log_mean_squares
+from bayesoleo.posterior.density.error_models.base import (
+    ErrorModel,
+    Frame,
+    Quantity,
+    log_mean_squares,
+)
 from bayesoleo.posterior.density.error_models.fitted_start import climb
 
 #: Coordinates of a share from which the climb to its most likely value starts: a fifth, a half, and
@@ -117,7 +123,7 @@ class ByOutput(ErrorModel):
             assert prior is not None
             middle = float(np.log(prior.mean))
 
-            def height(trial: Array, b: int = b, quantities: list = quantities) -> Array:
+            def height(trial: Array, b: int = b, quantities: list[Quantity] = quantities) -> Array:
                 total = np.zeros(len(trial))
                 for k, quantity in enumerate(quantities):
                     total += quantity.log_prior(np.ascontiguousarray(trial[:, k]))
@@ -127,7 +133,7 @@ class ByOutput(ErrorModel):
 
             guesses = [np.array([sizes[b], share, middle]) for share in _SHARES]
             eta[self._places(b)] = climb(height, guesses)
-        return self._direct(eta[None], 1)[0]
+        return cast(Array, self._direct(eta[None], 1)[0])
 
     def spread(self) -> Array:
         s, sd = len(self.frame.outputs), super().spread()

@@ -25,13 +25,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import numba
 import numpy as np
 from scipy.special import ndtr
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import LogNormal, Uniform
 from bayesoleo.posterior.density.error_models.base import Frame, Quantity
@@ -47,7 +48,7 @@ jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit
-def _log_likelihood(residual, kind, steps, eta, out):
+def _log_likelihood(residual: Array, kind: Integers, steps: Array, eta: Array, out: Array) -> None:
     """Log-likelihood of rows ``(L, n)``; ``kind (n - 1)`` says which of ``steps`` lies between."""
     n = residual.shape[1]
     decay = np.empty(steps.size)
@@ -85,7 +86,7 @@ def _log_likelihood(residual, kind, steps, eta, out):
 
 
 @jit
-def _whiten(columns, kind, steps, eta, out):
+def _whiten(columns: Array, kind: Integers, steps: Array, eta: Array, out: Array) -> None:
     """Rows ``(k, n)`` as innovations of unit variance."""
     share, white = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
     rate, sd = np.exp(-eta[2]), np.exp(0.5 * eta[0])
@@ -190,4 +191,4 @@ def covariance(time: Sequence[float] | Array, v: float, share: float, tau: float
     """The covariance itself, shape (n, n), for whoever wants to see it."""
     t = np.asarray(time, dtype=float)
     memory = np.exp(-np.abs(t[:, None] - t) / tau)
-    return v * ((1 - share) * np.eye(t.size) + share * memory)
+    return cast(Array, v * ((1 - share) * np.eye(t.size) + share * memory))

@@ -81,7 +81,7 @@ def basis(phase: Array) -> Array:
 
 
 @jit
-def project(rows, table, out, squares):
+def project(rows: Array, table: Array, out: Array, squares: Array) -> None:
     """Products of rows ``(L, n)`` with the basis ``(n, R)``, and their sums of squares."""
     for lane in range(rows.shape[0]):
         squares[lane] = 0.0
@@ -95,7 +95,7 @@ def project(rows, table, out, squares):
 
 
 @jit
-def factorise(gram, root, noise, factor):
+def factorise(gram: Array, root: Array, noise: float, factor: Array) -> float:
     """Cholesky factor of ``noise + D G D`` with ``D = diag(root)``, in place, and ln det."""
     size, logs = root.size, 0.0
     for i in range(size):
@@ -111,7 +111,9 @@ def factorise(gram, root, noise, factor):
 
 
 @jit
-def _log_likelihood(projected, squares, count, gram, weight, eta, out):
+def _log_likelihood(
+    projected: Array, squares: Array, count: int, gram: Array, weight: Array, eta: Array, out: Array
+) -> None:
     """Log-likelihood of rows by the matrix inversion and determinant lemmas."""
     size = gram.shape[0]
     factor, root, answer = np.empty((size, size)), np.empty(size), np.empty(size)
@@ -134,7 +136,9 @@ def _log_likelihood(projected, squares, count, gram, weight, eta, out):
 
 
 @jit
-def _without_products(projected, squares, count, gram, weight, eta, out):
+def _without_products(
+    projected: Array, squares: Array, count: int, gram: Array, weight: Array, eta: Array, out: Array
+) -> None:
     """The same where no two functions of the basis have a product."""
     size = gram.shape[0]
     for lane in range(projected.shape[0]):

@@ -14,6 +14,7 @@ correlation matrices based on vines and extended onion method", *Journal of Mult
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from scipy.special import betaln
@@ -163,7 +164,7 @@ class FullErrors(ErrorModel):
         correlation = _MOST * moments / np.outer(sd, sd)
         natural = [correlation[i, j] for i, j in self._pairs]
         start = np.concatenate([log_mean_squares(residuals), natural])
-        return self.coordinates(start[None])[0]
+        return cast(Array, self.coordinates(start[None])[0])
 
     def spread(self) -> Array:
         sd = super().spread()

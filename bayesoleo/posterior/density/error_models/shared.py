@@ -34,7 +34,7 @@ import numba
 import numpy as np
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Uniform
 from bayesoleo.posterior.density.error_models.base import Frame, Quantity
@@ -54,7 +54,7 @@ jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit
-def _answer(factor, right, out):
+def _answer(factor: Array, right: Array, out: Array) -> float:
     """Solution of ``L L' out = right``; the part of it after the first sweep has norm ``sum``."""
     size, total = right.size, 0.0
     for i in range(size):
@@ -72,7 +72,7 @@ def _answer(factor, right, out):
 
 
 @jit
-def _add_inverse(factor, scale, inverse, total):
+def _add_inverse(factor: Array, scale: float, inverse: Array, total: Array) -> None:
     """Subtract ``scale (L L')^-1`` from the lower half of ``total``; ``inverse`` is work space."""
     size = factor.shape[0]
     for j in range(size):
@@ -91,7 +91,10 @@ def _add_inverse(factor, scale, inverse, total):
 
 
 @jit
-def _dense(projected, squares, counts, grams, weight, eta, out):
+def _dense(
+    projected: Array, squares: Array, counts: Integers, grams: Array, weight: Array, eta: Array,
+    out: Array,
+) -> None:  # fmt: skip
     """Log-likelihood of runs given those before, ``out (L, N)``; projected ``(N, L, R)``."""
     runs, lanes, size = projected.shape
     factor, inverse, joint = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
@@ -122,7 +125,10 @@ def _dense(projected, squares, counts, grams, weight, eta, out):
 
 
 @jit
-def _diagonal(projected, squares, counts, grams, weight, eta, out):
+def _diagonal(
+    projected: Array, squares: Array, counts: Integers, grams: Array, weight: Array, eta: Array,
+    out: Array,
+) -> None:  # fmt: skip
     """The same where no two functions of the basis have a product."""
     runs, lanes, size = projected.shape
     joint, common = np.empty(size), np.empty(size)
@@ -151,7 +157,7 @@ def _diagonal(projected, squares, counts, grams, weight, eta, out):
 
 
 @jit
-def _parts(eta):
+def _parts(eta: Array) -> tuple[float, float, float, float]:
     """Shares of the discrepancy and of noise, a run's own part of it, and common over own."""
     share, noise = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
     own = max(0.5 * math.erfc(eta[3] / SQRT_2), _LEAST_OWN)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from emcee.moves import Move, RedBlueMove
 from emcee.state import State
-from numpy.typing import NDArray
+
+from bayesoleo._types import Array, Flags, Integers
 
 
-class Grouped(Move):
+class Grouped(Move):  # type: ignore[misc] # emcee has no types
     """Apply a move to several ensembles at once, each with complements from itself alone.
 
     The ensembles stay independent, but one call of the log density has rows of all of them.
@@ -29,7 +32,7 @@ class Grouped(Move):
     def __init__(self, move: RedBlueMove, ensembles: int) -> None:
         self.move, self.ensembles = move, ensembles
 
-    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:
+    def propose(self, model: Any, state: State) -> tuple[State, Flags]:
         """Advance every walker once; returns the state and who was accepted, shape (walkers,)."""
         walkers, splits = len(state.coords), self.move.nsplits
         each = walkers // self.ensembles
@@ -48,7 +51,9 @@ class Grouped(Move):
             state = self.update(state, new, accepted, active)
         return state, accepted
 
-    def _proposals(self, coords, halves, half, random):
+    def _proposals(
+        self, coords: Array, halves: Integers, half: int, random: np.random.RandomState
+    ) -> tuple[Array, Array]:
         proposals, ratios = [], []
         for mine in np.split(np.arange(len(coords)), self.ensembles):
             sets = [coords[mine[halves[mine] == k]] for k in range(self.move.nsplits)]
@@ -59,7 +64,7 @@ class Grouped(Move):
         return np.concatenate(proposals), np.concatenate(ratios)
 
 
-class Counted(Move):
+class Counted(Move):  # type: ignore[misc] # emcee has no types
     """Count how often a move is accepted.
 
     Parameters
@@ -79,7 +84,7 @@ class Counted(Move):
         self.name, self.move = name, move
         self.proposed = self.accepted = 0
 
-    def propose(self, model, state: State) -> tuple[State, NDArray[np.bool_]]:
+    def propose(self, model: Any, state: State) -> tuple[State, Flags]:
         """Pass on, and count."""
         state, accepted = self.move.propose(model, state)
         self.proposed += len(accepted)

@@ -9,7 +9,7 @@ from bayesoleo._types import Array
 from bayesoleo.posterior.approximation.mixture import Mixture
 
 
-class IndependenceMove(MHMove):
+class IndependenceMove(MHMove):  # type: ignore[misc] # emcee has no types
     """Metropolis-Hastings with a proposal that does not depend on the walker.
 
     Parameters

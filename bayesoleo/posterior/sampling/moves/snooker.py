@@ -8,7 +8,7 @@ from emcee.moves import RedBlueMove
 from bayesoleo._types import Array
 
 
-class SnookerMove(RedBlueMove):
+class SnookerMove(RedBlueMove):  # type: ignore[misc] # emcee has no types
     """Step along the line to another walker, by the difference of two more projected on it.
 
     Parameters
