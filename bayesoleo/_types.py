@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Bool as Bool
+from jaxtyping import Complex as Complex
+from jaxtyping import Float as Float
+from jaxtyping import Int as Int
 from numpy.typing import NDArray
 
 #: Real numbers in double precision; docstrings give the shape and the unit.

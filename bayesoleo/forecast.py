@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.assessment import Score, score_draws
 from bayesoleo.assessment.series import judged_errors
 from bayesoleo.data import ReducedCampaign
@@ -70,8 +70,8 @@ class Known:
     """
 
     values: Mapping[str, float]
-    draws: Mapping[str, Array]
-    sd: Mapping[str, Array]
+    draws: Mapping[str, Float[Array, " draws"]]
+    sd: Mapping[str, Float[Array, " draws"]]
 
 
 def predict(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, stats
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 
 
 @dataclass(frozen=True)
@@ -227,9 +227,9 @@ class Dependence:
         F-test of the bins, samples counted by their memory.
     """
 
-    centres: Array
-    means: Array
-    errors: Array
+    centres: Float[Array, " bins"]
+    means: Float[Array, " bins"]
+    errors: Float[Array, " bins"]
     share: float
     outcome: Outcome
 

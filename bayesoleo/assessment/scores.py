@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 
 
@@ -35,7 +35,7 @@ class Score:
     """
 
     log_score: float
-    pit: Array
+    pit: Float[Array, " samples"]
     coverage: float
     level: float
     distance: float

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.data.averaging import PeriodicAverage, periodic_average
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation.estimators.point import PointEstimate
@@ -58,10 +58,10 @@ class Series:
     role: str
     group: str
     unit: str
-    residual: Array
+    residual: Float[Array, " samples"]
     time_step: float
     frequency: float
-    variables: Mapping[str, Array]
+    variables: Mapping[str, Float[Array, " samples"]]
     units: Mapping[str, str] = field(default_factory=dict)
     input_noise: float = 0.0
     judged: Mapping[str, float] = field(default_factory=dict)

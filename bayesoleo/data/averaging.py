@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Complex, ComplexArray, Float
 from bayesoleo.data.transforms import HarmonicBasis
 from bayesoleo.errors import InputError
 
@@ -37,8 +36,8 @@ class PeriodicAverage:
         Standard error of the average, root mean square over the period: ``sigma * sqrt(M / N)``.
     """
 
-    values: Array
-    coefficients: NDArray[np.complex128]
+    values: Float[Array, " samples"]
+    coefficients: Complex[ComplexArray, " harmonics"]
     samples: int
     number: int
     repeating: float

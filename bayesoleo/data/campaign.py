@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.data.bad_samples import impossible_sample
 from bayesoleo.data.checked_table import FILE, choose
 from bayesoleo.data.declaration import Channel, Declaration, read_declaration
@@ -60,8 +60,8 @@ class Run:
     role: str
     kind: str
     frequency: float | None
-    time: Array
-    samples: Mapping[str, Array]
+    time: Float[Array, " samples"]
+    samples: Mapping[str, Float[Array, " samples"]]
     conditions: Mapping[str, float] = field(default_factory=dict)
     condition_units: Mapping[str, str] = field(default_factory=dict)
     condition_sd: Mapping[str, float] = field(default_factory=dict)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.data.checked_table import FILE
 from bayesoleo.data.declaration import FORMAT
 from bayesoleo.errors import CampaignError
@@ -46,8 +46,8 @@ class SimulatedRun:
     """
 
     label: str
-    time: Array
-    samples: Mapping[str, Array]
+    time: Float[Array, " samples"]
+    samples: Mapping[str, Float[Array, " samples"]]
     frequency: float | None = None
     group: str = ""
     role: str = "fit"

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.prediction.stability import compared, count_unstable, is_jump, jumps, swings
 from bayesoleo.solvers.orbit import floquet_multipliers
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
@@ -48,10 +48,10 @@ class Anchor:
         Whether it left the branch of the anchor before it, or changed its stability.
     """
 
-    p: Array
-    x: Array
-    x_p: Array
-    monodromy: Array | None = None
+    p: Float[Array, " constants"]
+    x: Float[Array, "steps width"]
+    x_p: Float[Array, "active steps width"]
+    monodromy: Float[Array, "states states"] | None = None
     jumped: bool = False
 
     def predict(self, change: Array) -> Array:

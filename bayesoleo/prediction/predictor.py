@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.parallel import thread_map
@@ -41,11 +40,11 @@ class RunPrediction:
         Of the periodic solution; its eigenvalues are the Floquet multipliers.
     """
 
-    y: Array
-    sensitivity: Array
+    y: Float[Array, "outputs samples"]
+    sensitivity: Float[Array, "outputs unknowns samples"]
     status: Status
     jumped: bool = False
-    monodromy: Array | None = None
+    monodromy: Float[Array, "states states"] | None = None
 
 
 class Predictor:
@@ -125,24 +124,26 @@ class Predictor:
         for run, known in zip(self.runs, found, strict=True):
             run.restore(known)
 
-    def constants(self, theta: Array, run: int) -> Array:
+    def constants(
+        self, theta: Float[Array, "vectors unknowns"], run: int
+    ) -> Float[Array, "vectors constants"]:
         """Model constants of a run, shape (L, np), from unknowns of shape (L, l)."""
         p = np.repeat(self._base[run][None], theta.shape[0], axis=0)
         p[:, self.runs[run].active] = theta[:, self.layout.columns[run]]
         return p
 
-    def set_anchor(self, theta: Array) -> list[Status]:
+    def set_anchor(self, theta: Float[Array, " unknowns"]) -> list[Status]:
         """Solve every run at ``theta (l,)`` and start later solutions from there."""
         work = range(len(self.runs))
         return thread_map(
             lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs
         )
 
-    def predict(self, theta: Array) -> list[RunPrediction]:
+    def predict(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction]:
         """Outputs and sensitivities of every run at ``theta (l,)``."""
         return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)
 
-    def evaluate(self, theta: Array) -> list[RunPrediction]:
+    def evaluate(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction]:
         """Anchor every run at ``theta (l,)`` and predict it there, by one solve.
 
         Where runs were anchored before and one cannot be solved at ``theta``, all stay where they
@@ -202,11 +203,13 @@ class Predictor:
             None if samples.monodromy is None else samples.monodromy[0],
         )
 
-    def simulate(self, theta: Array, r: int) -> Samples:
+    def simulate(self, theta: Float[Array, "vectors unknowns"], r: int) -> Samples:
         """Outputs of run number ``r`` for many vectors, shape (L, l)."""
         return self.runs[r].predict(self.constants(theta, r))
 
-    def sum_of_squares(self, theta: Array) -> tuple[Array, NDArray[np.int64]]:
+    def sum_of_squares(
+        self, theta: Float[Array, "vectors unknowns"]
+    ) -> tuple[Float[Array, "vectors runs outputs"], Int[Integers, " vectors"]]:
         """Sums of squared residuals, shape (L, N, ny), and the status of each vector, shape (L,).
 
         The work is cut into blocks of runs and vectors; every vector's result is computed from its

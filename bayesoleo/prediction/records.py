@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Complex, ComplexArray, Flags, Float, Int, Integers
 from bayesoleo.prediction.smoothing import Smoothed
 
 PERIODIC, TRANSIENT = "periodic", "transient"
@@ -23,7 +22,9 @@ PERIODIC, TRANSIENT = "periodic", "transient"
 class Signal(Protocol):
     """What an input is to a model: values and derivatives at any phase of a run."""
 
-    def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
+    def evaluate(
+        self, phase: Float[Array, " samples"], frequency: float, derivative: int = 0
+    ) -> Float[Array, " samples"]:
         """Value or time derivative at phases, shape (N,); see :class:`Harmonics`."""
 
     def for_derivative(self, highest: int) -> Signal:
@@ -48,9 +49,9 @@ class Harmonics:
         for all further ones; none where all harmonics count.
     """
 
-    orders: NDArray[np.int64]
-    coefficients: NDArray[np.complex128]
-    variances: Array
+    orders: Int[Integers, " harmonics"]
+    coefficients: Complex[ComplexArray, " harmonics"]
+    variances: Float[Array, " harmonics"]
     limits: tuple[float, ...] = ()
 
     def for_derivative(self, highest: int) -> Harmonics:
@@ -140,15 +141,15 @@ class Record:
     frequency: float
     frequency_sd: float
     periods: int
-    time: Array
-    samples: Mapping[str, Array]
+    time: Float[Array, " samples"]
+    samples: Mapping[str, Float[Array, " samples"]]
     harmonics: Mapping[str, Harmonics]
     signal_noise: Mapping[str, float]
     conditions: Mapping[str, float] = field(default_factory=dict)
     condition_sd: Mapping[str, float] = field(default_factory=dict)
     dropped_periods: int = 0
     smoothed: Mapping[str, Smoothed] = field(default_factory=dict)
-    kept: NDArray[np.bool_] | None = None
+    kept: Bool[Flags, " samples"] | None = None
 
     @property
     def phase(self) -> Array:

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, TIME, WITHIN
@@ -59,11 +59,11 @@ class Samples:
         multipliers.
     """
 
-    y: Array
-    y_p: Array | None
-    status: NDArray[np.int64]
-    jumped: NDArray[np.bool_] | None = None
-    monodromy: Array | None = None
+    y: Float[Array, "vectors outputs samples"]
+    y_p: Float[Array, "vectors outputs active samples"] | None
+    status: Int[Integers, " vectors"]
+    jumped: Bool[Flags, " vectors"] | None = None
+    monodromy: Float[Array, "vectors states states"] | None = None
 
 
 class RunPredictor:

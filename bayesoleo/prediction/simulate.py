@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
@@ -133,8 +133,8 @@ class Simulation:
     group: str
     role: str
     frequency: float
-    time: Array
-    samples: Mapping[str, Array]
+    time: Float[Array, " samples"]
+    samples: Mapping[str, Float[Array, " samples"]]
     conditions: Mapping[str, float]
     run: RunPredictor | None = field(default=None, repr=False, compare=False)
 

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize_scalar
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.prediction.filtering import Band, filtered
 from bayesoleo.prediction.kalman import innovations, process_noise, smooth, walk
@@ -58,7 +58,7 @@ class Smoothed:
     """
 
     step: float
-    states: Array
+    states: Float[Array, "samples 3"]
     noise: float = 0.0
     roughness: float = 0.0
     band: Band | None = None

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Flags, Integers
+from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.compiled import BLOCK, BlockKernel, pointer
 from bayesoleo.model.derive import Derived
 from bayesoleo.model.kernels import Kernels
@@ -27,11 +27,11 @@ class Places(NamedTuple):
     """A :class:`~bayesoleo.solvers.schemes.collocation.SamplePlan` in blocks: index and position
     (blocks, BLOCK), weights (blocks, s, BLOCK)."""
 
-    index: Any
-    position: Any
-    w0: Any
-    w1: Any
-    w2: Any
+    index: Any  # whole numbers; tuples have a method of this name
+    position: Float[Array, "blocks BLOCK"]
+    w0: Float[Array, "blocks stages BLOCK"]
+    w1: Float[Array, "blocks stages BLOCK"]
+    w2: Float[Array, "blocks stages BLOCK"]
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Flags, Integers
+from bayesoleo._types import Array, Complex, ComplexArray, Flags, Int, Integers
 from bayesoleo.solvers.orbit import floquet_multipliers
 
 __all__ = ["Stability", "count_unstable"]
-
-Complex = NDArray[np.complex128]
 
 #: Nodes of a period at which two motions are compared: another branch differs at most of them.
 COMPARED = 16
@@ -80,7 +78,7 @@ def compared(n: int) -> NDArray[np.int64]:
     return np.unique(np.arange(COMPARED) * n // COMPARED)
 
 
-def count_unstable(multipliers: Complex) -> NDArray[np.int64]:
+def count_unstable(multipliers: ComplexArray) -> NDArray[np.int64]:
     """Number of multipliers ``(..., D)`` outside the unit circle, -1 where they are not known.
 
     Beside a huge one the others are known to its rounding only; what is not known to lie outside
@@ -116,8 +114,8 @@ class Stability:
     """
 
     runs: tuple[str, ...]
-    multipliers: Complex
-    jumps: NDArray[np.int64]
+    multipliers: Complex[ComplexArray, "runs states"]
+    jumps: Int[Integers, " runs"]
 
     @classmethod
     def of(
@@ -208,14 +206,14 @@ JUMPED = (
 )
 
 
-def _telling(multipliers: Complex) -> complex:
+def _telling(multipliers: ComplexArray) -> complex:
     """The least of the real ones where that is the nearest to -1, else the largest."""
     least = multipliers[np.argmin(multipliers.real)]
     near = least.imag == 0 and least.real < NEAR and np.abs(multipliers[0]) <= 1.0 + MARGIN
     return complex(least if near else multipliers[0])
 
 
-def _finding(multipliers: Complex, unstable: int) -> str:
+def _finding(multipliers: ComplexArray, unstable: int) -> str:
     """What a rig would do, where it would not stay on the solution or hardly so."""
     if unstable < 0:
         return ""

@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import parse, split_derivative, symbol
 from bayesoleo.model.initial import EQUILIBRIUM, start_of
@@ -43,9 +43,9 @@ class StartStates:
         Values of :class:`~bayesoleo.solvers.status.Status`.
     """
 
-    state: Array
-    by_parameter: Array
-    status: NDArray[np.int64]
+    state: Float[Array, "vectors states"]
+    by_parameter: Float[Array, "vectors states active"]
+    status: Int[Integers, " vectors"]
 
 
 class InitialState:

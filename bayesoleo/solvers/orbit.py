@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Complex, ComplexArray, Float
 from bayesoleo.solvers.status import Status
 
 
@@ -34,10 +33,10 @@ class Orbit:
         How often the equations were evaluated, counted by points in time.
     """
 
-    phases: Array
-    states: Array
+    phases: Float[Array, " points"]
+    states: Float[Array, "points states"]
     period: float
-    multipliers: NDArray[np.complex128]
+    multipliers: Complex[ComplexArray, " states"]
     status: Status
     error: float
     evaluations: int
@@ -52,7 +51,9 @@ class Orbit:
         return bool(np.all(np.abs(self.multipliers) < 1.0))
 
 
-def floquet_multipliers(monodromy: Array) -> NDArray[np.complex128]:
+def floquet_multipliers(
+    monodromy: Float[Array, "states states"],
+) -> Complex[ComplexArray, " states"]:
     """Eigenvalues of a monodromy matrix ``(D, D)``, largest first; NaN if it is not finite."""
     if not np.isfinite(monodromy).all():
         return np.full(monodromy.shape[0], complex(np.nan))

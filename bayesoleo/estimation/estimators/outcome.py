@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.estimation.problems.problem import Evaluation
 from bayesoleo.solvers.status import Status
 
@@ -28,8 +28,8 @@ class Iteration:
     """
 
     number: int
-    theta: Array
-    variance: Array
+    theta: Float[Array, " unknowns"]
+    variance: Float[Array, " outputs"] | Float[Array, "outputs outputs"]
     objective: float
     halvings: int
 
@@ -52,7 +52,7 @@ class Outcome:
         Evaluations that came to nothing, by the lower-case name of their status.
     """
 
-    theta: Array
+    theta: Float[Array, " unknowns"]
     evaluation: Evaluation
     status: Status
     history: tuple[Iteration, ...]

@@ -8,9 +8,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.status import Status
 
@@ -88,10 +87,10 @@ class PointEstimate:
 
     names: tuple[str, ...]
     outputs: tuple[str, ...]
-    theta: Array
-    variance: Array
-    covariance: Array
-    covariance_likelihood: Array
+    theta: Float[Array, " unknowns"]
+    variance: Float[Array, " outputs"]
+    covariance: Float[Array, "unknowns unknowns"]
+    covariance_likelihood: Float[Array, "unknowns unknowns"]
     method: str
     status: Status
     iterations: int
@@ -99,14 +98,14 @@ class PointEstimate:
     evaluations: int
     objective: float
     distance: float
-    start: Array
-    history: Array = field(repr=False)
-    history_variance: Array = field(repr=False)
-    history_objective: Array = field(repr=False)
-    history_halvings: NDArray[np.int64] = field(repr=False)
+    start: Float[Array, " unknowns"]
+    history: Float[Array, "iterates unknowns"] = field(repr=False)
+    history_variance: Float[Array, "iterates outputs"] = field(repr=False)
+    history_objective: Float[Array, " iterates"] = field(repr=False)
+    history_halvings: Int[Integers, " iterates"] = field(repr=False)
     on_limit: tuple[str, ...] = ()
     objective_name: str = "diagonal"
-    error_covariance: Array | None = field(default=None, repr=False)
+    error_covariance: Float[Array, "outputs outputs"] | None = field(default=None, repr=False)
     failures: Mapping[str, int] = field(default_factory=dict)
     stability: Stability | None = field(default=None, repr=False)
     exact: tuple[str, ...] = ()

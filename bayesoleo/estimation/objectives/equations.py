@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.estimation.objectives.bounded import bounded_step, on_limit
 from bayesoleo.estimation.objectives.linearise import RANK, inverse_gram
 
@@ -37,12 +37,12 @@ class Equations:
         Standard deviation by which rows were whitened, the outputs' geometric mean.
     """
 
-    jacobian: Array
-    residual: Array
-    slope: Array
-    room: tuple[Array, Array]
-    root: Array
-    place: Array
+    jacobian: Float[Array, "rows unknowns"]
+    residual: Float[Array, " rows"]
+    slope: Float[Array, " unknowns"]
+    room: tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
+    root: Float[Array, "unknowns unknowns"]
+    place: Float[Array, " unknowns"]
     noise: float = 1.0
 
     @property

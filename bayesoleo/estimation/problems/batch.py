@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.estimation.problems.problem import Problem
 
 
@@ -35,10 +34,10 @@ class NormalEquations:
         numbers mean nothing.
     """
 
-    gram: Array
-    slope: Array
-    sums: Array
-    status: NDArray[np.int64]
+    gram: Float[Array, "vectors outputs unknowns unknowns"]
+    slope: Float[Array, "vectors outputs unknowns"]
+    sums: Float[Array, "vectors outputs"]
+    status: Int[Integers, " vectors"]
 
 
 @runtime_checkable

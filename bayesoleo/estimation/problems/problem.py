@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
 
@@ -36,10 +35,10 @@ class Evaluation:
         multipliers.
     """
 
-    residual: tuple[Array, ...]
-    sensitivity: tuple[Array, ...]
+    residual: tuple[Float[Array, " _samples"], ...]
+    sensitivity: tuple[Float[Array, "_samples unknowns"], ...]
     status: Status
-    monodromy: tuple[Array | None, ...] = ()
+    monodromy: tuple[Float[Array, "states states"] | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,11 +53,11 @@ class Misfit:
         Values of :class:`~bayesoleo.solvers.status.Status`.
     """
 
-    sum_of_squares: Array
-    status: NDArray[np.int64]
+    sum_of_squares: Float[Array, "vectors runs outputs"]
+    status: Int[Integers, " vectors"]
 
 
-def jumps_of(problem: Problem) -> NDArray[np.int64]:
+def jumps_of(problem: Problem) -> Int[Integers, " runs"]:
     """Solutions so far that left their branch, by run, shape (N,); zeros where none are counted."""
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
 
@@ -71,7 +70,7 @@ class Named(Protocol):
         """Of the unknowns."""
 
 
-def measured_of(problem: Named) -> NDArray[np.bool_]:
+def measured_of(problem: Named) -> Bool[Flags, " unknowns"]:
     """Which unknowns have a prior that is a measurement, shape (l,).
 
     These are nuisance parameters and constants known to a tolerance: what is known of them counts
@@ -93,7 +92,7 @@ class Problem(Protocol):
         """Prior of each unknown."""
 
     @property
-    def start(self) -> Array:
+    def start(self) -> Float[Array, " unknowns"]:
         """Where an estimate starts, shape (l,)."""
 
     @property
@@ -105,13 +104,13 @@ class Problem(Protocol):
         """Labels of the runs."""
 
     @property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Int[Integers, "runs outputs"]:
         """Number of samples by run and output, shape (N, s)."""
 
-    def evaluate(self, theta: Array) -> Evaluation:
+    def evaluate(self, theta: Float[Array, " unknowns"]) -> Evaluation:
         """Residuals and sensitivities at one vector, shape (l,)."""
 
-    def misfit(self, theta: Array) -> Misfit:
+    def misfit(self, theta: Float[Array, "vectors unknowns"]) -> Misfit:
         """Sums of squares at many vectors, shape (L, l).
 
         Each depends on its own vector alone, bit for bit.

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.estimation.problems.problem import Problem
 
 
@@ -27,7 +26,7 @@ class RunSamples:
         Cycles from the crest of what drives the run to the first sample.
     """
 
-    time: Array
+    time: Float[Array, " samples"]
     frequency: float | None
     origin: float = 0.0
 
@@ -52,7 +51,9 @@ class ResidualProblem(Problem, Protocol):
     def samples(self) -> tuple[RunSamples, ...]:
         """When the samples of each run were taken, length N."""
 
-    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+    def residuals(
+        self, theta: Float[Array, "vectors unknowns"], run: int
+    ) -> tuple[Float[Array, "vectors outputs samples"], Int[Integers, " vectors"]]:
         """Residuals (L, s, n) of one run at vectors (L, l), and statuses (L,).
 
         Each depends on its own vector alone, bit for bit.

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Flags, Float
 from bayesoleo.errors import InputError
 from bayesoleo.model.correlated import Correlated, log_density_of, scaled_root
 from bayesoleo.model.priors import LogNormal, Normal, Prior
@@ -56,13 +56,13 @@ class PriorScale:
     """
 
     priors: tuple[Prior, ...]
-    mean: Array
-    sd: Array
-    low: Array
-    high: Array
-    logarithmic: NDArray[np.bool_]
-    spread: Array
-    root: Array
+    mean: Float[Array, " unknowns"]
+    sd: Float[Array, " unknowns"]
+    low: Float[Array, " unknowns"]
+    high: Float[Array, " unknowns"]
+    logarithmic: Bool[Flags, " unknowns"]
+    spread: Float[Array, " unknowns"]
+    root: Float[Array, "unknowns unknowns"]
 
     @classmethod
     def of(cls, priors: Sequence[Prior], names: Sequence[str]) -> PriorScale:

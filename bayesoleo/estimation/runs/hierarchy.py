@@ -28,7 +28,7 @@ import xarray as xr
 from scipy import stats
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.runs.comparable import check_definite, comparable
 from bayesoleo.estimation.runs.scatter import (
@@ -71,15 +71,15 @@ class Hierarchy:
 
     names: tuple[str, ...]
     runs: tuple[str, ...]
-    mean: Array
-    mean_covariance: Array
-    mean_interval: Array
-    spread: Array
-    spread_covariance: Array
-    spread_interval: Array
-    p_value: Array
-    shrunken: Array
-    shrunken_sd: Array
+    mean: Float[Array, " parameters"]
+    mean_covariance: Float[Array, "parameters parameters"]
+    mean_interval: Float[Array, "parameters 2"]
+    spread: Float[Array, " parameters"]
+    spread_covariance: Float[Array, "parameters parameters"]
+    spread_interval: Float[Array, "parameters 2"]
+    p_value: Float[Array, " parameters"]
+    shrunken: Float[Array, "runs parameters"]
+    shrunken_sd: Float[Array, "runs parameters"]
     level: float
     left_out: tuple[str, ...] = ()
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.estimation.objectives.diagonal import log_likelihood, log_prior
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -77,9 +77,9 @@ class Outcome:
         Of the last point that was linearised.
     """
 
-    theta: Array
-    x: tuple[Array, ...]
-    variance: Array
+    theta: Float[Array, " unknowns"]
+    x: tuple[Float[Array, "_steps _width"], ...]
+    variance: Float[Array, " outputs"]
     status: Status
     history: tuple[Line, ...]
     local: Local | None

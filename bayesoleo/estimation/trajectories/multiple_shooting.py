@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.point import PointEstimate
@@ -67,12 +67,12 @@ class Trajectory:
     """
 
     label: str
-    time: Array
-    states: Array
-    initial_sd: Array
+    time: Float[Array, " nodes"]
+    states: Float[Array, "nodes states"]
+    initial_sd: Float[Array, " states"]
     outputs: tuple[str, ...]
-    predicted: Array
-    residual: Array
+    predicted: Float[Array, "outputs samples"]
+    residual: Float[Array, "outputs samples"]
     gap: float
     names: tuple[str, ...]
 

@@ -15,7 +15,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.problem import Problem
@@ -107,9 +107,9 @@ class Line:
         Where the fall reaches the limit; infinite where it does not.
     """
 
-    values: Array
-    falls: Array
-    paths: Array
+    values: Float[Array, " points"]
+    falls: Float[Array, " points"]
+    paths: Float[Array, "points unknowns"]
     low: float
     high: float
 

@@ -19,7 +19,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.known import without_measured
@@ -57,12 +57,12 @@ class Replications:
 
     names: tuple[str, ...]
     outputs: tuple[str, ...]
-    theta: Array
-    variance: Array
-    covariance: Array
-    status: NDArray[np.int64]
-    iterations: NDArray[np.int64]
-    together: NDArray[np.bool_]
+    theta: Float[Array, "replications unknowns"]
+    variance: Float[Array, "replications outputs"]
+    covariance: Float[Array, "replications unknowns unknowns"]
+    status: Int[Integers, " replications"]
+    iterations: Int[Integers, " replications"]
+    together: Bool[Flags, " replications"]
     method: str
 
     def __len__(self) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.log_density import Density
@@ -47,8 +47,8 @@ class Weighted:
     """
 
     names: tuple[str, ...]
-    draws: Array
-    weights: Array
+    draws: Float[Array, "draws quantities"]
+    weights: Float[Array, " draws"]
     effective_size: float
     shape: float
     evaluations: int

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import DEGREES_OF_FREEDOM, Mixture
 from bayesoleo.posterior.density.differences import derivatives
@@ -46,8 +46,8 @@ class Mode:
     densities", *JASA* 81, eq. 2.2.
     """
 
-    centre: Array
-    covariance: Array
+    centre: Float[Array, " coordinates"]
+    covariance: Float[Array, "coordinates coordinates"]
     log_weight: float
     status: Status
 

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 
 #: Tails heavy enough that the ratio target / proposal stays bounded where a normal approximation
@@ -41,10 +41,10 @@ class Mixture:
         If shapes disagree, or a scale matrix is not positive definite.
     """
 
-    centres: Array
-    covariances: Array
-    log_weights: Array
-    degrees: float | Array = DEGREES_OF_FREEDOM
+    centres: Float[Array, "components coordinates"]
+    covariances: Float[Array, "components coordinates coordinates"]
+    log_weights: Float[Array, " components"]
+    degrees: float | Float[Array, " components"] = DEGREES_OF_FREEDOM
 
     def __post_init__(self) -> None:
         components, dimension = np.shape(self.centres)
@@ -95,7 +95,7 @@ class Mixture:
         with np.errstate(divide="ignore"):
             return cast(Array, np.log(self.weights) + constant - log_det + kernel)
 
-    def log_density(self, phi: Array) -> Array:
+    def log_density(self, phi: Float[Array, "points coordinates"]) -> Float[Array, " points"]:
         """Normalised log density, shape (W,), at rows of shape (W, d).
 
         References

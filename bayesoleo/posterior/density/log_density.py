@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Misfit, Problem, jumps_of
 from bayesoleo.estimation.problems.residuals import ResidualProblem
@@ -39,10 +39,14 @@ class Density(Protocol):
     def runs(self) -> tuple[str, ...]:
         """Labels of the ``N`` parts of the log-likelihood."""
 
-    def natural(self, phi: Array) -> Array:
+    def natural(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
         """Quantities in natural units, shape (W, d), from coordinates, shape (W, d)."""
 
-    def __call__(self, phi: Array) -> tuple[Array, Array]:
+    def __call__(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> tuple[Float[Array, " walkers"], Float[Array, "walkers runs"]]:
         """Log density, shape (W,), and log-likelihood by run, shape (W, N)."""
 
 
@@ -135,19 +139,25 @@ class LogDensity:
         """Solutions of runs so far that left the branch of the one they started from."""
         return int(jumps_of(self.problem).sum())
 
-    def natural(self, phi: Array) -> Array:
+    def natural(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
         """All quantities in their units, from coordinates, both of shape (W, p + m)."""
         block, eta = self.split(np.asarray(phi, dtype=float))
         return np.concatenate([self.unknowns.natural(block), self.errors.natural(eta)], axis=1)
 
-    def coordinates(self, natural: Array) -> Array:
+    def coordinates(
+        self, natural: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
         """Coordinates of quantities in their units, both of shape (W, p + m)."""
         block, eta = self.split(np.asarray(natural, dtype=float))
         return np.concatenate(
             [self.unknowns.coordinates(block), self.errors.coordinates(eta)], axis=1
         )
 
-    def __call__(self, phi: Array) -> tuple[Array, Array]:
+    def __call__(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> tuple[Float[Array, " walkers"], Float[Array, "walkers runs"]]:
         """Evaluate all rows.
 
         Parameters
@@ -184,11 +194,11 @@ class LogDensity:
                 total += run
         return self._mark_failures(total, by_run, status)
 
-    def dispersed(self, rng: np.random.Generator, count: int) -> Array:
+    def dispersed(self, rng: np.random.Generator, count: int) -> Float[Array, "count coordinates"]:
         """Draws of the unknowns' prior as coordinates, shape (count, p)."""
         return self.unknowns.coordinates(self.unknowns.sample_prior(rng, count))
 
-    def log_prior(self, phi: Array) -> Array:
+    def log_prior(self, phi: Float[Array, "walkers quantities"]) -> Float[Array, " walkers"]:
         """Log prior density of the coordinates, shape (W,), Jacobian included."""
         block, eta = self.split(phi)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

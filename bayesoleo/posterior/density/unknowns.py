@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.model.correlated import log_density_of, sample_of
 from bayesoleo.model.priors import Prior
 from bayesoleo.posterior.density.transforms import Transforms
@@ -31,39 +31,47 @@ class Unknowns(ABC):
         """Names of the ``p`` quantities, the problem's first."""
 
     @abstractmethod
-    def theta(self, block: Array) -> Array:
+    def theta(self, block: Float[Array, "walkers coordinates"]) -> Float[Array, "walkers unknowns"]:
         """Unknowns of the problem in their units, shape (W, l), from coordinates (W, p)."""
 
     @abstractmethod
-    def natural(self, block: Array) -> Array:
+    def natural(
+        self, block: Float[Array, "walkers coordinates"]
+    ) -> Float[Array, "walkers coordinates"]:
         """All quantities in their units from coordinates, both of shape (W, p)."""
 
     @abstractmethod
-    def coordinates(self, natural: Array) -> Array:
+    def coordinates(
+        self, natural: Float[Array, "walkers coordinates"]
+    ) -> Float[Array, "walkers coordinates"]:
         """Coordinates of quantities in their units, both of shape (W, p)."""
 
     @abstractmethod
-    def log_prior(self, block: Array) -> Array:
+    def log_prior(self, block: Float[Array, "walkers coordinates"]) -> Float[Array, " walkers"]:
         """Log prior density of the coordinates, Jacobian included, shape (W,)."""
 
     @abstractmethod
-    def natural_log_prior(self, natural: Array) -> dict[str, Array]:
+    def natural_log_prior(
+        self, natural: Float[Array, "walkers coordinates"]
+    ) -> dict[str, Float[Array, " walkers"]]:
         """Log prior density of each quantity, shape (W,), over quantities in their units (W, p)."""
 
     @abstractmethod
-    def sample_prior(self, rng: np.random.Generator, size: int) -> Array:
+    def sample_prior(self, rng: np.random.Generator, size: int) -> Float[Array, "size coordinates"]:
         """Draws of the quantities, shape (size, p)."""
 
     @abstractmethod
-    def start(self, theta: Array) -> Array:
+    def start(self, theta: Float[Array, " unknowns"]) -> Float[Array, " coordinates"]:
         """Coordinates, shape (p,), of a parameter vector, shape (l,)."""
 
     @abstractmethod
-    def jacobian(self, block: Array) -> Array:
+    def jacobian(self, block: Float[Array, " coordinates"]) -> Float[Array, "unknowns coordinates"]:
         """Derivatives of the unknowns with respect to the coordinates at (p,), shape (l, p)."""
 
     @abstractmethod
-    def precision(self, block: Array) -> Array:
+    def precision(
+        self, block: Float[Array, " coordinates"]
+    ) -> Float[Array, "coordinates coordinates"]:
         """Rough curvature of the log prior over the coordinates at (p,): (p, p), positive."""
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.posterior.density.log_density import LOG_VARIANCE
 from bayesoleo.posterior.sampling.segment import REASONS
@@ -60,22 +59,22 @@ class Samples:
 
     names: tuple[str, ...]
     runs: tuple[str, ...]
-    draws: Array
-    log_density: Array
-    log_likelihood: Array
-    ensemble: NDArray[np.int64]
-    start: Array
+    draws: Float[Array, "chains draws quantities"]
+    log_density: Float[Array, "chains draws"]
+    log_likelihood: Float[Array, "chains draws runs"]
+    ensemble: Int[Integers, " chains"]
+    start: Float[Array, "chains quantities"]
     mixture: Mixture
-    autocorrelation_time: Array
-    effective_size: Array
-    rhat_nested: Array
+    autocorrelation_time: Float[Array, " quantities"]
+    effective_size: Float[Array, " quantities"]
+    rhat_nested: Float[Array, " quantities"]
     acceptance: dict[str, float]
     evaluations: int
     failures: dict[str, int]
     reached: bool
     warning: str
     branch_jumps: int = 0
-    failed: NDArray[np.int64] = field(
+    failed: Int[Integers, "draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
 

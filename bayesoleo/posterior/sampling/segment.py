@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.posterior.approximation.mixture import Mixture
 from bayesoleo.solvers.status import Status
 
@@ -51,9 +51,9 @@ class Segment:
     """
 
     phase: Phase
-    coords: Array
-    log_density: Array
-    by_run: Array
+    coords: Float[Array, "draws chains coordinates"]
+    log_density: Float[Array, "draws chains"]
+    by_run: Float[Array, "draws chains runs"]
     random_state: RandomState
     mixture: Mixture
     evaluations: int
@@ -61,7 +61,7 @@ class Segment:
     proposed: Counter[str] = field(default_factory=Counter)
     accepted: Counter[str] = field(default_factory=Counter)
     branch_jumps: int = 0
-    failed: NDArray[np.int64] = field(
+    failed: Int[Integers, "draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
 

@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
     Condition,
@@ -45,7 +45,7 @@ class LimitCycle:
 
     solution: BorderedSolution
     orbit: Orbit
-    period_theta: Array
+    period_theta: Float[Array, " active"]
 
     @property
     def own(self) -> complex:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.schemes.collocation import Collocation
 from bayesoleo.solvers.status import Status
@@ -78,10 +78,10 @@ class BorderedSolution:
     iterations : int
     """
 
-    x: Array
+    x: Float[Array, "steps width"]
     value: float
-    monodromy: Array
-    by_value: Array
+    monodromy: Float[Array, "states states"]
+    by_value: Float[Array, " states"]
     status: Status
     iterations: int
 

@@ -17,10 +17,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Complex, ComplexArray, Float
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
     Condition,
@@ -58,9 +57,9 @@ class BranchPoint:
     """
 
     value: float
-    x: Array
-    multipliers: NDArray[np.complex128]
-    tangent: Array
+    x: Float[Array, "steps width"]
+    multipliers: Complex[ComplexArray, " states"]
+    tangent: Float[Array, " states+1"]
 
     @property
     def unstable(self) -> int:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Integers
 from bayesoleo.compiled import BLOCK
 from bayesoleo.solvers.schemes.unrolled.emit import COLUMNS, REACH, WIDTH
 from bayesoleo.solvers.schemes.unrolled.program import Program, chunks
@@ -102,12 +102,12 @@ class Sweep(NamedTuple):
     """Order of the steps, inputs and lengths of steps, as they are swept; ``again`` is where the
     step of each position stands for good."""
 
-    again: Any
-    source: Any
-    lengths: Any
-    order: Any
-    inputs: Any
-    h: Any
+    again: Integers
+    source: Integers
+    lengths: Integers
+    order: Integers
+    inputs: Array
+    h: Array
 
 
 class Work(NamedTuple):
@@ -203,9 +203,9 @@ class Line(NamedTuple):
     """Where lanes start: ``base (w, positions)`` and ``change (L, na)`` times ``slopes (na, w,
     positions)``; empty where ``x`` says it."""
 
-    base: Any
-    slopes: Any
-    change: Any
+    base: Float[Array, "width positions"]
+    slopes: Float[Array, "active width positions"]
+    change: Float[Array, "vectors active"]
 
 
 NO_LINE = Line(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))

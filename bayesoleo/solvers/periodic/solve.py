@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.compiled import BlockKernel
 from bayesoleo.solvers.periodic import arrangement, measures, newton
 from bayesoleo.solvers.periodic.extrapolation import Extrapolation
@@ -63,7 +63,7 @@ class Boundary:
     equations: Equations
     scheme: Scheme
     period: float
-    inputs: Array
+    inputs: Float[Array, "inputs points"]
     conditions: int
     active: int
 
@@ -99,9 +99,9 @@ class Solution:
         Newton iterations.
     """
 
-    x: Array
-    status: NDArray[np.int64]
-    iterations: NDArray[np.int64]
+    x: Float[Array, "vectors steps width"]
+    status: Int[Integers, " vectors"]
+    iterations: Int[Integers, " vectors"]
 
 
 #: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
@@ -114,8 +114,8 @@ MAXIMUM_HALVINGS = 12
 
 def solve_periodic(
     problem: Boundary,
-    p: Array,
-    start: Array,
+    p: Float[Array, "vectors constants"],
+    start: Float[Array, "vectors steps width"],
     *,
     max_iterations: int = 40,
     monotone: bool = True,

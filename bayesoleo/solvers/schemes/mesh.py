@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 
 
@@ -26,7 +26,7 @@ class Mesh:
         If the edges do not rise from 0 to 1.
     """
 
-    edges: Array
+    edges: Float[Array, " edges"]
 
     def __post_init__(self) -> None:
         edges = np.asarray(self.edges, dtype=np.float64)

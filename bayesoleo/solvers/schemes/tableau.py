@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import Polynomial, legendre
 from numpy.polynomial.polynomial import polyval
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 
 
@@ -33,9 +33,9 @@ class Tableau:
 
     name: str
     order: int
-    c: Array
-    a: Array
-    b: Array
+    c: Float[Array, " stages"]
+    a: Float[Array, "stages stages"]
+    b: Float[Array, " stages"]
 
     @property
     def stages(self) -> int:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Bool, Flags, Float
 from bayesoleo.compiled import Kernel
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.shooting import march as loop
@@ -121,15 +121,15 @@ class Trajectory:
         The given steps were too long.
     """
 
-    times: Array
-    states: Array
-    tops: Array
-    switched: NDArray[np.bool_]
-    aims: Array
-    derivatives: Array
+    times: Float[Array, " nodes"]
+    states: Float[Array, "nodes states"]
+    tops: Float[Array, "steps stages dofs"]
+    switched: Bool[Flags, " steps"]
+    aims: Float[Array, " steps"]
+    derivatives: Float[Array, "states columns"]
     by: Array
     tops_by: Array
-    scale: Array
+    scale: Float[Array, " states"]
     status: Status
     evaluations: int
     orders: tuple[int, ...]

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
 from bayesoleo.solvers.shooting.initial_value import Dynamics, Trajectory, solve_initial_value
 from bayesoleo.solvers.status import Status
@@ -57,8 +57,8 @@ class Shot:
 
     trajectory: Trajectory
     status: Status
-    monodromy: Array
-    start_theta: Array
+    monodromy: Float[Array, "states states"]
+    start_theta: Float[Array, "states active"]
     iterations: int
     halvings: int
     evaluations: int

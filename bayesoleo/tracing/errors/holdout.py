@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.estimation import estimate
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.prediction.predictor import Predictor
@@ -38,7 +38,7 @@ class Prediction:
     """
 
     record: Record
-    y: Array
+    y: Float[Array, "outputs samples"]
     theta: dict[str, float]
     re_estimated: int
     status: Status

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Float
 from bayesoleo.effects.unnamed import Axis, UnnamedEffect, balance_unit_at
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.state import State
@@ -43,9 +43,9 @@ class Shape:
     target: str
     axes: tuple[Axis, ...]
     unit: str
-    places: Array
-    value: Array
-    sd: Array
+    places: Float[Array, "quantities points"]
+    value: Float[Array, " points"]
+    sd: Float[Array, " points"]
 
 
 def shapes(state: State) -> Iterator[Shape]:

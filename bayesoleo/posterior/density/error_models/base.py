@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from typing import ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Int, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.residuals import RunSamples
@@ -106,7 +105,7 @@ class Frame:
 
     outputs: tuple[str, ...]
     runs: tuple[str, ...]
-    counts: NDArray[np.int64]
+    counts: Int[Integers, "runs outputs"]
     samples: tuple[RunSamples, ...] | None
     log_variance_prior: Mapping[str, Prior]
 
