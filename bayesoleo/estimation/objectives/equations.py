@@ -29,8 +29,9 @@ class Equations:
         Derivative of the log prior where the prior is fixed at its centre, zero otherwise.
     room : tuple of ndarray, each shape (l,)
         Distances to the limits of the support, or to how far a logarithm may go in one step.
-    root : ndarray, shape (l, l)
-        Rows ``P`` with ``P'P`` the prior's precision; upper triangular.
+    root : ndarray, shape (l, l) or (0, l)
+        Rows ``P`` with ``P'P`` the prior's precision; upper triangular. Newton's method has none:
+        its matrix contains the prior.
     place : ndarray, shape (l,)
         Scaled unknowns where this is, by which a first step is judged.
     noise : float
@@ -41,7 +42,7 @@ class Equations:
     residual: Float[Array, " rows"]
     slope: Float[Array, " unknowns"]
     room: tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
-    root: Float[Array, "unknowns unknowns"]
+    root: Float[Array, "_rows unknowns"]
     place: Float[Array, " unknowns"]
     noise: float = 1.0
 

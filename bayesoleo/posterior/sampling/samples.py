@@ -74,7 +74,7 @@ class Samples:
     reached: bool
     warning: str
     branch_jumps: int = 0
-    failed: Int[Integers, "draws reasons"] = field(
+    failed: Int[Integers, "_draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
 

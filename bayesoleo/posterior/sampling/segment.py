@@ -61,7 +61,7 @@ class Segment:
     proposed: Counter[str] = field(default_factory=Counter)
     accepted: Counter[str] = field(default_factory=Counter)
     branch_jumps: int = 0
-    failed: Int[Integers, "draws reasons"] = field(
+    failed: Int[Integers, "_draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
 
