@@ -11,12 +11,9 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
-from bayesoleo._types import Array
-
-ComplexArray = NDArray[np.complex128]
+from bayesoleo._types import Array, ComplexArray
 
 # Part of the largest curvature below which a direction's own is rounding.
 _UNSEEN = 1e-9

@@ -22,8 +22,6 @@ from bayesoleo.prediction.inputs import input_rows, signal_of
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.status import Status
 
-Flags = NDArray[np.bool_]
-
 MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
 #: A Newton step this small, over the state's size, leaves round-off only.
 SMALL_STEP = 1e-12

@@ -15,10 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.solvers.schemes.elimination import eliminate, jit
-
-Flags = NDArray[np.bool_]
 
 #: ``(times in s, shape (N,)) -> rows of inputs, shape (nu, N)``.
 Inputs = Callable[[Array], Array]
