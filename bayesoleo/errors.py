@@ -8,6 +8,7 @@ becomes minus infinity and is counted by reason.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 
@@ -71,6 +72,46 @@ class ModelError(InputError):
 
 class ResultsError(InputError):
     """A stored result is missing, broken or of another kind than expected."""
+
+
+class MissingExtraError(BayesoleoError, ImportError):
+    """A package is not installed that only some users need.
+
+    Parameters
+    ----------
+    module : str
+        Name of the package.
+    extra : str
+        The optional dependency of bayesoleo that installs it.
+    """
+
+    def __init__(self, module: str, extra: str) -> None:
+        self.extra = extra
+        text = f"this needs the package {module}; pip install 'bayesoleo[{extra}]' installs it"
+        super().__init__(text, name=module)
+
+
+def import_extra(module: str, extra: str) -> Any:
+    """Import a package that is an optional dependency.
+
+    Parameters
+    ----------
+    module, extra : str
+        As :class:`MissingExtraError` takes them.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingExtraError
+        If the package is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(module, extra) from error
 
 
 class UnfinishedError(BayesoleoError):

@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from bayesoleo.errors import InputError, ResultsError
+from bayesoleo.errors import InputError, ResultsError, import_extra
 from bayesoleo.parallel import available_cores, limit_threads, single_blas_thread
 
 if TYPE_CHECKING:
@@ -47,17 +47,16 @@ def connected(scheduler: str | None) -> Iterator[Client | None]:
     ------
     InputError
         If the scheduler does not answer, or the number of processes is none.
+    MissingExtraError
+        If Dask is not installed.
     """
     if scheduler is None:
         yield None
         return
-    from distributed import Client
-
+    distributed = import_extra("distributed", "dask")
     if scheduler.partition(":")[0] == LOCAL:
-        from distributed import LocalCluster
-
         with (
-            LocalCluster(
+            distributed.LocalCluster(
                 n_workers=_processes(scheduler),
                 threads_per_worker=1,
                 processes=True,
@@ -65,12 +64,12 @@ def connected(scheduler: str | None) -> Iterator[Client | None]:
                 dashboard_address="localhost:0",
                 silence_logs="CRITICAL",
             ) as cluster,
-            Client(cluster) as client,
+            distributed.Client(cluster) as client,
         ):
             yield client
         return
     try:
-        client = Client(scheduler, timeout=PATIENCE)
+        client = distributed.Client(scheduler, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         raise InputError(
             "the scheduler does not answer",

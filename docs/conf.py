@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "docs" / "_ext"))
+sys.path.append(str(ROOT / "studies"))  # long calculations that pages of the gallery may repeat
 
 project = "bayesoleo"
 author = "The bayesoleo developers"
@@ -43,6 +44,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",  # model files are no pages
     "within_subsection_order": "FileNameSortKey",
+    "thumbnail_size": (640, 448),
     "image_scrapers": ("matplotlib", "gallery_figures.scrape"),
     "ignore_repr_types": r"matplotlib\.",
     "download_all_examples": False,

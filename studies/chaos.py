@@ -143,5 +143,5 @@ def print_spread(table: dict[tuple[str, str, str], Spread]) -> None:
     print(
         f"noise {100 * NOISE:g} % of the spread, {SAMPLES} samples, starts up to {100 * AWAY:g} % "
         f"off, seeds 0 to {SEEDS - 1}; bayesoleo {version('bayesoleo')};\n"
-        "BAYESOLEO_STORE_FIGURES=1 python studies/plot_chaos.py"
+        "BAYESOLEO_STORE_FIGURES=1 PYTHONPATH=studies python studies/4_solvers/plot_chaos.py"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import chaos
 import numpy as np
@@ -14,32 +14,6 @@ from bayesoleo.plots import style
 COLOURS = dict(zip(chaos.CASES, ("#0072b2", "#56b4e9", "#009e73", "#e69f00"), strict=True))
 #: Width of the strip in which the fifty estimates of a case stand side by side.
 STRIP = 0.8
-
-
-def draw_landscape(
-    rhos: np.ndarray, time: np.ndarray, misfit: np.ndarray, lengths: Sequence[float]
-) -> Figure:
-    """Misfit over one parameter for records of several lengths; one is that of other motions."""
-    figure = style.blank(style.WIDTH, 2.9)
-    wide = 0.9 / len(lengths)
-    for k, length in enumerate(lengths):
-        axes = figure.add_axes((0.07 + k * wide, 0.18, 0.86 * wide, 0.62))
-        style.dress(axes, 4)
-        values = misfit[:, time <= length].mean(axis=1)
-        axes.plot(rhos, values, color=style.AFTER, lw=1.2)
-        axes.axvline(28.0, color=style.BEFORE, lw=0.9)
-        axes.set_xlim(rhos[0], rhos[-1])
-        axes.set_ylim(bottom=0.0)
-        axes.set_title(f"record of {length:g} s", loc="left", fontsize=style.SMALL, pad=3)
-        axes.set_xlabel("ρ", fontsize=style.TEXT)
-        if k == 0:
-            axes.set_ylabel("misfit over variance", fontsize=style.TEXT)
-    style.legend(
-        figure,
-        [style.line(style.AFTER, "single shooting"), style.line(style.BEFORE, "truth", 0.9)],
-        "σ, β and the initial state at their true values",
-    )
-    return figure
 
 
 def draw_spread(table: Mapping[tuple[str, str, str], chaos.Spread]) -> Figure:

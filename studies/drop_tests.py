@@ -95,41 +95,6 @@ def predict_drop(
     )
 
 
-def nominal_drop(mass: float, factor: float, time: np.ndarray) -> dict[str, np.ndarray]:
-    """Outputs at times of a drop with nominal parameters and the damping times a factor, SI."""
-    model = bayesoleo.system("f16n2d2")
-    damping = factor * model.parameters["orifice_damping"].value
-    dropped = drop_test(model.with_values({"orifice_damping": damping}), mass)
-    nothing = {name: np.zeros(time.size) for name in dropped.outputs}
-    noise = dict.fromkeys(nothing, 0.0)
-    record = Record(
-        "drop", "", "fit", "transient", np.nan, np.nan, 0, time, nothing, {}, noise, CONDITIONS
-    )
-    predictor = Predictor(dropped, [record])
-    theta = predictor.layout.start(dropped)
-    predictor.set_anchor(theta)
-    return dict(zip(predictor.outputs, predictor.simulate(theta[None], 0).y[0], strict=True))
-
-
-def print_nominal_drops() -> dict[tuple[float, float], tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Peaks and the slow end of drops with and without the thesis's damping factors."""
-    made = {}
-    time = np.linspace(0.0, 40.0, 20_001)
-    print("   kg  damping   peak m/s   peak bar   stroke at 2.5, 24, 40 s [mm]")
-    for mass, factor in ((350.0, 1.0), (350.0, 2.0), (825.0, 1.0), (825.0, 2.3)):
-        y = nominal_drop(mass, factor, time)
-        made[mass, factor] = (time, y)
-        stroke = 1e3 * y["displacement"]
-        speed = np.gradient(y["displacement"], time).max()
-        at = np.interp([2.5, 24.0, 40.0], time, stroke)
-        peak = 1 + y["pressure"].max() / 1e5
-        print(
-            f"{mass:5.0f}  × {factor:3.1f}   {speed:9.2f} {peak:10.1f}   "
-            f"{at[0]:.0f}, {at[1]:.0f}, {at[2]:.0f}"
-        )
-    return made
-
-
 def from_estimate(
     point: PointEstimate, model: Model, rng: np.random.Generator, count: int = 200
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:

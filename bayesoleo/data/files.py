@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.data.text import read_text
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, MissingExtraError, import_extra
 
 _SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
 
@@ -41,6 +41,8 @@ def read_columns(
     ------
     CampaignError
         If the file is missing, empty or not what its name says.
+    MissingExtraError
+        If the file is Parquet and pyarrow is not installed.
     """
     if not path.is_file():
         raise CampaignError("no such file", file=path.name, hint=_neighbours(path))
@@ -55,7 +57,7 @@ def read_columns(
         return read_text(path, delimiter, header_delimiter, wanted)
     try:
         columns = reader(path)
-    except CampaignError:
+    except (CampaignError, MissingExtraError):
         raise
     except Exception as error:  # each format's library raises its own types on a broken file
         raise CampaignError(
@@ -94,6 +96,7 @@ def _read_mat(path: Path) -> dict[str, Array]:
 def _read_parquet(path: Path) -> dict[str, Array]:
     import pandas as pd
 
+    import_extra("pyarrow", "parquet")
     table = pd.read_parquet(path)
     return {str(name): table[name].to_numpy(dtype=float) for name in table.select_dtypes("number")}
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, import_extra
 
 #: Environment variable with a folder laid out as ``measured/<name>``, ``campaigns/<name>``,
 #: ``nist``.
@@ -88,6 +88,8 @@ def dataset_folder(name: str, files: Sequence[str] = ()) -> Path:
     ------
     CampaignError
         If the set is unknown or not there, or a file is not the registered one.
+    MissingExtraError
+        If the set has to be fetched and pooch is not installed.
     """
     known = REGISTERED.get(name)
     wanted = tuple(files) or (tuple(known.hashes) if known else ())
@@ -140,8 +142,7 @@ def _digest(path: Path, modified: int, size: int) -> str:
 
 
 def _fetch(name: str, known: RegisteredSet, wanted: Sequence[str]) -> Path:
-    import pooch
-
+    pooch = import_extra("pooch", "data")
     unknown = [file for file in wanted if file not in known.hashes]
     if unknown:
         raise CampaignError(

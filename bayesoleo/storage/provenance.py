@@ -18,7 +18,7 @@ PACKAGES = (
     "numba",
     "xarray",
     "emcee",
-    "arviz",
+    "arviz-stats",
     "h5netcdf",
 )
 """Those whose version can change a number in the result."""

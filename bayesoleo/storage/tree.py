@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo.errors import ResultsError
+from bayesoleo.errors import MissingExtraError, ResultsError, import_extra
 from bayesoleo.storage.atomic import replacing
 
 LARGE = 4096
@@ -39,7 +39,11 @@ def write_tree(tree: xr.DataTree, path: str | os.PathLike[str]) -> None:
     ------
     ResultsError
         The place cannot be written to; an older result there is untouched.
+    MissingExtraError
+        The path ends in ``.zarr`` and Zarr is not installed.
     """
+    if _is_zarr(path):
+        import_extra("zarr", "zarr")
     storable = _storable(tree)
     with replacing(path) as draft:
         if _is_zarr(path):
@@ -64,11 +68,15 @@ def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
     ------
     ResultsError
         The file is missing, empty, cut short, of another kind or from a later version.
+    MissingExtraError
+        The path ends in ``.zarr`` and Zarr is not installed.
     """
     path = Path(path)
     _check_exists(path)
     try:
         tree = _read_zarr(path) if _is_zarr(path) else _read_netcdf(path)
+    except MissingExtraError:
+        raise
     # A damaged file shows itself as almost anything, depending on where it is damaged.
     except Exception as error:
         raise ResultsError(
@@ -152,6 +160,7 @@ def _read_netcdf(path: Path) -> xr.DataTree:
 
 
 def _read_zarr(path: Path) -> xr.DataTree:
+    import_extra("zarr", "zarr")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
         options: dict[str, Any] = {"engine": "zarr", "decode_times": False, "consolidated": False}

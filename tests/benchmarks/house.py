@@ -2,7 +2,8 @@
 
 Run with ``python tests/benchmarks/house.py --json`` for one flat object, or without ``--json``
 for a table. ``--installed`` also installs the core into a fresh environment and measures its
-size and the time of the first import and command; this takes a minute or two.
+size and the time of the first import and command, and lists the largest packages on standard error;
+this takes a minute or two.
 """
 
 from __future__ import annotations
@@ -250,6 +251,8 @@ def measure_installed() -> dict[str, float]:
         listed = subprocess.run(
             [python, "-m", "pip", "list", "--format=json"], check=True, capture_output=True
         )
+        for name, megabytes in package_sizes(python)[:20]:
+            print(f"{name:24} {megabytes:7.1f} MB", file=sys.stderr)
         bare = timed([python, "-c", "pass"])
         return {
             "installed_mb": round(size / 1e6, 1),
@@ -257,6 +260,22 @@ def measure_installed() -> dict[str, float]:
             "import_s": round(timed([python, "-c", "import bayesoleo"]) - bare, 3),
             "first_command_s": round(timed([str(home / "bin" / "bayesoleo"), "effects"]), 2),
         }
+
+
+def package_sizes(python: str) -> list[tuple[str, float]]:
+    """Return the installed packages of an environment with their sizes in MB, largest first."""
+    code = """
+import json
+from importlib.metadata import distributions
+
+sizes = {}
+for found in distributions():
+    paths = [one.locate() for one in found.files or () if one.suffix != ".pyc"]
+    sizes[found.name] = sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
+print(json.dumps(sizes))
+"""
+    done = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True)
+    return sorted(json.loads(done.stdout).items(), key=lambda item: -item[1])
 
 
 def disk_usage(folder: Path) -> int:

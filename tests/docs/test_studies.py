@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from bayesoleo.plots import stored as stored_module
+
 STUDIES = Path(__file__).resolve().parents[2] / "studies"
-PAGES = sorted(STUDIES.glob("plot_*.py"))
+PAGES = sorted(STUDIES.glob("*/plot_*.py"))
 
 
 @pytest.fixture
-def stored(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The helper of the pages, without data."""
-    monkeypatch.syspath_prepend(str(STUDIES))
+def stored(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The helper of the pages, without data, as a page of the repository sees it."""
+    monkeypatch.setattr(sys, "argv", [str(PAGES[0])])
     monkeypatch.delenv("BAYESOLEO_DATA", raising=False)
     monkeypatch.delenv("BAYESOLEO_STORE_FIGURES", raising=False)
-    import stored
-
-    yield stored
-    sys.modules.pop("stored", None)
+    return stored_module
 
 
 def wanted(page: Path) -> set[str]:
@@ -70,13 +69,15 @@ def test_study_stores_what_it_shows(
     (tmp_path / "set").mkdir()
     monkeypatch.setenv("BAYESOLEO_DATA", str(tmp_path))
     monkeypatch.setenv("BAYESOLEO_STORE_FIGURES", "1")
-    monkeypatch.setattr(stored, "FIGURES", tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / "studies" / "section" / "plot_page.py")])
+    (tmp_path / "studies" / "figures").mkdir(parents=True)
+    figures = tmp_path / "studies" / "figures"
     study = stored.Study("page", data="set", slow=True)
     assert study.run(lambda: 7) == 7
     study.text("table", lambda: print("one  \ntwo"))
-    assert (tmp_path / "page-table.txt").read_text(encoding="utf-8") == "one\ntwo\n"
+    assert (figures / "page-table.txt").read_text(encoding="utf-8") == "one\ntwo\n"
     study.figure("picture", lambda: stored.Figure(figsize=(3, 2)))
-    shown = stored._framed(tmp_path / "page-picture.png")
+    shown = stored._framed(figures / "page-picture.png")
     assert tuple(shown.get_size_inches()) == (3.0, 2.0)
 
 
@@ -90,3 +91,43 @@ def test_slow_study_is_shown_from_the_store(
     monkeypatch.setenv("BAYESOLEO_DATA", str(tmp_path))
     assert not stored.Study("page", data="set", slow=True).live
     assert "takes minutes" in capsys.readouterr().out
+
+
+def test_page_alone_has_nothing_to_show_and_says_so(
+    stored: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", [str(tmp_path / "plot_page.py")])
+    study = stored.Study("page", slow=True)
+    assert "in the folder studies of the repository" in capsys.readouterr().out
+    study.text("table", lambda: 1 / 0)
+    assert study.figure("picture", lambda: 1 / 0) is None
+    assert study.helper("no_such_module") is None
+
+
+def test_study_says_which_module_of_the_repository_it_needs(
+    stored: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert not stored.Study("page", needs=("no_such_module",)).live
+    assert "needs studies/no_such_module.py" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_imports_nothing_of_the_repository(page: Path) -> None:
+    helpers = {path.stem for path in STUDIES.glob("*.py")}
+    tree = ast.parse(page.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            assert not helpers & {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module not in helpers
+
+
+@pytest.mark.parametrize("name", ["silverbox", "mr_damper", "mbari_gas_spring"])
+def test_page_shows_the_model_of_its_campaign(name: str) -> None:
+    text = (STUDIES / "measured" / name / "model.py").read_text(encoding="utf-8")
+    model = text[text.index("model = Model(") :]
+    page = "mbari" if name == "mbari_gas_spring" else name
+    assert model in next(STUDIES.glob(f"*/plot_{page}.py")).read_text(encoding="utf-8")

@@ -40,7 +40,7 @@ def prior_sensitivity(tree: xr.DataTree) -> xr.Dataset:
     Kallioinen, Paananen, Bürkner and Vehtari (2024), "Detecting and diagnosing prior and
     likelihood sensitivity with power-scaling", *Statistics and Computing* 34, eqs. 3-7.
     """
-    import arviz as az
+    import arviz_stats as az
 
     for group in (schema.POSTERIOR, schema.LOG_PRIOR, schema.LOG_LIKELIHOOD):
         if group not in tree.children:

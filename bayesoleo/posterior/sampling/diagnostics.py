@@ -78,7 +78,7 @@ def effective_size(draws: Array) -> Array:
     *Bayesian Analysis* 16, section 3 (bulk and tail); and all draws over
     :func:`autocorrelation_time`.
     """
-    import arviz as az
+    import arviz_stats as az
 
     size = draws.shape[0] * draws.shape[1]
     times = autocorrelation_time(draws)
@@ -113,7 +113,7 @@ def nested_rhat(draws: Array, ensemble: NDArray[np.int64]) -> Array:
     Margossian et al. (2024), "Nested R-hat: assessing the convergence of Markov chain Monte Carlo
     when running many short chains", *Bayesian Analysis*.
     """
-    import arviz as az
+    import arviz_stats as az
 
     out = np.full(draws.shape[2], np.inf)
     for a in range(draws.shape[2]):
