@@ -30,7 +30,7 @@ from bayesoleo.prediction.invented import without_invented
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.simulation import model_of, parameter_sets
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status, count, counted
 from bayesoleo.tracing.errors.errors_table import compared
 from bayesoleo.tracing.errors.holdout import Prediction
@@ -84,6 +84,7 @@ def predict(
     level: float = 0.95,
     seed: int = 0,
     scheme: str = DEFAULT_SCHEME,
+    solver: str = COLLOCATION,
     steps: int = STEPS,
     jobs: int | None = None,
 ) -> Shown:
@@ -105,8 +106,8 @@ def predict(
     level : float, optional
         Of the intervals.
     seed : int, optional
-    scheme, steps
-        Discretisation.
+    scheme, solver, steps
+        How runs are solved.
     jobs : int, optional
         Threads.
 
@@ -142,7 +143,9 @@ def predict(
     given = [name for name, c in campaign.campaign.channels.items() if c.bandwidth is not None]
     chosen, _ = without_invented(used, chosen, given)
     records = uncertain_conditions(used).complete(chosen)
-    found = [_one_run(used, record, known, rng, level, scheme, steps, jobs) for record in records]
+    found = [
+        _one_run(used, record, known, rng, level, scheme, solver, steps, jobs) for record in records
+    ]
     found = [
         _as_judged(tree, record, run, used) for record, run in zip(records, found, strict=True)
     ]
@@ -210,10 +213,11 @@ def _one_run(
     rng: np.random.Generator,
     level: float,
     scheme: str,
+    solver: str,
     steps: int,
     jobs: int | None,
 ) -> _Run:
-    predictor = Predictor(model, [record], steps=steps, scheme=scheme, jobs=jobs)
+    predictor = Predictor(model, [record], steps=steps, scheme=scheme, solver=solver, jobs=jobs)
     names, priors = predictor.layout.names, predictor.layout.priors(model)
     number = len(next(iter(known.sd.values())))
     theta = np.array(

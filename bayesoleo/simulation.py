@@ -18,6 +18,7 @@ from bayesoleo.model import Model
 from bayesoleo.model.document import from_document
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.simulate import STEPS, RunPlan, Simulation, simulate_run
+from bayesoleo.solvers.schemes.choose import COLLOCATION
 
 
 def model_of(tree: xr.DataTree) -> Model:
@@ -79,6 +80,7 @@ def simulate_like(
     seed: int,
     scheme: str,
     steps: int | None,
+    solver: str = COLLOCATION,
 ) -> Path:
     """Write a campaign with the runs, inputs and conditions of another.
 
@@ -102,6 +104,8 @@ def simulate_like(
         Discretisation.
     steps : int, optional
         Steps of the mesh.
+    solver : str
+        See :func:`~bayesoleo.prediction.orbits.periodic_orbit`.
 
     Returns
     -------
@@ -114,7 +118,7 @@ def simulate_like(
         for r, record in enumerate(records):
             label = record.label if len(sets) == 1 else f"{record.label}, draw {k + 1}"
             made = _simulated(
-                model, record, values, noise, streams[k * len(records) + r], scheme, steps
+                model, record, values, noise, streams[k * len(records) + r], scheme, steps, solver
             )
             if k == 0:
                 errors.append(made.error)
@@ -147,6 +151,7 @@ def _simulated(
     rng: np.random.Generator,
     scheme: str,
     steps: int | None,
+    solver: str,
 ) -> Simulation:
     per_period = record.time.size / record.periods
     plan = RunPlan(
@@ -168,7 +173,9 @@ def _simulated(
         shared, _, run = name.partition("[")
         if not run or run == f"{record.label}]":
             own[shared] = value
-    return simulate_run(model, plan, own, noise=given, rng=rng, scheme=scheme, steps=steps or STEPS)
+    return simulate_run(
+        model, plan, own, noise=given, rng=rng, scheme=scheme, solver=solver, steps=steps or STEPS
+    )
 
 
 def merged(

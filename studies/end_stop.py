@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.orbit import PeriodicAnswer, periodic_answer
+from bayesoleo.prediction.orbits import PeriodicOrbits, periodic_orbit
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
 from bayesoleo.solvers.periodic.continuation import solve_from_guess
@@ -56,15 +56,15 @@ class Stop:
     """One stiffness by all solvers; ``given`` are equal steps that start from the answer."""
 
     stiffness: float
-    answer: PeriodicAnswer
+    answer: PeriodicOrbits
     found: dict[str, Found]
     given: dict[str, Found]
 
     def contact(self) -> Array:
         """Phases at which the stop is touched and left, shape (2,): sign changes of the stroke."""
-        mesh = self.answer.solution.mesh.edges
+        mesh = self.answer.motions[0].solution.mesh.edges
         fine = (mesh[:-1, None] + np.diff(mesh)[:, None] * np.arange(40) / 40).ravel()
-        touching = self.answer.dof("stroke", fine) < 0.0
+        touching = self.answer.dof("stroke", fine)[0] < 0.0
         ends = fine[np.flatnonzero(touching[1:] != touching[:-1]) + 1]
         return ends[[0, -1]]
 
@@ -73,11 +73,11 @@ def solve(stiffness: float) -> Stop:
     """By all solvers, each from the model's own static guess."""
     model = system("end_stop")
     begin = time.process_time()
-    answer = periodic_answer(
-        model, PLAN, {STIFFNESS: stiffness}, stiffness=STIFFNESS, backend="numba"
+    answer = periodic_orbit(
+        model, PLAN, {STIFFNESS: stiffness}, "adaptive", tolerance=1e-6, stiffness=STIFFNESS
     )
     seconds = time.process_time() - begin
-    orbit = answer.orbit
+    orbit = answer.orbits[0]
     state = orbit.states[0] if orbit.status.ok else NOTHING
     found = {"adaptive": Found(state, seconds, len(orbit.phases)), "shooting": shooting(stiffness)}
     given = {}
@@ -103,7 +103,7 @@ def shooting(stiffness: float) -> Found:
 
 
 def equal_steps(
-    stiffness: float, scheme: str, n: int, answer: PeriodicAnswer | None = None
+    stiffness: float, scheme: str, n: int, answer: PeriodicOrbits | None = None
 ) -> Found:
     """From the static guess or, given an answer, from that."""
     model = system("end_stop").with_values({STIFFNESS: stiffness})
@@ -111,7 +111,7 @@ def equal_steps(
     p = run.base_constants()
     start = run.guess(p)
     if answer is not None:
-        rows = answer.solution.motion
+        rows = answer.motions[0].rows
         start = run.scheme.from_motion(rows(np.arange(n) / n)[None], rows(run.points)[None])
     begin = time.process_time()
     if answer is None:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from bayesoleo.model import Model
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.orbit import adaptive_problem
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.prediction.solver import periodic_problem
 from bayesoleo.solvers.adaptive.refine import solve_adaptive
 from bayesoleo.solvers.periodic.continuation import solve_from_guess
 from bayesoleo.solvers.shooting.shoot import solve_shooting
@@ -73,7 +73,7 @@ class Problem:
         self.at_rest = self.predictor("radau3", 64)
         self.p = self.at_rest.base_constants()
         self.dynamics = dynamics_of(model, self.record)
-        self.pieces = adaptive_problem(model, plan, "numba")[1]
+        self.pieces = periodic_problem(model, self.record, "numba")
         exact = self.shooting(REFERENCE)()
         assert exact is not None
         self.exact = exact(PHASES)[0]

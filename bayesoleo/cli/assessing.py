@@ -226,6 +226,7 @@ def replicate(
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
     steps: options.Steps = None,
 ) -> None:
     """Repeat an experiment by simulation and compare the scatter of the estimates with theory.
@@ -251,7 +252,9 @@ def replicate(
 
     if out is not None:
         shell.check_writable(out)
-    chosen = options.settings(seed=seed, jobs=jobs, drive=drive, scheme=scheme, steps=steps)
+    chosen = options.settings(
+        seed=seed, jobs=jobs, drive=drive, scheme=scheme, solver=solver, steps=steps
+    )
     task = workflow.prepare(campaign, load_model(model), chosen)
     records = list(task.roles.fitted)
     if runs is not None:

@@ -114,6 +114,7 @@ def close(
     quiet: options.Quiet = False,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
     error_model: options.ErrorModel = "independent",
@@ -150,6 +151,7 @@ def close(
         quick=quick,
         effective_size=effective_size,
         scheme=scheme,
+        solver=solver,
         steps=steps,
         max_effects=max_effects,
         drive=drive,
@@ -189,6 +191,7 @@ def check(
     model: options.ModelText,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
     without: options.Without = "",
@@ -208,7 +211,7 @@ def check(
     from bayesoleo.modelfile import load_model
 
     chosen = options.settings(
-        scheme=scheme, steps=steps, drive=drive, nuisance=nuisance, without=without
+        scheme=scheme, solver=solver, steps=steps, drive=drive, nuisance=nuisance, without=without
     )
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:

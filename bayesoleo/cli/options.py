@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 RUNNING, SOLVING, OUTPUT = "How it is run", "How the model is solved", "What is written"
 SCHEMES = ("radau2", "radau3", "gauss2", "gauss3", "thesis")
+SOLVERS = ("collocation", "adaptive", "shooting", "hybrid", "library")
 
 CampaignPath = Annotated[
     Path,
@@ -115,6 +116,14 @@ Scheme = Annotated[
         help=f"Discretisation: {', '.join(SCHEMES)} (second-order backward differences).",
     ),
 ]
+Solver = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        rich_help_panel=SOLVING,
+        help=f"Solver of periodic runs: {', '.join(SOLVERS)}.",
+    ),
+]
 Steps = Annotated[
     int | None,
     typer.Option(
@@ -197,6 +206,7 @@ def settings(
     quick: bool = False,
     effective_size: int = 1000,
     scheme: str = "radau3",
+    solver: str = "collocation",
     steps: int | None = None,
     max_effects: int = 4,
     drive: str | None = None,
@@ -212,10 +222,12 @@ def settings(
     Raises
     ------
     InputError
-        If there is no such scheme, error model or effect, or the file of effects cannot be used.
+        If there is no such scheme, solver, error model or effect, or the file of effects cannot be
+        used.
     """
     from bayesoleo.modelfile import load_effects
     from bayesoleo.posterior.density.error_models import check_word
+    from bayesoleo.prediction.solver import check_solver
     from bayesoleo.workflow import Settings
 
     if scheme not in SCHEMES:
@@ -230,6 +242,7 @@ def settings(
         quick=quick,
         effective_size=effective_size,
         scheme=scheme,
+        solver=check_solver(solver, scheme, "--solver"),
         steps=steps,
         max_effects=max_effects,
         drive=drive,

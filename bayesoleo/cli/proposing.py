@@ -55,6 +55,7 @@ def propose(
     effects: options.Effects = None,
     without: options.Without = "",
     scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
     steps: options.Steps = None,
     nuisance: options.Nuisance = "",
     figure: Annotated[
@@ -87,8 +88,8 @@ def propose(
     from bayesoleo.modelfile import load_model
 
     chosen = options.settings(
-        seed=seed, jobs=jobs, drive=drive, effects=effects, scheme=scheme, steps=steps,
-        nuisance=nuisance, without=without,
+        seed=seed, jobs=jobs, drive=drive, effects=effects, scheme=scheme, solver=solver,
+        steps=steps, nuisance=nuisance, without=without,
     )  # fmt: skip
     limits = dict(_limit(text) for text in limit or [])
     names = tuple(part.strip() for part in rivals.split(",") if part.strip())

@@ -120,6 +120,7 @@ def simulate(
     jobs: options.Jobs = None,
     drive: options.Drive = None,
     scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
     steps: options.Steps = None,
 ) -> None:
     """Simulate a campaign with a model, or with the model and posterior of a result.
@@ -140,7 +141,9 @@ def simulate(
     if out.is_dir() and any(out.iterdir()):
         raise InputError("folder is not empty", file=out, hint="choose another with --out")
     shell.check_writable(out)
-    chosen = options.settings(seed=seed, jobs=jobs, drive=drive, scheme=scheme, steps=steps)
+    chosen = options.settings(
+        seed=seed, jobs=jobs, drive=drive, scheme=scheme, solver=solver, steps=steps
+    )
     amounts = pairs(noise or [], "--noise")
     for channel, sd in amounts.items():
         if sd < 0:

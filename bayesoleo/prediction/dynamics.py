@@ -52,7 +52,8 @@ def dynamics_of(
             raise ModelError(
                 f"model {model.name!r}: an output needs a higher derivative of {dof!r} than its"
                 " equation",
-                hint="write the output in terms of what the equations contain",
+                hint="write the output in terms of what the equations contain, or use another "
+                "solver than shooting: collocation, adaptive or library",
             )
     return Dynamics(
         kernels=kernels(pieces.model, active, backend),

@@ -7,7 +7,7 @@ is asked for once, at the estimate.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from bayesoleo._types import Array
 from bayesoleo.prediction.dynamics import signal_of_rows
 from bayesoleo.prediction.inputs import input_rows
 from bayesoleo.prediction.run import RunPredictor
+from bayesoleo.prediction.solved_run import SolvedRun
 from bayesoleo.solvers.adaptive.error_estimate import NONE, ErrorEstimate, estimate_error
 from bayesoleo.solvers.adaptive.switched import PeriodicProblem
 from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
@@ -47,6 +48,8 @@ def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstima
     anchor, derived = run.anchor, run.kernels.derived
     if anchor is None or not derived.dofs:
         return NONE
+    if isinstance(run, SolvedRun):
+        return run.error()
     initial = not run.record.periodic
     problem = PeriodicProblem(
         equations=run.kernels,
@@ -56,20 +59,20 @@ def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstima
         conditions=len(derived.admissible),
         active=len(derived.active),
     )
-    scheme, step = run.scheme, run.boundary.step(run.steps)
+    scheme = run.scheme
     method, mesh = tableau(DEFAULT_SCHEME), equidistant(run.steps)
     if isinstance(scheme, Collocation):
         method, mesh = scheme.method, scheme.mesh or mesh
 
-    def motion(phase: Array) -> Array:
-        if isinstance(scheme, Collocation):
-            plan: Any = scheme.plan(phase, run.steps, initial=initial)
-        else:
-            plan = scheme.plan(phase, run.steps)
-        return np.asarray(scheme.sample(anchor.x[None, :, :, None], plan, step)[0, :, 0])
-
     return estimate_error(
-        problem, method, anchor.p, motion, mesh, tolerance, initial=initial, looks=LOOKS
+        problem,
+        method,
+        anchor.p,
+        lambda phase: run.rows(anchor.x, phase),
+        mesh,
+        tolerance,
+        initial=initial,
+        looks=LOOKS,
     )
 
 

@@ -15,8 +15,9 @@ from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.run import RunPredictor, Samples
+from bayesoleo.prediction.solved_run import SolvedRun
 from bayesoleo.prediction.transient import TransientRun
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 #: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
@@ -60,6 +61,9 @@ class Predictor:
         Steps of the mesh in a period; how finely the steps of transients are cut.
     scheme : str
         Discretisation, see :func:`bayesoleo.solvers.schemes.choose.scheme`.
+    solver : str
+        Of periodic runs, see :func:`~bayesoleo.prediction.orbits.periodic_orbit`; a transient is
+        solved by collocation.
     backend : {"numba", "numpy"}
         Kernels; NumPy's are ready at once.
     jobs : int, optional
@@ -75,6 +79,7 @@ class Predictor:
         *,
         steps: int = 256,
         scheme: str = DEFAULT_SCHEME,
+        solver: str = COLLOCATION,
         backend: str = "numba",
         jobs: int | None = None,
         share: Predictor | None = None,
@@ -86,7 +91,7 @@ class Predictor:
             scheme,
             jobs,
         )
-        self.backend = backend
+        self.backend, self.solver = backend, solver
         self.layout = Layout.of(model, [record.label for record in records])
         compiled = kernels(model, self.layout.active, backend)
         self.outputs = compiled.derived.outputs
@@ -96,7 +101,9 @@ class Predictor:
             like = shared.get(id(record))
             if record.periodic:
                 rows = None if like is None else like.known_rows
-                return RunPredictor(model, compiled, record, steps, scheme, rows)
+                if solver == COLLOCATION:
+                    return RunPredictor(model, compiled, record, steps, scheme, rows)
+                return SolvedRun(model, compiled, record, steps, scheme, solver, backend, rows)
             same = like if isinstance(like, TransientRun) else None
             return TransientRun(model, compiled, record, steps, scheme, same)
 
@@ -113,7 +120,7 @@ class Predictor:
 
     def __getstate__(self) -> dict[str, Any]:
         """What another process needs to make the same predictor: compiled code stays here."""
-        names = ("model", "records", "steps", "scheme", "backend", "jobs")
+        names = ("model", "records", "steps", "scheme", "solver", "backend", "jobs")
         return {name: getattr(self, name) for name in names} | {
             "found": [run.found() for run in self.runs]
         }

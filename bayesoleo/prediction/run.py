@@ -188,11 +188,19 @@ class RunPredictor:
 
     def _rows_of(self, first: int, last: int, phase: Array) -> Array:
         assert self.anchor is not None
-        plan = self.scheme.plan(phase, self.steps)
-        rows = self.scheme.sample(
-            self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps)
-        )
-        return rows[0, first:last, 0]
+        return self.rows(self.anchor.x, phase)[first:last]
+
+    def rows(self, x: Array, phase: Array) -> Array:
+        """Values and derivatives of all dofs at phases ``(N,)`` in cycles, shape (nz, N), of
+        unknowns ``x (n, w)``; of their derivatives ``(n, w, na)``, shape (nz, na, N)."""
+        alone = x.ndim == 2
+        step = self.boundary.step(self.steps)
+        found = self.scheme.sample(x[None, :, :, None] if alone else x[None], self._at(phase), step)
+        return np.asarray(found[0, :, 0] if alone else found[0])
+
+    def _at(self, phase: Array) -> Any:
+        """Plan of the scheme for phases."""
+        return self.scheme.plan(phase, self.steps)
 
     def guess(self, p: Array) -> Array:
         """First guess of the unknowns, shape (1, n, w)."""
@@ -324,9 +332,21 @@ class RunPredictor:
         derivatives: bool,
     ) -> Samples:
         """Outputs of solutions ``x (L, n, w)`` with their derivatives ``x_p (L, n, w, na)``."""
+        z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
+        z_p = self._rows_at_samples(x_p, p) if derivatives and x_p is not None else None
+        return self._outputs(p, z, z_p, status, derivatives)
+
+    def _outputs(
+        self,
+        p: Array,
+        z: Array,
+        z_p: Array | None,
+        status: NDArray[np.int64],
+        derivatives: bool,
+    ) -> Samples:
+        """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives of ``z_p``."""
         derived, count = self.kernels.derived, p.shape[0]
         samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
-        z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
         lanes = np.flatnonzero(status == Status.CONVERGED.value)
         y = np.full((count, ny, samples), np.nan)
         with np.errstate(all="ignore"):
@@ -337,8 +357,7 @@ class RunPredictor:
         yz, yp = np.zeros((count, ny, z.shape[1], samples)), np.zeros((count, ny, na, samples))
         with np.errstate(all="ignore"):
             self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
-        if x_p is not None:
-            z_p = self._rows_at_samples(x_p, p)
+        if z_p is not None:
             yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
         return Samples(y, yp, status)
 

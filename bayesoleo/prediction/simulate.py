@@ -11,11 +11,11 @@ from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 from bayesoleo.model.expressions import COSINE, SINE, WITHIN
-from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.motion_error import motion_error
+from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 
 #: Steps of the mesh: data must be finer than what is fitted to them.
@@ -162,6 +162,7 @@ def simulate_run(
     rng: np.random.Generator | None = None,
     steps: int = STEPS,
     scheme: str = DEFAULT_SCHEME,
+    solver: str = COLLOCATION,
     backend: str = "numpy",
 ) -> Simulation:
     """Simulate one periodic run.
@@ -180,7 +181,7 @@ def simulate_run(
         Step by channel, SI, to whose multiples the noisy samples are rounded.
     rng : numpy.random.Generator, optional
         Needed for noise.
-    steps, scheme, backend
+    steps, scheme, solver, backend
         See :class:`~bayesoleo.prediction.predictor.Predictor`; NumPy's kernels need no compilation.
 
     Returns
@@ -194,9 +195,9 @@ def simulate_run(
         this motion and these values.
     """
     noise, quantisation, values = noise or {}, quantisation or {}, values or {}
-    _check_plan(model, plan, values)
+    check_plan(model, plan, values)
     _check_channels(model, plan, noise, quantisation, rng)
-    clean, run = _clean_samples(model, plan, values, steps, scheme, backend)
+    clean, run = _clean_samples(model, plan, values, steps, scheme, solver, backend)
     samples = {}
     for name, x in clean.items():
         if noise.get(name, 0.0) > 0 and rng is not None:
@@ -216,7 +217,8 @@ def simulate_run(
     )
 
 
-def _check_plan(model: Model, plan: RunPlan, values: Mapping[str, float]) -> None:
+def check_plan(model: Model, plan: RunPlan, values: Mapping[str, float]) -> None:
+    """Refuse names that the model does not have, and plans that lack an input or a condition."""
     for name in values:
         if name not in model.parameters:
             hint = f"parameters there are: {', '.join(model.parameters)}"
@@ -263,12 +265,21 @@ def _check_channels(
 
 
 def _clean_samples(
-    model: Model, plan: RunPlan, values: Mapping[str, float], steps: int, scheme: str, backend: str
+    model: Model,
+    plan: RunPlan,
+    values: Mapping[str, float],
+    steps: int,
+    scheme: str,
+    solver: str,
+    backend: str,
 ) -> tuple[dict[str, Array], RunPredictor]:
     """All channels without noise, inputs first, and what they were made by."""
     record = record_of(model, plan)
     inputs = {name: record.samples[name] for name in _moved(model)}
-    run = RunPredictor(model, kernels(model, model.estimated(), backend), record, steps, scheme)
+    predictor = Predictor(
+        model, [record], steps=steps, scheme=scheme, solver=solver, backend=backend, jobs=1
+    )
+    run = predictor.runs[0]
     p = run.base_constants()
     for name, value in values.items():
         p[run.kernels.derived.constants.index(name)] = value

@@ -312,13 +312,9 @@ class TransientRun(RunPredictor):
             solution, x_p, _ = transient_sensitivities(self.boundary, p, solution, start)
         return self._at_samples(p, solution.x, x_p, solution.status, derivatives)
 
-    def _rows_of(self, first: int, last: int, phase: Array) -> Array:
-        assert self.anchor is not None
-        plan = self.collocation.plan(phase, self.steps, initial=True)
-        rows = self.scheme.sample(
-            self.anchor.x[None, :, :, None], plan, self.boundary.step(self.steps)
-        )
-        return rows[0, first:last, 0]
+    def _at(self, phase: Array) -> Any:
+        """Plan of the collocation for positions."""
+        return self.collocation.plan(phase, self.steps, initial=True)
 
 
 def _rests(now: Array, before: Array) -> bool:

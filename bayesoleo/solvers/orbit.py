@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,8 +23,8 @@ class Orbit:
         Value, and velocity of a second-order dof, of each dof in turn; SI.
     period : float
         Seconds.
-    multipliers : ndarray of complex, shape (D,)
-        Floquet multipliers, largest first; NaN where they are not known.
+    monodromy : ndarray, shape (D, D)
+        Derivative of the state after a period by the state before; NaN where it is not known.
     status : Status
         How the solver ended; unless it is ``solved`` the states are only where it stopped.
     error : float
@@ -36,10 +37,15 @@ class Orbit:
     phases: Float[Array, " points"]
     states: Float[Array, "points states"]
     period: float
-    multipliers: Complex[ComplexArray, " states"]
+    monodromy: Float[Array, "states states"]
     status: Status
     error: float
     evaluations: int
+
+    @cached_property
+    def multipliers(self) -> Complex[ComplexArray, " states"]:
+        """Floquet multipliers, largest first, shape (D,); NaN where they are not known."""
+        return floquet_multipliers(self.monodromy)
 
     @property
     def stable(self) -> bool:

@@ -14,6 +14,7 @@ from bayesoleo import schema
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
+from bayesoleo.solvers.schemes.choose import COLLOCATION
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.outcome.inference import mixture_at
 from bayesoleo.tracing.outcome.result import point_group, posterior_groups, predictive_groups
@@ -104,6 +105,7 @@ def draw(
     start = mixture_at(density, fit.point.theta, starts=starts, seed=settings.seed)
     # Another seed or quality is another run, with a folder of its own.
     parts = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
+    parts += [] if settings.solver == COLLOCATION else [settings.solver]
     parts += [settings.seed, settings.quick, settings.error_model, settings.between_runs]
     fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     samples = draw_samples(

@@ -9,7 +9,8 @@ from bayesoleo.effects import Effect, catalogue
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.density.error_models import ERROR_MODELS
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.prediction.solver import check_solver
+from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.outcome.inference import Inference
 
@@ -33,6 +34,8 @@ class Settings:
         Effective draws asked of the sampler.
     scheme : str
         Discretisation: ``radau3`` …, or ``thesis``.
+    solver : {"collocation", "adaptive", "shooting", "hybrid", "library"}
+        Of periodic runs; see :func:`~bayesoleo.prediction.orbits.periodic_orbit`.
     steps : int, optional
         Steps of the mesh in a period; by default refined until the estimate no longer moves.
     max_effects : int
@@ -73,8 +76,10 @@ class Settings:
     between_runs: tuple[str, ...] = ()
     scheduler: str | None = None
     without: tuple[str, ...] = ()
+    solver: str = COLLOCATION
 
     def __post_init__(self) -> None:
+        check_solver(self.solver, self.scheme)
         known = [effect.id for effect in self._offered] + [FAMILY]
         for name in self.without:
             if name not in known:
@@ -104,4 +109,6 @@ class Settings:
     @property
     def numerics(self) -> Numerics:
         """How models are solved."""
-        return Numerics(self.scheme, self.steps, self.jobs, scheduler=self.scheduler)
+        return Numerics(
+            self.scheme, self.steps, self.jobs, scheduler=self.scheduler, solver=self.solver
+        )

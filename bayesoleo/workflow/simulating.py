@@ -72,5 +72,6 @@ def simulate(
         noise=noise,
         seed=settings.seed,
         scheme=settings.scheme,
+        solver=settings.solver,
         steps=settings.steps,
     )

@@ -12,6 +12,7 @@ import numpy as np
 from bayesoleo.model import Model
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
+from bayesoleo.solvers.schemes.choose import COLLOCATION
 from bayesoleo.solvers.status import Status
 
 #: Correlation, averaged over the runs, below which a sign looks turned. Starts drawn from wide
@@ -48,7 +49,12 @@ class Start:
 
 
 def starts_of(
-    model: Model, records: Sequence[Record], steps: int, scheme: str, jobs: int | None
+    model: Model,
+    records: Sequence[Record],
+    steps: int,
+    scheme: str,
+    jobs: int | None,
+    solver: str = COLLOCATION,
 ) -> list[Start]:
     """Predict runs at a model's nominal values and compare.
 
@@ -63,8 +69,12 @@ def starts_of(
         Discretisation.
     jobs : int or None
         Threads.
+    solver : str
+        Of periodic runs.
     """
-    predictor = Predictor(model, records, steps=steps, scheme=scheme, backend="numpy", jobs=jobs)
+    predictor = Predictor(
+        model, records, steps=steps, scheme=scheme, solver=solver, backend="numpy", jobs=jobs
+    )
     theta = predictor.layout.start(model)
     statuses = predictor.set_anchor(theta) if model.dofs else [Status.CONVERGED] * len(records)
     found = []

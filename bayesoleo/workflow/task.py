@@ -258,7 +258,9 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
     driven = task.assembly.model()
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
     steps = settings.steps or first_steps(driven, task.roles.fitted)
-    starts = starts_of(driven, task.roles.fitted, steps, settings.scheme, settings.jobs)
+    starts = starts_of(
+        driven, task.roles.fitted, steps, settings.scheme, settings.jobs, settings.solver
+    )
     return {
         **task.about(),
         "inputs": list(driven.inputs),

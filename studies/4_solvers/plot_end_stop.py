@@ -16,8 +16,9 @@ its own steps. This page has it.
 
 # %%
 # The contact lasts :math:`\pi/\sqrt{\theta}`: at :math:`10^{11}` a hundred-thousandth of a period.
-# :func:`~bayesoleo.prediction.orbit.periodic_answer` places steps by an estimate of their error,
-# with edges on the ends of the contact, and walks up the stiffness where a direct solution fails.
+# The solver ``adaptive`` of :func:`~bayesoleo.prediction.orbits.periodic_orbit` places steps by an
+# estimate of their error, with edges on the ends of the contact, and walks up the stiffness where a
+# direct solution fails.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -25,15 +26,18 @@ import numpy as np
 import bayesoleo
 from bayesoleo.plots import style
 from bayesoleo.plots.stored import Study
-from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion
 
 model = bayesoleo.system("end_stop")
 plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
-answer = periodic_answer(model, plan, {"stop_stiffness": 2500.0})
-print(answer.orbit.status.message, "on", answer.orbit.phases.size, "steps;")
-print("largest multiplier", np.abs(answer.orbit.multipliers).max().round(3))
-print("q(0) =", answer.orbit.states[0, 0].round(8), "and it should be", 0.83680069)
+answer = periodic_orbit(
+    model, plan, {"stop_stiffness": 2500.0}, "adaptive", tolerance=1e-6, backend="numpy"
+)
+orbit = answer.orbits[0]
+print(orbit.status.message, "on", orbit.phases.size, "steps;")
+print("largest multiplier", np.abs(orbit.multipliers).max().round(3))
+print("q(0) =", orbit.states[0, 0].round(8), "and it should be", 0.83680069)
 
 # %%
 # The whole table, by the adaptive mesh and by shooting, both from a static guess and compared with
@@ -58,13 +62,13 @@ def orbits():
     figure.subplots_adjust(left=0.06, right=0.985, top=0.8, bottom=0.15, wspace=0.27)
     phase = np.linspace(0.0, 1.0, 2001)
     for stop, colour in zip(stops, SHADES, strict=True):
-        whole.plot(phase, stop.answer.dof("stroke", phase), color=colour, lw=1.5)
+        whole.plot(phase, stop.answer.dof("stroke", phase)[0], color=colour, lw=1.5)
         touch, leave = stop.contact()
-        speed, edges = np.sqrt(stop.stiffness), stop.answer.solution.mesh.edges
+        speed, edges = np.sqrt(stop.stiffness), stop.answer.motions[0].solution.mesh.edges
         around = np.linspace(touch - 0.8 / speed, leave + 0.8 / speed, 800)
         inside = edges[(edges > around[0]) & (edges < around[-1])]
         for at, look in ((around, "-"), (inside, ".")):
-            scaled = speed * stop.answer.dof("stroke", at)
+            scaled = speed * stop.answer.dof("stroke", at)[0]
             contact.plot(speed * (at - touch), scaled, look, color=colour, lw=1.5, ms=4)
         count = np.arange(edges.size) - np.searchsorted(edges, touch)
         lengths.stairs(np.diff(edges), count, color=colour, lw=1.5, baseline=None)

@@ -32,7 +32,7 @@ from bayesoleo.posterior import (
     sample,
     to_datasets,
 )
-from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion
 
 TRUTH, NOISE, PRIOR = 100.0, 0.01, LogNormal(200.0, 1.0)
@@ -44,9 +44,9 @@ model = bayesoleo.system("end_stop")
 def stroke(amplitude):
     """The stroke over two periods as a function of the logarithm of the stiffness."""
     plan = RunPlan("run", 1.0, {"force": motion(23.0, [amplitude])})
-    answers = [periodic_answer(model, plan, {"stop_stiffness": k}) for k in table]
-    rows = [answer.dof("stroke", phase % 1.0) for answer in answers]
-    return make_interp_spline(np.log(table), np.array(rows))
+    stiffness, options = {"stop_stiffness": table}, {"tolerance": 1e-6, "backend": "numpy"}
+    found = periodic_orbit(model, plan, stiffness, "adaptive", **options)
+    return make_interp_spline(np.log(table), found.dof("stroke", phase % 1.0))
 
 
 def problem_of(amplitude):

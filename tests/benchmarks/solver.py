@@ -36,7 +36,7 @@ import solves
 from cases import Case, campaign, cases
 
 from bayesoleo.parallel import available_cores
-from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion
 from bayesoleo.systems import system
 
@@ -97,15 +97,16 @@ class Benchmark:
 
     def end_stop(self) -> dict[str, float]:
         """Errors of position and velocity at phase zero."""
-        answer = periodic_answer(
-            system("end_stop"), END_STOP, {"stop_stiffness": STIFFEST}, stiffness="stop_stiffness"
-        )
-        errors = abs(answer.orbit.states[0] - STATE)
+        answer = periodic_orbit(
+            system("end_stop"), END_STOP, {"stop_stiffness": STIFFEST}, "adaptive",
+            tolerance=1e-6, stiffness="stop_stiffness", backend="numpy",
+        )  # fmt: skip
+        errors = abs(answer.orbits[0].states[0] - STATE)
         return {
             "end_stop_error_1e11": float(errors[0]),
             "end_stop_velocity_error_1e11": float(errors[1]),
-            "end_stop_steps": answer.orbit.states.shape[0],
-            "end_stop_failures": int(not answer.orbit.status.ok),
+            "end_stop_steps": answer.orbits[0].states.shape[0],
+            "end_stop_failures": int(not answer.orbits[0].status.ok),
         }
 
     def resources(self) -> dict[str, float]:

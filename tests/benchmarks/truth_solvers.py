@@ -30,11 +30,12 @@ from bayesoleo.model import Dof, Model, Parameter
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.motion_error import TOLERANCE as KNOWN
 from bayesoleo.prediction.motion_error import motion_error
-from bayesoleo.prediction.orbits import METHODS, periodic_orbit
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.prediction.simulate import RunPlan, motion
 from bayesoleo.prediction.transient import TransientRun
 from bayesoleo.solvers.adaptive.switched import state_rows
+from bayesoleo.solvers.schemes.choose import SOLVERS
 
 Array = np.ndarray
 Rates = Callable[[float, Array], tuple[float, ...]]
@@ -561,7 +562,7 @@ def figures(fraction: float = 1.0, say: Callable[[str], object] = print) -> dict
     done: list[Solve] = []
     for make in PROBLEMS[: max(1, round(fraction * len(PROBLEMS)))]:
         case = make()
-        for method in (*METHODS, "transient"):
+        for method in (*SOLVERS, "transient"):
             begin = time.perf_counter()
             one = solve_transient(case) if method == "transient" else solve_periodic(case, method)
             done.append(one)

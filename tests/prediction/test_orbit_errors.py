@@ -5,13 +5,13 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbit import periodic_answer
-from bayesoleo.prediction.orbits import METHODS, periodic_orbit
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.solvers.schemes.choose import SOLVERS
 from bayesoleo.solvers.shooting import shoot
 from bayesoleo.solvers.status import Status
 
-OWN = METHODS[:-1]
+OWN = SOLVERS[:-1]
 PHASES = np.arange(4096) / 4096
 #: Samples of a period from which exact answers of linear equations are made; the Fourier
 #: coefficients of what is sampled fall to round-off long before.
@@ -76,9 +76,9 @@ def test_a_steep_function_of_the_input_is_resolved(method, tau):
 
 def test_without_finer_steps_the_error_is_told(monkeypatch):
     """Shooting alone passes over the step of the function, and its estimate knows."""
-    import bayesoleo.prediction.orbits as orbits
+    from bayesoleo.prediction import solver
 
-    monkeypatch.setattr(orbits, "MORE_SHOTS", 0)
+    monkeypatch.setattr(solver, "MORE_SHOTS", 0)
     found = periodic_orbit(lag(1e-6, 50.0), COSINE, None, "shooting", backend="numpy", jobs=1)
     assert found.status[0] == Status.TOLERANCE_NOT_MET
     error = true_error(found, lagged(1e-6, 50.0))
@@ -125,7 +125,7 @@ def test_a_pulse_narrower_than_any_step_is_seen():
         if found.status[0] == Status.CONVERGED:
             assert true_error(found, exact) < 1e-7
         elif found.status[0] == Status.TOLERANCE_NOT_MET:  # the pulse is a step and a half wide
-            assert method == "discretisation"
+            assert method == "collocation"
             assert found.orbits[0].error > 0.3 * true_error(found, exact)
         else:  # an integrator that meets the pulse in one pass and not in the next does not close
             assert method in ("shooting", "hybrid")
@@ -153,8 +153,8 @@ def test_an_error_that_cannot_be_estimated_has_a_status(monkeypatch):
     assert "could not be estimated" in Status(int(found.status[0])).message
     assert np.isnan(found.orbits[0].error)
     assert np.isfinite(found.rows(PHASES)).all()
-    answer = periodic_answer(lag(1e-2, 1.0), COSINE)
-    assert answer.orbit.status is Status.NO_ERROR_ESTIMATE
+    answer = periodic_orbit(lag(1e-2, 1.0), COSINE, None, "adaptive", backend="numpy")
+    assert answer.orbits[0].status is Status.NO_ERROR_ESTIMATE
 
 
 def test_shooting_by_given_steps_closes_on_them():

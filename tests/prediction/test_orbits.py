@@ -8,9 +8,10 @@ from bayesoleo import system
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model.kernels import kernels
 from bayesoleo.prediction.inputs import input_rows
-from bayesoleo.prediction.orbits import METHODS, periodic_orbit
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.solvers.schemes.choose import SOLVERS
 from bayesoleo.solvers.shooting.library import shoot_by_library
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
@@ -60,7 +61,7 @@ def exact():
     return np.stack([q for q, _ in found]), np.stack([slope for _, slope in found])
 
 
-OWN = METHODS[:-1]
+OWN = SOLVERS[:-1]
 
 
 @pytest.mark.parametrize("method", [*OWN, pytest.param("library", marks=pytest.mark.slow)])
@@ -88,7 +89,7 @@ def test_all_ways_agree_with_another_code_in_motion_and_derivatives(method, exac
 
 
 def test_states_of_an_orbit_are_those_of_its_motion():
-    for method in METHODS:
+    for method in SOLVERS:
         options = {"backend": "numpy", "steps": 64, "tolerance": 1e-6}
         found = periodic_orbit(DUFFING, PLAN, None, method, **options)
         orbit = found.orbits[0]
@@ -101,7 +102,7 @@ def test_states_of_an_orbit_are_those_of_its_motion():
 
 def test_a_vector_does_not_know_the_others():
     for method in OWN:
-        options = {"backend": "numpy", "steps": 64, "method": method}
+        options = {"backend": "numpy", "steps": 64, "solver": method}
         together = periodic_orbit(DUFFING, PLAN, {"stiffness": STIFFNESSES}, **options, jobs=2)
         alone = periodic_orbit(DUFFING, PLAN, {"stiffness": STIFFNESSES[1]}, **options, jobs=1)
         assert together.rows(PHASES)[1].tobytes() == alone.rows(PHASES)[0].tobytes()
@@ -125,7 +126,7 @@ def test_shooting_and_hybrid_agree_where_equal_steps_fail(stiffness):
 
 def test_derivatives_across_a_stiff_contact_are_differences_of_motions():
     model, stiffness, part = system("end_stop"), 1e5, 1e-3
-    options = {"method": "shooting", "tolerance": 1e-11, "backend": "numpy"}
+    options = {"solver": "shooting", "tolerance": 1e-11, "backend": "numpy"}
     sides = {"stop_stiffness": stiffness * np.array([1 - part, 1.0, 1 + part])}
     found = periodic_orbit(model, END_STOP, sides, **options)
     q, by_stiffness = found.rows(PHASES)[:, 0], found.rows_by_parameter(PHASES)[1, 0, 0]
@@ -174,7 +175,7 @@ def test_a_library_says_why_it_failed():
 
 def test_failures_have_a_status_and_no_numbers():
     free = {"damping": 0.0, "stiffness": 0.0, "cubic_spring": 0.0}
-    for method in METHODS:
+    for method in SOLVERS:
         found = periodic_orbit(DUFFING, PLAN, free, method, backend="numpy", steps=64)
         assert found.status[0] != Status.CONVERGED
         assert np.isnan(found.rows(PHASES)).all()
@@ -182,7 +183,7 @@ def test_failures_have_a_status_and_no_numbers():
 
 
 def test_bad_input_says_what_to_write():
-    with pytest.raises(InputError, match=r"no such method.*euler.*use discretisation, adaptive"):
+    with pytest.raises(InputError, match=r"unknown solver.*euler.*use collocation, adaptive"):
         periodic_orbit(DUFFING, PLAN, None, "euler")
     with pytest.raises(InputError, match=r"stifness: no such parameter; parameters there are"):
         periodic_orbit(DUFFING, PLAN, {"stifness": 1.0})

@@ -1,5 +1,7 @@
 """What must hold for a solution on any mesh, independent codes, and failures by their names."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from periodic_problems import coupled, duffing, friction_oscillator, harmonics, relaxation
@@ -7,7 +9,7 @@ from scipy.integrate import solve_bvp, solve_ivp
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion
 from bayesoleo.solvers.adaptive.crossings import Crossings, find_crossings
 from bayesoleo.solvers.adaptive.switched import state_rows
@@ -18,13 +20,14 @@ from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 FREQUENCY, PERIOD = 0.2, 5.0
+adaptive_orbit = partial(periodic_orbit, solver="adaptive", tolerance=1e-6, backend="numpy")
 
 
 def answer(model, phase=0.0, **options):
-    found = periodic_answer(
+    found = adaptive_orbit(
         model, RunPlan("run", FREQUENCY, {"force": FORCE}, phase=phase), **options
     )
-    assert found.orbit.status is Status.CONVERGED
+    assert found.orbits[0].status is Status.CONVERGED
     return found
 
 
@@ -34,8 +37,11 @@ def answer(model, phase=0.0, **options):
 def test_a_shift_of_phase_shifts_the_solution(model):
     shift, phase = 0.37, np.linspace(0.0, 1.0, 500)
     here, later = answer(model), answer(model, phase=shift)
-    moved, other = here.solution.motion(phase + shift), later.solution.motion(phase)
-    kept = state_rows(here.solution.level.scheme.orders)
+    moved, other = (
+        here.motions[0].rows(phase + shift),
+        later.motions[0].rows(phase),
+    )
+    kept = state_rows(here.motions[0].solution.level.scheme.orders)
     size = np.abs(moved).max(axis=1)[kept, None]
     # Both are good to 1e-6, on meshes that differ.
     np.testing.assert_allclose((moved[kept] - other[kept]) / size, 0.0, atol=2e-6)
@@ -47,7 +53,7 @@ def test_a_shift_of_phase_shifts_the_solution(model):
 def test_work_done_equals_what_is_dissipated(model):
     found = answer(model, tolerance=1e-7)
     phase = (np.arange(20000) + 0.5) / 20000
-    velocity = found.dof("q", phase, 1)
+    velocity = found.dof("q", phase, 1)[0]
     force = FORCE.evaluate(phase, FREQUENCY)
     lost = 0.3 * velocity**2 + 0.5 * np.abs(velocity) ** 3
     if model.name == "friction":
@@ -61,10 +67,10 @@ def test_work_done_equals_what_is_dissipated(model):
 def test_floquet_multipliers_obey_liouville_across_a_contact():
     """Their product is the exponential of the integral of the trace, contacts or not."""
     plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
-    found = periodic_answer(system("end_stop"), plan, {"stop_stiffness": 2500.0})
+    found = adaptive_orbit(system("end_stop"), plan, {"stop_stiffness": 2500.0})
     phase = (np.arange(100_000) + 0.5) / 100_000
-    trace = np.mean(-2.0 * np.abs(found.dof("stroke", phase, 1)))
-    product = np.prod(found.orbit.multipliers)
+    trace = np.mean(-2.0 * np.abs(found.dof("stroke", phase, 1)[0]))
+    product = np.prod(found.orbits[0].multipliers)
     assert abs(product.imag) < 1e-12
     assert product.real == pytest.approx(np.exp(trace), rel=1e-5)
 
@@ -81,25 +87,29 @@ def test_agrees_with_a_boundary_value_solver_and_with_integration():
     times = np.linspace(0.0, PERIOD, 101)
     run = solve_ivp(rates, (0, 40 * PERIOD), np.zeros(2), method="LSODA", rtol=1e-10, atol=1e-11)
     # The integrator's own error is some ten times its tolerance.
-    np.testing.assert_allclose(found.orbit.states[0], run.y[:, -1], atol=5e-8)
+    np.testing.assert_allclose(found.orbits[0].states[0], run.y[:, -1], atol=5e-8)
     other = solve_bvp(
-        rates, lambda a, b: a - b, times, found.solution.motion(times / PERIOD)[:2] * 0.9, tol=1e-7
+        rates,
+        lambda a, b: a - b,
+        times,
+        found.motions[0].rows(times / PERIOD)[:2] * 0.9,
+        tol=1e-7,
     )
     assert other.status == 0
     np.testing.assert_allclose(
-        found.solution.motion(times / PERIOD)[:2], other.sol(times), atol=1e-6
+        found.motions[0].rows(times / PERIOD)[:2], other.sol(times), atol=1e-6
     )
 
 
 @pytest.mark.parametrize("model", [duffing(quadratic=0.5), coupled()], ids=lambda m: m.name)
 def test_sensitivities_are_those_of_the_solution(model):
     found, step = answer(model, tolerance=1e-8), 1e-4
-    rows = found.solution.level.scheme.orders
-    by = found.solution.sensitivities()[0]
+    rows = found.motions[0].solution.level.scheme.orders
+    by = found.motions[0].solution.sensitivities[0]
     for k, name in enumerate(model.estimated()):
         nominal = model.parameters[name].value
         ends = [
-            answer(model, tolerance=1e-10, values={name: nominal + sign * step}).orbit.states[0]
+            answer(model, tolerance=1e-10, values={name: nominal + sign * step}).orbits[0].states[0]
             for sign in (1, -1)
         ]
         difference = (ends[0] - ends[1]) / (2 * step)
@@ -110,14 +120,14 @@ def test_sensitivities_are_those_of_the_solution(model):
 def test_failures_have_names():
     plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})
     model = system("end_stop")
-    few = periodic_answer(model, plan, {"stop_stiffness": 2500.0}, tolerance=1e-9, max_steps=100)
-    assert few.orbit.status is Status.TOLERANCE_NOT_MET
-    assert few.orbit.error > 1e-9
-    assert "tolerance" in few.orbit.status.message
-    stiff = periodic_answer(model, plan, {"stop_stiffness": 1e8})
-    assert stiff.orbit.status is Status.NO_CONVERGENCE
-    assert np.isnan(stiff.orbit.multipliers).all()
-    assert not stiff.orbit.stable
+    few = adaptive_orbit(model, plan, {"stop_stiffness": 2500.0}, tolerance=1e-9, max_steps=100)
+    assert few.orbits[0].status is Status.TOLERANCE_NOT_MET
+    assert few.orbits[0].error > 1e-9
+    assert "tolerance" in few.orbits[0].status.message
+    stiff = adaptive_orbit(model, plan, {"stop_stiffness": 1e8})
+    assert stiff.orbits[0].status is Status.NO_CONVERGENCE
+    assert np.isnan(stiff.orbits[0].multipliers).all()
+    assert not stiff.orbits[0].stable
     free = Model(
         "free mass",
         inputs={"force": "N"},
@@ -126,8 +136,8 @@ def test_failures_have_names():
         equations={"q": "mass*ddot(q) - force"},
         outputs={"displacement": "q"},
     )
-    adrift = periodic_answer(free, RunPlan("run", FREQUENCY, {"force": FORCE}))
-    assert adrift.orbit.status is Status.SINGULAR
+    adrift = adaptive_orbit(free, RunPlan("run", FREQUENCY, {"force": FORCE}))
+    assert adrift.orbits[0].status is Status.SINGULAR
 
 
 def test_wrong_names_are_told():
@@ -135,11 +145,11 @@ def test_wrong_names_are_told():
     with pytest.raises(
         InputError, match=r"key masss: no such parameter; parameters there are: mass"
     ):
-        periodic_answer(model, plan, {"masss": 1.0})
+        adaptive_orbit(model, plan, {"masss": 1.0})
     with pytest.raises(InputError, match=r"key stiffness: no such parameter .got .stif.."):
-        periodic_answer(model, plan, stiffness="stif")
+        adaptive_orbit(model, plan, stiffness="stif")
     with pytest.raises(InputError, match=r"needs the input 'force'"):
-        periodic_answer(model, RunPlan("run", FREQUENCY, {}))
+        adaptive_orbit(model, RunPlan("run", FREQUENCY, {}))
     with pytest.raises(InputError, match=r"no such dof.*there are q"):
         answer(model).dof("x", np.zeros(1))
 

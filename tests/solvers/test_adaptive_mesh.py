@@ -1,12 +1,15 @@
 """Adaptive meshes: the error asked for, kinks that cost no order, and ever stiffer end stops."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from periodic_problems import duffing, friction_oscillator, harmonics
 
 from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.orbit import adaptive_problem, periodic_answer
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.prediction.orbits import periodic_orbit
+from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.prediction.solver import periodic_problem
 from bayesoleo.solvers.adaptive.moving_edges import solve_on
 from bayesoleo.solvers.adaptive.refine import solve_adaptive
 from bayesoleo.solvers.adaptive.switched import PeriodicProblem
@@ -27,13 +30,14 @@ REFERENCE = {
     1e11: (0.8155908, 1.2154198),
 }
 
+adaptive_orbit = partial(periodic_orbit, solver="adaptive", tolerance=1e-6, backend="numpy")
 
 PLAN = RunPlan("run", 0.2, {"force": FORCE})
 
 
 def end_stop(theta, **options):
     values = {"stop_stiffness": theta}
-    return periodic_answer(system("end_stop"), END_STOP, values, **options)
+    return adaptive_orbit(system("end_stop"), END_STOP, values, **options)
 
 
 @pytest.mark.parametrize("method", ["radau2", "radau3", "gauss2", "gauss3"])
@@ -42,24 +46,24 @@ def end_stop(theta, **options):
     "model", [duffing(quadratic=0.5), friction_oscillator()], ids=lambda m: m.name
 )
 def test_the_error_is_below_its_estimate_and_that_below_the_tolerance(model, method, tolerance):
-    exact = periodic_answer(model, PLAN, tolerance=1e-9, method="gauss3").solution
-    found = periodic_answer(model, PLAN, tolerance=tolerance, method=method)
-    assert found.orbit.status is Status.CONVERGED
+    exact = adaptive_orbit(model, PLAN, tolerance=1e-9, scheme="gauss3").motions[0].solution
+    found = adaptive_orbit(model, PLAN, tolerance=tolerance, scheme=method)
+    assert found.orbits[0].status is Status.CONVERGED
     phase = np.linspace(0.0, 1.0, 2000)
     states = exact.motion(phase)[:2]
     size = np.abs(states).max(axis=1, keepdims=True)
-    error = np.max(np.abs(found.solution.motion(phase)[:2] - states) / size)
-    assert error < found.orbit.error <= tolerance
+    error = np.max(np.abs(found.motions[0].rows(phase)[:2] - states) / size)
+    assert error < found.orbits[0].error <= tolerance
 
 
 @pytest.mark.parametrize("theta", [0.0, 100.0, 2500.0])
 def test_end_stop_agrees_with_long_integration(theta):
     answer = end_stop(theta)
-    assert answer.orbit.status is Status.CONVERGED
-    assert answer.orbit.stable
+    assert answer.orbits[0].status is Status.CONVERGED
+    assert answer.orbits[0].stable
     # The reference's own error, which shows where the mesh is refined: 4e-8.
-    np.testing.assert_allclose(answer.orbit.states[0], REFERENCE[theta], atol=1e-7)
-    assert answer.orbit.states.shape[0] < 250
+    np.testing.assert_allclose(answer.orbits[0].states[0], REFERENCE[theta], atol=1e-7)
+    assert answer.orbits[0].states.shape[0] < 250
 
 
 @pytest.mark.slow
@@ -67,25 +71,25 @@ def test_end_stop_agrees_with_long_integration(theta):
 def test_a_walk_along_the_stiffness_reaches_stiff_stops(theta):
     """Beyond 2500 Verbeek (1993) had to shoot. Wanted: 1e-4 in position, 1e-3 in velocity."""
     answer = end_stop(theta, stiffness="stop_stiffness")
-    assert answer.orbit.status is Status.CONVERGED
-    np.testing.assert_allclose(answer.orbit.states[0], REFERENCE[theta], atol=5e-7)
+    assert answer.orbits[0].status is Status.CONVERGED
+    np.testing.assert_allclose(answer.orbits[0].states[0], REFERENCE[theta], atol=5e-7)
     # The stop is hit once; edges stand on the contact's ends and on both reversals of velocity.
-    assert answer.solution.level.kinks.phases.size == 4
-    assert answer.orbit.states.shape[0] < 300
+    assert answer.motions[0].solution.level.kinks.phases.size == 4
+    assert answer.orbits[0].states.shape[0] < 300
 
 
 @pytest.mark.slow
 def test_a_stiffer_contact_needs_no_more_steps():
     """The contact shrinks ten times and its steps with it: their number stays."""
     soft, stiff = (end_stop(theta, stiffness="stop_stiffness") for theta in (1e6, 1e8))
-    assert stiff.orbit.states.shape[0] < 1.3 * soft.orbit.states.shape[0]
-    shortest = [np.diff(item.solution.mesh.edges).min() for item in (soft, stiff)]
+    assert stiff.orbits[0].states.shape[0] < 1.3 * soft.orbits[0].states.shape[0]
+    shortest = [np.diff(item.motions[0].solution.mesh.edges).min() for item in (soft, stiff)]
     assert shortest[0] / shortest[1] == pytest.approx(10.0, rel=0.5)
 
 
 def at_the_start(method, n, exact, kinks):
     """Error of the first state on ``n`` steps between kinks, or on as many equal steps."""
-    problem = adaptive_problem(system("end_stop"), END_STOP)[1]
+    problem = periodic_problem(system("end_stop"), record_of(system("end_stop"), END_STOP))
     mesh = equidistant(5 * n)
     if kinks is not None:
         ends = np.concatenate([[0.0], kinks.phases, [1.0]])
@@ -97,7 +101,7 @@ def at_the_start(method, n, exact, kinks):
 
 def test_edges_on_kinks_keep_the_order_of_the_method():
     """Across a contact, which costs equal steps all of it."""
-    exact = end_stop(2500.0, tolerance=1e-10, method="gauss3").solution
+    exact = end_stop(2500.0, tolerance=1e-10, scheme="gauss3").motions[0].solution
     kinks = exact.level.kinks
     for method, order in {"radau2": 3, "radau3": 5, "gauss2": 4, "gauss3": 6}.items():
         coarse, fine = (at_the_start(method, n, exact, kinks) for n in (24, 48))
@@ -115,11 +119,11 @@ def test_kinks_that_are_not_declared_are_found_by_shorter_steps():
     )
     nominal = {str(item): value for item, value in model.nominal().items()}
     p = np.array([nominal[name] for name in plain.derived.constants])
-    found = solve_adaptive(problem, p, end_stop(0.0).solution.motion, tolerance=1e-5)
+    found = solve_adaptive(problem, p, end_stop(0.0).motions[0].rows, tolerance=1e-5)
     assert found.orbit.status is Status.CONVERGED
     assert found.level.kinks is None
     # Inside a step a kink makes the estimate optimistic: by less than ten here.
     np.testing.assert_allclose(found.orbit.states[0], REFERENCE[100.0], atol=1e-4)
-    contact = found.mesh.locate(end_stop(100.0).solution.level.kinks.phases[[1, 3]])[0]
+    contact = found.mesh.locate(end_stop(100.0).motions[0].solution.level.kinks.phases[[1, 3]])[0]
     lengths = np.diff(found.mesh.edges)
     assert lengths[contact].max() < 0.2 * lengths.max()

@@ -11,7 +11,7 @@ from bayesoleo.model import driven_by
 from bayesoleo.model.expressions import derivative_symbol, symbol
 from bayesoleo.prediction.branch import follow_branch
 from bayesoleo.prediction.limit_cycle import limit_cycle
-from bayesoleo.prediction.orbit import periodic_answer
+from bayesoleo.prediction.orbits import periodic_orbit
 from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
 from bayesoleo.systems import system, systems
 
@@ -118,8 +118,11 @@ def test_three_answers_of_duffing_and_which_of_them_last(duffing):
 def test_end_stop_moves_as_in_the_thesis(theta, first, least, fastest):
     """Verbeek (1993), section 4.3.3; digits from 60 periods of LSODA at rtol 1e-9."""
     plan = RunPlan("a", 1.0, {"force": motion(23.0, [20.0])})
-    answer = periodic_answer(system("end_stop"), plan, {"stop_stiffness": theta}, tolerance=1e-7)
-    np.testing.assert_allclose(answer.orbit.states[0], first, atol=1e-6)
+    stiffness = {"stop_stiffness": theta}
+    answer = periodic_orbit(
+        system("end_stop"), plan, stiffness, "adaptive", tolerance=1e-7, backend="numpy"
+    )
+    np.testing.assert_allclose(answer.orbits[0].states[0], first, atol=1e-6)
     phase = np.linspace(0.0, 1.0, 20001)
     assert answer.dof("stroke", phase).min() == pytest.approx(least, abs=6e-6)
     speed = np.abs(answer.dof("stroke", phase, 1)).max()

@@ -271,6 +271,7 @@ class CampaignSource:
             records,
             steps=old.steps,
             scheme=old.scheme,
+            solver=old.solver,
             backend=old.backend,
             jobs=1,
         )

@@ -129,7 +129,7 @@ def importance_sample(
 
 def _weights(proposals: list[Mixture], phi: Array, height: Array) -> tuple[Array, float]:
     """Normalised weights, smoothed, and the shape of their tail."""
-    from arviz_stats.base import array_stats  # type: ignore[attr-defined] # not in its __all__
+    from arviz_stats.base import array_stats
 
     finite = np.flatnonzero(np.isfinite(height))
     if not finite.size:

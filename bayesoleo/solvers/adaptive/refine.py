@@ -16,6 +16,7 @@ Verbeek (1993), section 4.3.1, recommends error-controlled meshes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -33,7 +34,7 @@ from bayesoleo.solvers.adaptive.switched import (
     state_rows,
 )
 from bayesoleo.solvers.adaptive.warp import SAME, Warp
-from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.orbit import Orbit
 from bayesoleo.solvers.periodic.solve import Solution, sensitivities
 from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
 from bayesoleo.solvers.schemes.tableau import Tableau, tableau
@@ -45,7 +46,7 @@ MAXIMUM_PASSES = 25
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class AdaptiveStart:
     """Where to start from: a motion, and a mesh that suits it.
 
     Parameters
@@ -96,13 +97,16 @@ class AdaptiveSolution:
         """Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,)."""
         return self.level.motion(phase)
 
-    def start(self, warp: Warp = SAME) -> Start:
+    def start(self, warp: Warp = SAME) -> AdaptiveStart:
         """Start of another solution, phases moved by a warp."""
         kinks = self.level.kinks
         if kinks is not None:
             kinks = replace(kinks, phases=warp.forward(kinks.phases))
-        return Start(lambda phase: self.motion(warp.back(phase)), warp.mesh(self.next_mesh), kinks)
+        return AdaptiveStart(
+            lambda phase: self.motion(warp.back(phase)), warp.mesh(self.next_mesh), kinks
+        )
 
+    @cached_property
     def sensitivities(self) -> Array:
         """Derivatives of the unknowns by the active parameters, shape (n, w, na).
 
@@ -116,13 +120,14 @@ class AdaptiveSolution:
         """Derivatives of :meth:`motion` by the active parameters, shape (nz, na, N)."""
         n = self.level.x.shape[0]
         plan, step = self.level.scheme.plan(phase, n), self.level.boundary.step(n)
-        return cast(Array, self.level.scheme.sample(self.sensitivities()[None], plan, step)[0])
+        found: Array = self.level.scheme.sample(self.sensitivities[None], plan, step)[0]
+        return found
 
 
 def solve_adaptive(
     problem: PeriodicProblem,
     p: Array,
-    start: Motion | Start,
+    start: Motion | AdaptiveStart,
     *,
     method: str = "radau3",
     tolerance: float = 1e-6,
@@ -136,7 +141,7 @@ def solve_adaptive(
         Equations and inputs.
     p : ndarray, shape (np,)
         Constants.
-    start : callable or Start
+    start : callable or AdaptiveStart
         A guess: values and derivatives of all dofs, shape (nz, N), at phases in cycles; or what
         another solution's :meth:`AdaptiveSolution.start` gives.
     method : str
@@ -151,7 +156,7 @@ def solve_adaptive(
     AdaptiveSolution
         Whatever came of it; see ``orbit.status``.
     """
-    begin = start if isinstance(start, Start) else Start(start)
+    begin = start if isinstance(start, AdaptiveStart) else AdaptiveStart(start)
     end = _Work(problem, p, tableau(method), tolerance, max_steps).run(begin)
     return _finish(end, problem, p)
 
@@ -177,7 +182,7 @@ class _Work:
     tolerance: float
     max_steps: int
 
-    def run(self, start: Start) -> _End:
+    def run(self, start: AdaptiveStart) -> _End:
         """Solve, halve, compare, place the steps anew, until the tolerance is met."""
         level, spent = self._first(start)
         for _ in range(MAXIMUM_PASSES):
@@ -215,7 +220,7 @@ class _Work:
             self.problem, self.method, self.p, level.motion, level.mesh, self.tolerance
         )
 
-    def _first(self, start: Start) -> tuple[Level, int]:
+    def _first(self, start: AdaptiveStart) -> tuple[Level, int]:
         if start.mesh is not None:
             level = self._solve(start.mesh, start.motion, start.kinks)
             return level, level.evaluations
@@ -235,20 +240,19 @@ class _Work:
 
 def _finish(end: _End, problem: PeriodicProblem, p: Array) -> AdaptiveSolution:
     level, status, scheme = end.level, end.status, end.level.scheme
-    multipliers = np.full(scheme.state_size, complex(np.nan))
+    monodromy = np.full((scheme.state_size, scheme.state_size), np.nan)
     if status.solved:
         held = problem.on(scheme.method, level.mesh, level.kinks)
         level = replace(level, boundary=held)
         found = Solution(level.x[None], np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
-        found, _, monodromy = sensitivities(held, p[None], found)
+        found, _, (monodromy,) = sensitivities(held, p[None], found)
         if found.status[0] != Status.CONVERGED.value:
             status = Status(int(found.status[0]))
-        multipliers = floquet_multipliers(monodromy[0])
     orbit = Orbit(
         phases=level.mesh.edges[:-1],
         states=level.x[:, : scheme.state_size],
         period=problem.period,
-        multipliers=multipliers,
+        monodromy=monodromy,
         status=status,
         error=end.error,
         evaluations=end.evaluations,

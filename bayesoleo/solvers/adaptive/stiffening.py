@@ -9,7 +9,7 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.refine import (
     AdaptiveSolution,
-    Start,
+    AdaptiveStart,
     solve_adaptive,
 )
 from bayesoleo.solvers.adaptive.switched import Motion, PeriodicProblem
@@ -27,7 +27,7 @@ ROUGH = 1e-3
 def solve_stiffening(
     problem: PeriodicProblem,
     p: Array,
-    start: Motion | Start,
+    start: Motion | AdaptiveStart,
     index: int,
     *,
     method: str = "radau3",
@@ -86,7 +86,9 @@ class _Way:
     method: str
     max_steps: int
 
-    def solve(self, value: float, start: Motion | Start, tolerance: float) -> AdaptiveSolution:
+    def solve(
+        self, value: float, start: Motion | AdaptiveStart, tolerance: float
+    ) -> AdaptiveSolution:
         p = self.p.copy()
         p[self.index] = value
         return solve_adaptive(

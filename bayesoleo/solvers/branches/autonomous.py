@@ -23,7 +23,7 @@ from bayesoleo.solvers.branches.bordered import (
     end_states,
     solve_bordered,
 )
-from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.orbit import Orbit
 from bayesoleo.solvers.periodic.solve import Boundary
 from bayesoleo.solvers.status import Status
 
@@ -99,12 +99,11 @@ def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> L
     moving = rows[[first[j] + k + 1 for j, o in enumerate(method.orders) for k in range(o)]]
     condition = Condition(np.append(moving, 0.0), float(moving @ x[0, :D]))
     solution = solve_bordered(family, x, period, condition)
-    multipliers = floquet_multipliers(solution.monodromy)
     orbit = Orbit(
         phases=np.arange(len(x)) / len(x),
         states=solution.x[:, :D],
         period=solution.value,
-        multipliers=multipliers,
+        monodromy=solution.monodromy,
         status=Status.NO_ERROR_ESTIMATE if solution.status.ok else solution.status,
         error=np.nan,
         evaluations=4 * solution.iterations * problem.inputs.shape[1],

@@ -13,6 +13,11 @@ from bayesoleo.solvers.schemes.tableau import tableau
 #: Three-stage Radau IIA: order five, and stiff components (steep friction) decay instead of
 #: ringing.
 DEFAULT_SCHEME = "radau3"
+#: Solvers of periodic motions: all unknowns of a period at once on equal steps, the same on a mesh
+#: with error control, shooting, shooting with derivatives on a mesh of its steps, and shooting with
+#: SciPy's LSODA.
+COLLOCATION = "collocation"
+SOLVERS = (COLLOCATION, "adaptive", "shooting", "hybrid", "library")
 
 
 def scheme(name: str, orders: tuple[int, ...], mesh: Mesh | None = None) -> Scheme:

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.orbit import Orbit
 from bayesoleo.solvers.status import Status
 from bayesoleo.solvers.transient.state_space import StateSpace
 
@@ -207,14 +207,14 @@ class _Library:
         start_theta = np.linalg.solve(np.eye(D) - monodromy, end[:, 1 + D :])
         states = path.y[:: end.shape[1], :-1].T
         orbit = Orbit(
-            path.t[:-1] / self.period, states, self.period, floquet_multipliers(monodromy), status,
-            np.nan, self.evaluations,
+            path.t[:-1] / self.period, states, self.period, monodromy, status, np.nan,
+            self.evaluations,
         )  # fmt: skip
         return LibraryShot(self.space, self.p, orbit, path.sol, start_theta)
 
     def failed(self, state: Array, status: Status) -> LibraryShot:
         D = self.space.size
-        nothing = np.full(D, complex(np.nan))
+        nothing = np.full((D, D), np.nan)
         orbit = Orbit(
             np.zeros(1), state[None], self.period, nothing, status, np.nan, self.evaluations
         )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Float
-from bayesoleo.solvers.orbit import Orbit, floquet_multipliers
+from bayesoleo.solvers.orbit import Orbit
 from bayesoleo.solvers.shooting.initial_value import Dynamics, Trajectory, solve_initial_value
 from bayesoleo.solvers.status import Status
 
@@ -95,7 +95,7 @@ class Shot:
             phases=(path.times[:-1] - path.times[0]) / max(self.period, 1e-300),
             states=path.states[:-1],
             period=self.period,
-            multipliers=floquet_multipliers(self.monodromy),
+            monodromy=self.monodromy,
             status=Status.NO_ERROR_ESTIMATE if self.status.ok else self.status,
             error=np.nan,
             evaluations=self.evaluations,

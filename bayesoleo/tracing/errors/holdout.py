@@ -81,6 +81,7 @@ def _single(fit: Fit, record: Record) -> Predictor:
         [record],
         steps=fit.steps,
         scheme=numerics.scheme,
+        solver=numerics.solver,
         backend=numerics.backend,
         jobs=numerics.jobs,
         share=fit.predictor,
@@ -144,8 +145,9 @@ def crossed(prediction: Prediction) -> Prediction | None:
 def _like(prediction: Prediction, record: Record) -> Predictor:
     old = prediction.predictor
     return Predictor(
-        old.model, [record], steps=old.steps, scheme=old.scheme, backend=old.backend, jobs=1
-    )
+        old.model, [record], steps=old.steps, scheme=old.scheme, solver=old.solver,
+        backend=old.backend, jobs=1,
+    )  # fmt: skip
 
 
 def _own_estimate(prediction: Prediction, record: Record) -> Array | None:

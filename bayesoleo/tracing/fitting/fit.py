@@ -17,7 +17,7 @@ from bayesoleo.prediction.motion_error import motion_error, outputs_of
 from bayesoleo.prediction.predictor import Predictor, RunPrediction
 from bayesoleo.prediction.records import Record
 from bayesoleo.prediction.stability import Stability
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
+from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.other_starts import doubtful, from_other_starts
 
@@ -56,6 +56,8 @@ class Numerics:
     ----------
     scheme : str
         Discretisation.
+    solver : str
+        Of periodic runs, see :func:`~bayesoleo.prediction.orbits.periodic_orbit`.
     steps : int or None
         Steps of the mesh; ``None`` refines until the estimate no longer moves.
     jobs : int or None
@@ -72,6 +74,7 @@ class Numerics:
     jobs: int | None = None
     backend: str = "numba"
     scheduler: str | None = None
+    solver: str = COLLOCATION
 
 
 @dataclass(frozen=True)
@@ -263,6 +266,7 @@ def _problem(
         records,
         steps=steps,
         scheme=numerics.scheme,
+        solver=numerics.solver,
         backend=numerics.backend,
         jobs=numerics.jobs,
         share=share,
@@ -299,6 +303,7 @@ def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | Non
         coarse.records,
         steps=2 * coarse.steps,
         scheme=coarse.scheme,
+        solver=coarse.solver,
         backend=coarse.backend,
         jobs=coarse.jobs,
         share=coarse,

@@ -133,6 +133,7 @@ def _on_phases(prediction: Prediction, theta: Array) -> Array:
         [replace(record, time=record.span * _grid(record), samples=blank)],
         steps=old.steps,
         scheme=old.scheme,
+        solver=old.solver,
         backend=old.backend,
         jobs=1,
     )

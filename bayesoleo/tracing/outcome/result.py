@@ -79,6 +79,7 @@ def point_group(fit: Fit) -> xr.Dataset:
         scheme = fit.numerics.scheme
         point.attrs |= {
             "scheme": scheme,
+            "solver": fit.numerics.solver,
             "steps": fit.steps,
             "mesh_shift": fit.shift,
             "motion_error": fit.motion_error,
