@@ -290,9 +290,9 @@ def _errors(
 def _as_judged(tree: xr.DataTree, record: Record, run: _Run, model: Model) -> _Run:
     """With the errors that the search of the result has found on the very same samples: there is
     one answer. It knows more: what each run said of its own parameters."""
-    if schema.OBSERVED_DATA not in tree.children:
+    if schema.RECORDS not in tree.children:
         return run
-    observed = tree[schema.OBSERVED_DATA].to_dataset()
+    observed = tree[schema.RECORDS].to_dataset()
     errors = []
     for output, computed in zip(model.outputs, run.errors, strict=True):
         same = output in observed and record.label in observed[schema.RUN].values

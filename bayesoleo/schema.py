@@ -20,6 +20,7 @@ FORMAT: Final = 1
 """Version of the layout; a reader refuses a later one."""
 
 # Groups
+RECORDS: Final = "records"
 OBSERVED_DATA: Final = "observed_data"
 CONSTANT_DATA: Final = "constant_data"
 NOISE: Final = "noise"
@@ -29,6 +30,7 @@ POSTERIOR: Final = "posterior"
 SAMPLE_STATS: Final = "sample_stats"
 LOG_LIKELIHOOD: Final = "log_likelihood"
 POSTERIOR_PREDICTIVE: Final = "posterior_predictive"
+PERIOD_PREDICTIVE: Final = "period_predictive"
 RESIDUAL: Final = "residual"
 PREDICTION: Final = "prediction"
 DISCOVERY: Final = "discovery"
@@ -44,6 +46,7 @@ COMPARISON: Final = "comparison"
 PROPOSAL: Final = "proposal"
 
 GROUPS: Final = (
+    RECORDS,
     OBSERVED_DATA,
     CONSTANT_DATA,
     NOISE,
@@ -53,6 +56,7 @@ GROUPS: Final = (
     SAMPLE_STATS,
     LOG_LIKELIHOOD,
     POSTERIOR_PREDICTIVE,
+    PERIOD_PREDICTIVE,
     RESIDUAL,
     PREDICTION,
     DISCOVERY,
@@ -72,6 +76,8 @@ GROUPS: Final = (
 CHAIN: Final = "chain"
 DRAW: Final = "draw"
 RUN: Final = "run"
+BLOCK: Final = "block"
+PERIOD: Final = "period"
 SAMPLE: Final = "sample"
 PHASE: Final = "phase"
 OUTPUT: Final = "output"
@@ -267,8 +273,8 @@ def of_errors(name: str) -> bool:
 _RUN_WORDS: Final = (RUN, FREQUENCY, FREQUENCY_SD, PERIODS, ROLE, RUN_GROUP)
 _RESERVED: Final = {
     "parameter": frozenset({CHAIN, DRAW, ENSEMBLE}),
-    "input": frozenset({RUN, SAMPLE, PHASE, CHAIN, DRAW}),
-    "output": frozenset({RUN, SAMPLE, PHASE, CHAIN, DRAW}),
+    "input": frozenset({RUN, BLOCK, PERIOD, SAMPLE, PHASE, CHAIN, DRAW}),
+    "output": frozenset({RUN, BLOCK, PERIOD, SAMPLE, PHASE, CHAIN, DRAW}),
     "condition": frozenset(_RUN_WORDS),
 }
 

@@ -26,9 +26,9 @@ import calibration_oleo as campaign
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesoleo.error_models.discrepancy import basis, spectrum
 from bayesoleo.posterior import LogDensity, importance_sample, laplace_mixture
 from bayesoleo.posterior import sample as draw
-from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
 
 Arrays = dict[str, NDArray]
 #: Ninety-per-cent intervals.

@@ -13,9 +13,10 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, stats
+from scipy import stats
 
 from bayesoleo._types import Array, Float
+from bayesoleo.autocovariance import lagged_products
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,7 @@ def autocorrelation(values: Array, lags: int) -> Array:
     ndarray, shape (lags + 1,)
     """
     centred = values - values.mean()
-    length = fft.next_fast_len(2 * values.size)
-    sums = fft.irfft(np.abs(fft.rfft(centred, length)) ** 2, length)[: lags + 1]
+    sums = lagged_products(centred[None])[: lags + 1]
     overlap = values.size - np.arange(lags + 1)
     return cast(Array, sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny))
 

@@ -211,7 +211,7 @@ def series_of_tree(tree: xr.DataTree, stage: str | None = None) -> list[Series]:
             hint="give the results.nc that `bayesoleo close` or `bayesoleo trace` wrote",
         )  # fmt: skip
     residual = tree[schema.RESIDUAL].to_dataset()
-    observed = tree[schema.OBSERVED_DATA].to_dataset()
+    observed = tree[schema.RECORDS].to_dataset()
     constant = tree[schema.CONSTANT_DATA].to_dataset()
     outputs = [str(n).removesuffix("_before") for n in residual if str(n).endswith("_before")]
     if stage is None:

@@ -48,7 +48,7 @@ def whereabouts(tree: xr.DataTree) -> xr.Dataset:
     residual = tree[schema.RESIDUAL].to_dataset() if schema.RESIDUAL in tree.children else None
     if residual is None:
         raise InputError("the result holds no residual", hint="give the result of close or trace")
-    observed = tree[schema.OBSERVED_DATA].to_dataset()
+    observed = tree[schema.RECORDS].to_dataset()
     periodic = np.isfinite(observed[schema.PHASE].values).any(axis=1)
     if not periodic.any():
         raise InputError("no run is periodic", hint="transients have no harmonics")
@@ -120,7 +120,7 @@ def _coordinates(
 ) -> dict[str, Array]:
     """What the error may be a function of, on the phases of the averages, each (runs, phases)."""
     phases = residual.sizes[schema.PHASE]
-    observed = tree[schema.OBSERVED_DATA].to_dataset()
+    observed = tree[schema.RECORDS].to_dataset()
     phase = observed[schema.PHASE].values[periodic]
     count = phase.shape[0]
     found: dict[str, Array] = {"phase": np.tile(np.arange(phases) / phases, (count, 1))}

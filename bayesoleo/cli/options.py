@@ -225,8 +225,8 @@ def settings(
         If there is no such scheme, solver, error model or effect, or the file of effects cannot be
         used.
     """
+    from bayesoleo.error_models import check_word
     from bayesoleo.modelfile import load_effects
-    from bayesoleo.posterior.density.error_models import check_word
     from bayesoleo.prediction.solver import check_solver
     from bayesoleo.workflow import Settings
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from bayesoleo._types import Array
+from bayesoleo.autocovariance import lagged_products
 from bayesoleo.data.harmonics import FALSE_DISCOVERY_RATE, coefficient_variances, significant_orders
 from bayesoleo.data.transforms import HarmonicBasis, highest_order
 from bayesoleo.errors import CampaignError
@@ -81,9 +82,7 @@ def autocovariance(values: Array, shifts: NDArray[np.int64]) -> Array:
         In the square of the signal's unit; large where the shift is a period.
     """
     centred = values - np.mean(values)
-    power = np.abs(fft.rfft(centred, fft.next_fast_len(2 * values.size))) ** 2
-    sums = fft.irfft(power, fft.next_fast_len(2 * values.size))[shifts]
-    return cast(Array, sums / (values.size - shifts))
+    return lagged_products(centred[None])[shifts] / (values.size - shifts)
 
 
 def find_frequency(values: Array, time_step: float, nominal: float) -> Frequency:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import fft, stats
+from scipy import stats
 
 from bayesoleo._types import Array
+from bayesoleo.autocovariance import lagged_products
 from bayesoleo.data.transforms import HarmonicBasis
 
 #: Chance of dropping the first period of a settled channel whose noise is stationary.
@@ -97,20 +98,19 @@ def _differs(values: Array, length: int, step: float, level: float) -> bool:
 
 
 def _exceeds(power: float, rest: Array, length: int, share: float, level: float) -> bool:
-    """One-sided F-test, degrees of freedom cut by the noise's memory; no later period as bad."""
+    """One-sided F-test, degrees of freedom cut by correlated noise; no later period as bad."""
     usual = float(np.mean(rest**2))
-    memory = _memory(rest)
+    together = _samples_per_degree(rest)
     free = rest.size * (1.0 - share)
-    bound = stats.f.isf(level, max(length / memory, 1.0), max(free / memory, 1.0))
+    bound = stats.f.isf(level, max(length / together, 1.0), max(free / together, 1.0))
     others = rest[: rest.size // length * length].reshape(-1, length)
     worst = float(np.max(np.mean(others**2, axis=1)))
     return power > max(bound, 1.0 + LEAST_EXCESS) * usual and power > worst
 
 
-def _memory(rest: Array) -> float:
+def _samples_per_degree(rest: Array) -> float:
     """Samples per degree of freedom of a mean square: ``1 + 2 sum rho**2``."""
-    length = fft.next_fast_len(2 * rest.size)
-    covariance = fft.irfft(np.abs(fft.rfft(rest, length)) ** 2, length)[: rest.size // 10]
+    covariance = lagged_products(rest[None])[: rest.size // 10]
     correlation = covariance[1:] / max(float(covariance[0]), 1e-300)
     # Chance correlations of white noise have variance 1/N; without them white noise keeps all its
     # samples.

@@ -1,5 +1,11 @@
 """Which parameter values fit, and how sure is that, at a point."""
 
+from bayesoleo.error_models.independent import (
+    log_likelihood,
+    output_counts,
+    staged_variance,
+    sums_of_squares,
+)
 from bayesoleo.estimation.estimators.estimate import estimate, polish
 from bayesoleo.estimation.estimators.methods import METHODS
 from bayesoleo.estimation.estimators.multistart import Modes, multistart
@@ -7,15 +13,12 @@ from bayesoleo.estimation.estimators.outcome import Iteration
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.table import as_text, to_dataset
-from bayesoleo.estimation.objectives.diagonal import (
-    log_likelihood,
+from bayesoleo.estimation.objectives.objective import (
+    OBJECTIVES,
+    Objective,
     log_posterior,
     log_prior,
-    output_counts,
-    staged_variance,
-    sums_of_squares,
 )
-from bayesoleo.estimation.objectives.objective import OBJECTIVES, Objective
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.estimation.problems.function_problem import FunctionProblem
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit, Problem

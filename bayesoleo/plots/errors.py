@@ -162,7 +162,7 @@ def _logarithmic(axes: Axes, values: Array) -> None:
 
 
 def _unit(tree: xr.DataTree, output: str) -> str:
-    data = reading.group(tree, schema.OBSERVED_DATA)
+    data = reading.group(tree, schema.RECORDS)
     return "" if data is None or output not in data else reading.unit(data[output])
 
 

@@ -22,7 +22,7 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
     Parameters
     ----------
     tree : DataTree
-        Needs ``observed_data`` and ``prediction``.
+        Needs ``records`` and ``prediction``.
     output : str
         Name of the channel.
 
@@ -32,7 +32,7 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
         Averages over the periods of a run. A signal with too many harmonics for that is shown by a
         stretch of raw samples from the middle of its record.
     """
-    measured = reading.variable(tree, schema.OBSERVED_DATA, output)
+    measured = reading.variable(tree, schema.RECORDS, output)
     scale = engineering(reading.unit(measured), style.magnitude(measured.values))
     names = [schema.before(output), schema.after(output)]
     shown = [name for name in names if name in tree[schema.PREDICTION]]

@@ -36,7 +36,7 @@ def predictive(tree: xr.DataTree, output: str, level: float = 0.95) -> Figure:
     Parameters
     ----------
     tree : DataTree
-        Needs ``posterior_predictive``, ``observed_data`` and ``prediction``.
+        Needs ``period_predictive``, ``records`` and ``prediction``.
     output : str
         Name of the channel.
     level : float, optional
@@ -56,11 +56,11 @@ def predictive(tree: xr.DataTree, output: str, level: float = 0.95) -> Figure:
     ResultsError
         If there is no prediction of that output, or it is of an earlier version of the package.
     """
-    if schema.POSTERIOR_PREDICTIVE not in tree.children:
+    if schema.PERIOD_PREDICTIVE not in tree.children:
         raise ResultsError(
-            f"needs the group {schema.POSTERIOR_PREDICTIVE!r}", hint="sample the posterior first"
+            f"needs the group {schema.PERIOD_PREDICTIVE!r}", hint="sample the posterior first"
         )
-    data = tree[schema.POSTERIOR_PREDICTIVE].to_dataset()
+    data = tree[schema.PERIOD_PREDICTIVE].to_dataset()
     if schema.average_sd(output) not in data:
         raise ResultsError(
             "the posterior predictive has no averages of this output",
@@ -114,7 +114,7 @@ def _row(tree: xr.DataTree, data: xr.Dataset, output: str, run: reading.Run, lev
     # At the samples the prediction is exact; between points of the grid it is not.
     predicted = tree[schema.PREDICTION].to_dataset()
     last = schema.after(output) if schema.after(output) in predicted else schema.before(output)
-    observed = reading.variable(tree, schema.OBSERVED_DATA, output).values[run.index]
+    observed = reading.variable(tree, schema.RECORDS, output).values[run.index]
     e = observed - predicted[last].values[run.index]
     centres, measured = reading.fold(reading.abscissa(tree, run), e, draws.shape[1])
     grid = np.asarray(data[schema.PHASE].values, dtype=float)

@@ -85,7 +85,7 @@ def _marks(axes: Axes, tree: xr.DataTree, data: xr.Dataset, scale: Scale) -> Non
     axes.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
     axes.yaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
     limits = axes.get_xlim(), axes.get_ylim()
-    observed = reading.group(tree, schema.OBSERVED_DATA)
+    observed = reading.group(tree, schema.RECORDS)
     drive = str(tree[schema.PROPOSAL].attrs["drive"])
     if observed is not None and drive in observed:
         rows = observed[drive].values

@@ -86,7 +86,7 @@ def outputs(tree: xr.DataTree) -> list[str]:
 
 def channels(tree: xr.DataTree) -> list[str]:
     """Measured channels: those that are not outputs (the inputs) first."""
-    data = group(tree, schema.OBSERVED_DATA)
+    data = group(tree, schema.RECORDS)
     if data is None:
         return []
     own = [str(name) for name in data.data_vars if name not in (schema.TIME, schema.PHASE)]
@@ -95,7 +95,7 @@ def channels(tree: xr.DataTree) -> list[str]:
 
 def runs(tree: xr.DataTree) -> list[Run]:
     """The runs, in the order of the tree."""
-    data, constant = group(tree, schema.OBSERVED_DATA), group(tree, schema.CONSTANT_DATA)
+    data, constant = group(tree, schema.RECORDS), group(tree, schema.CONSTANT_DATA)
     if data is None:
         return []
     count = data.sizes[schema.RUN]
@@ -129,7 +129,7 @@ def unit(data: xr.DataArray) -> str:
 
 def abscissa(tree: xr.DataTree, run: Run) -> Array:
     """Phase modulo 1 of every sample; of a transient the fraction of its duration; NaN padded."""
-    data = tree[schema.OBSERVED_DATA].to_dataset()
+    data = tree[schema.RECORDS].to_dataset()
     if run.periodic:
         return np.asarray(data[schema.PHASE].values[run.index] % 1.0, dtype=np.float64)
     time = np.asarray(data[schema.TIME].values[run.index], dtype=np.float64)

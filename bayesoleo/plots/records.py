@@ -20,7 +20,7 @@ def records(tree: xr.DataTree) -> Figure:
     Parameters
     ----------
     tree : DataTree
-        Needs ``observed_data``.
+        Needs ``records``.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def _channel(
     """One channel of one run; all runs of a channel share its scale."""
     axes = figure.add_axes(box)
     style.dress(axes, ticks=2)
-    data = reading.variable(tree, schema.OBSERVED_DATA, name)
+    data = reading.variable(tree, schema.RECORDS, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     position, values = reading.abscissa(tree, run), scale.factor * data.values[run.index]
     if reading.is_resolved(position, values):
@@ -82,7 +82,7 @@ def _limits(values: Array) -> tuple[float, float]:
 
 def _head(figure: Figure, tree: xr.DataTree, name: str, x: float, height: float) -> None:
     """Name and unit of a channel above its column."""
-    data = reading.variable(tree, schema.OBSERVED_DATA, name)
+    data = reading.variable(tree, schema.RECORDS, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     text = style.plain(scale.label(name))
     figure.text(

@@ -1,9 +1,9 @@
 """Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
 
+from bayesoleo.error_models import ERROR_MODELS, error_model
 from bayesoleo.posterior.approximation.importance import Weighted, importance_sample
 from bayesoleo.posterior.approximation.laplace import Mode, find_mode, laplace_mixture
 from bayesoleo.posterior.approximation.mixture import Mixture
-from bayesoleo.posterior.density.error_models import ERROR_MODELS, error_model
 from bayesoleo.posterior.density.hierarchy import hierarchical
 from bayesoleo.posterior.density.log_density import LogDensity
 from bayesoleo.posterior.outcome.comparison import compare, comparison_text

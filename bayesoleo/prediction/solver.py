@@ -11,7 +11,7 @@ import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -350,17 +350,17 @@ def _in_pieces(model: Model, compiled: Kernels, backend: str) -> tuple[Kernels, 
         return compiled, None
 
     def values(z: Array, u: Array, p: Array) -> Array:
-        y: Array = np.empty((1, len(derived.outputs), z.shape[1]))
+        y = np.empty((1, len(derived.outputs), z.shape[1]))
         with np.errstate(all="ignore"):
             chosen.output(z[None], u, p[None], lane, y)
-        return y[0]
+        return cast(Array, y[0])
 
     def slopes(z: Array, u: Array, p: Array) -> Array:
         count = len(derived.outputs)
-        yz: Array = np.empty((1, count, *z.shape))
+        yz = np.empty((1, count, *z.shape))
         yp = np.empty((1, count, len(derived.active), z.shape[1]))
         with np.errstate(all="ignore"):
             chosen.output_jacobian(z[None], u, p[None], lane, yz, yp)
-        return yz[0]
+        return cast(Array, yz[0])
 
     return chosen, Switches(values, slopes, tuple(derived.inputs.index((m, 0)) for m in modes))

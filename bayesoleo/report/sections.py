@@ -197,11 +197,11 @@ def posterior_figures(tree: xr.DataTree) -> list[Shown]:
 
 def predictive_figures(tree: xr.DataTree) -> list[Shown]:
     """The posterior prediction of each output."""
-    if schema.POSTERIOR_PREDICTIVE not in tree.children:
+    if schema.PERIOD_PREDICTIVE not in tree.children:
         return []
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
-        if schema.average_sd(output) in tree[schema.POSTERIOR_PREDICTIVE]:
+        if schema.average_sd(output) in tree[schema.PERIOD_PREDICTIVE]:
             caption = (
                 f"Measured {output}, averaged over the periods of each run, about the prediction. "
                 "Dark: what the parameters leave open; light: where 95 % of such averages would "

@@ -63,7 +63,7 @@ class Table:
 
 def output_units(tree: xr.DataTree, summary: Mapping[str, Any]) -> dict[str, str]:
     """SI unit of each channel."""
-    data = reading.group(tree, schema.OBSERVED_DATA)
+    data = reading.group(tree, schema.RECORDS)
     found = {} if data is None else {str(n): reading.unit(v) for n, v in data.data_vars.items()}
     return {**dict(summary.get("units", {})), **found}
 

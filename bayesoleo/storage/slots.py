@@ -1,12 +1,15 @@
 """Numbered pieces of a long calculation on disk: each whole or absent, only missing ones redone.
 
-A piece depends on its own number alone, never on which pieces were made before it, so a calculation
-that was stopped goes on to the same result in any order and with any number of workers.
+Where a piece depends on its own number alone (:meth:`Slots.fill`), a calculation that was stopped
+goes on to the same result in any order and with any number of workers. Where each goes on from the
+one before it (:meth:`Slots.chain`), it goes on from the last that is whole.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
+import zlib
 from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
@@ -22,7 +25,9 @@ from bayesoleo.storage.atomic import replacing
 from bayesoleo.storage.lock import only_writer
 
 Arrays = dict[str, NDArray[Any]]
-_FINGERPRINT = "fingerprint"
+_FINGERPRINT, _CHECKSUM = "fingerprint", "checksum"
+#: What reading a truncated or altered archive can raise.
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error)
 
 
 class Slots:
@@ -34,16 +39,27 @@ class Slots:
         Made with the first piece; with None pieces are kept in memory.
     fingerprint : str
         Says what the pieces belong to; pieces of something else are refused.
+    name : str
+        What files are called.
+    foreign : str
+        What is said of pieces of something else.
     """
 
-    def __init__(self, folder: str | os.PathLike[str] | None, fingerprint: str) -> None:
+    def __init__(
+        self,
+        folder: str | os.PathLike[str] | None,
+        fingerprint: str,
+        *,
+        name: str = "slot",
+        foreign: str = "belongs to another calculation",
+    ) -> None:
         self.folder = None if folder is None else Path(folder)
-        self.fingerprint = fingerprint
+        self.fingerprint, self.name, self.foreign = fingerprint, name, foreign
         self._memory: dict[int, Arrays] = {}
 
     def path(self, number: int) -> Path | None:
         """File of a piece; None where pieces are kept in memory."""
-        return None if self.folder is None else self.folder / f"slot-{number:06d}.npz"
+        return None if self.folder is None else self.folder / f"{self.name}-{number:06d}.npz"
 
     def read(self, number: int) -> Arrays | None:
         """Arrays of a piece, or None if it has not been made.
@@ -61,14 +77,17 @@ class Slots:
         try:
             with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
-            found = str(arrays.pop(_FINGERPRINT))
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            checksum, found = arrays.pop(_CHECKSUM), str(arrays[_FINGERPRINT])
+            if not np.array_equal(checksum, _checksum(arrays, number)):
+                raise ValueError("another checksum")
+            del arrays[_FINGERPRINT]
+        except _DAMAGE as error:
             raise ResultsError(
                 "is damaged", file=path, hint="remove it; only this piece is then made again"
             ) from error
         if found != self.fingerprint:
             raise ResultsError(
-                "belongs to another calculation",
+                self.foreign,
                 file=path,
                 hint="choose another folder, or remove this one",
             )
@@ -87,8 +106,42 @@ class Slots:
             self._memory[number] = dict(arrays)
             return
         named: Arrays = {**arrays, _FINGERPRINT: np.array(self.fingerprint)}
+        named[_CHECKSUM] = _checksum(named, number)
         with replacing(path) as draft:
             np.savez(draft, **named)  # type: ignore[arg-type]
+
+    def remove_drafts(self) -> None:
+        """Remove what a process that was killed has left half written."""
+        if self.folder is not None:
+            for draft in self.folder.glob(f".{self.name}-*"):
+                draft.unlink()
+
+    def chain(self) -> list[Arrays]:
+        """Pieces up to the first that is missing or damaged; what comes after it is set aside.
+
+        Raises
+        ------
+        ResultsError
+            If the folder holds pieces of another calculation.
+        """
+        if self.folder is None:
+            return [self._memory[number] for number in range(len(self._memory))]
+        self.remove_drafts()
+        found: list[Arrays] = []
+        for number in range(len(list(self.folder.glob(f"{self.name}-*.npz")))):
+            try:
+                piece = self.read(number)
+            except ResultsError as error:
+                if error.__cause__ is None:  # whole, but of another calculation
+                    raise
+                break
+            if piece is None:
+                break
+            found.append(piece)
+        for path in sorted(self.folder.glob(f"{self.name}-*.npz")):
+            if int(path.stem.split("-")[-1]) >= len(found):
+                _set_aside(path)
+        return found
 
     def fill(
         self,
@@ -130,9 +183,7 @@ class Slots:
             If another process writes to the folder, or a stored piece is damaged.
         """
         with only_writer(self.folder):
-            if self.folder is not None:  # what a process that was killed left half written
-                for draft in self.folder.glob(".slot-*"):
-                    draft.unlink()
+            self.remove_drafts()
             pieces: dict[int, Arrays] = {}
             for number in range(count):
                 stored = self.read(number)
@@ -148,3 +199,21 @@ class Slots:
                         pieces[number] = arrays
                         done(number)
         return [pieces[number] for number in range(count)]
+
+
+def _checksum(arrays: Mapping[str, NDArray[Any]], number: int) -> NDArray[np.uint8]:
+    """Digest of a piece and its number: a file must be whole, and not another's."""
+    digest = hashlib.sha256(str(number).encode())
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        digest.update(f"{key}{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return np.frombuffer(digest.digest(), dtype=np.uint8)
+
+
+def _set_aside(path: Path) -> None:
+    """Rename a file so that it is neither read nor overwritten."""
+    number = 0
+    while (aside := path.with_suffix(f".broken-{number}")).exists():
+        number += 1
+    path.rename(aside)

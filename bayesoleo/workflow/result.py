@@ -170,7 +170,13 @@ def finish(
     """One tree with provenance."""
     roles = task.roles
     runs = {record.label: record for record in (*roles.fitted, *roles.held_out)}
-    tree = xr.DataTree.from_dict({**records_tree(list(runs.values()), task.campaign), **groups})
+    measured = records_tree(list(runs.values()), task.campaign)
+    constant = measured[schema.CONSTANT_DATA]
+    if schema.CONSTANT_DATA in groups:  # of blocks, beside that of runs
+        blocks = groups[schema.CONSTANT_DATA]
+        taken = [name for name in blocks.data_vars if name in constant]
+        constant = blocks.drop_vars(taken).merge(constant)  # first: az.plot_lm takes the first
+    tree = xr.DataTree.from_dict({**measured, **groups, schema.CONSTANT_DATA: constant})
     more: dict[str, Any] = {
         schema.CAMPAIGN: task.campaign.name,
         schema.CAMPAIGN_DESCRIPTION: task.campaign.description,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from bayesoleo.effects import Effect, catalogue
 from bayesoleo.effects.unnamed import FAMILY
+from bayesoleo.error_models import ERROR_MODELS
 from bayesoleo.errors import InputError
-from bayesoleo.posterior.density.error_models import ERROR_MODELS
 from bayesoleo.prediction.solver import check_solver
 from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.tracing.fitting.fit import Numerics
@@ -55,7 +55,7 @@ class Settings:
         of sensors (``accuracy``).
     error_model : {"independent", "per-run", "full", "correlated", "discrepancy", ...}
         What the errors of the outputs have in common; see
-        :mod:`bayesoleo.posterior.density.error_models`.
+        :mod:`bayesoleo.error_models`.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated; see
         :mod:`bayesoleo.posterior.density.hierarchy`.

@@ -106,7 +106,7 @@ study.text("before_after", lambda: print_before_after(summary, "psi", 1.0 / PSI)
 def loops():
     """Pressure over time and over stroke after 205 s: measured, before, after."""
     run, lines = "after 205 s", {}
-    seen, predicted = tree["observed_data"].sel(run=run), tree["prediction"].sel(run=run)
+    seen, predicted = tree["records"].sel(run=run), tree["prediction"].sel(run=run)
     time, stroke = seen["time"].values, seen["stroke"].values
     lines["measured"] = (seen["pressure"].values, "#b4bac3", 5.0)
     lines["polytropic gas"] = (predicted["pressure_before"].values, "#d55e00", 1.4)

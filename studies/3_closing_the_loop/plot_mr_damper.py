@@ -82,7 +82,7 @@ study.text("before_after", lambda: print_before_after(summary, "N", 1.0))
 
 def loops():
     """Average period of the hold-out runs: measured, model before, model after."""
-    measured, predicted = tree["observed_data"].to_dataset(), tree["prediction"].to_dataset()
+    measured, predicted = tree["records"].to_dataset(), tree["prediction"].to_dataset()
     velocity = tree["residual"].to_dataset()["velocity"]
     figure, panels = plt.subplots(2, 2, figsize=(10, 7), sharey=True, layout="constrained")
     for row, run in zip(panels, ("3", "7"), strict=True):

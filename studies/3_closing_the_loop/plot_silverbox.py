@@ -132,7 +132,7 @@ def hump():
     """The model's third harmonics over the measured ones."""
     frequency = float(block("constant_data")["frequency"])
     periods = round(float(block("constant_data")["periods"]))
-    measured = spectrum(block("observed_data")["output_voltage"])[::periods]
+    measured = spectrum(block("records")["output_voltage"])[::periods]
     model = spectrum(block("prediction")["output_voltage_after"])[::periods]
     near = slice(round(210 / frequency), round(225 / frequency))
     ratio = np.vdot(measured[near], model[near]) / np.vdot(measured[near], measured[near])

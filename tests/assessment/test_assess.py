@@ -127,7 +127,7 @@ def stored(problem, point):
     return xr.DataTree.from_dict(
         {
             schema.RESIDUAL: xr.Dataset({"force_before": padded(residual)}, coords=coords),
-            schema.OBSERVED_DATA: xr.Dataset(
+            schema.RECORDS: xr.Dataset(
                 {
                     "force": padded([r.samples["force"] for r in records]),
                     "displacement": padded([r.samples["displacement"] for r in records]),

@@ -32,7 +32,7 @@ def result(law, seed=0, transient=False):
     mean = mean + NOISE * rng.standard_normal(mean.shape)
     rows, units = (schema.RUN, schema.SAMPLE), {schema.UNITS: "1"}
     groups = {
-        schema.OBSERVED_DATA: xr.Dataset(
+        schema.RECORDS: xr.Dataset(
             {
                 schema.PHASE: (rows, np.full_like(phase, np.nan) if transient else phase),
                 schema.TIME: (rows, phase / FREQUENCY[:, None]),

@@ -155,7 +155,7 @@ def _tree(runs, roles, time, phase, inputs, outputs, missing, noise, after=True)
         residual[f"{name}_noise"] = _variable(error, unit, schema.RUN)
     return xr.DataTree.from_dict(
         {
-            "observed_data": xr.Dataset(data, coords=by_run),
+            "records": xr.Dataset(data, coords=by_run),
             "constant_data": xr.Dataset(constant, coords=by_run),
             "noise": xr.Dataset(sd, coords=by_run),
             "prediction": xr.Dataset(prediction, coords=by_run),
@@ -230,9 +230,7 @@ def _add_point(tree, truth, rng):
 def _add_predictive(tree, rng, runs, roles):
     values = {}
     for output in ("force", "pressure"):
-        mean = _average(
-            tree["observed_data/phase"].values, tree[f"prediction/{output}_after"].values
-        )
+        mean = _average(tree["records/phase"].values, tree[f"prediction/{output}_after"].values)
         wave = np.sin(2 * np.pi * (PHASES + rng.random((4, 30, 14, 1))))
         spread = 0.15 * NOISE[output] * rng.normal(size=(4, 30, 14, 1)) * wave
         dims, about = ("chain", "draw", "run", "phase"), {"units": UNITS[output]}
@@ -242,7 +240,7 @@ def _add_predictive(tree, rng, runs, roles):
         values[f"{output}_at_estimate"] = (dims[2:], mean, about)
         values[f"{output}_average_sd"] = (dims[:3], np.full((4, 30, 14), NOISE[output] / 3), about)
     coords = {"run": runs, "phase": PHASES}
-    tree["posterior_predictive"] = xr.DataTree(xr.Dataset(values, coords=coords))
+    tree["period_predictive"] = xr.DataTree(xr.Dataset(values, coords=coords))
 
 
 def _error(role, rms, repeating, noise):

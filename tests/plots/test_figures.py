@@ -191,7 +191,7 @@ def broadband(harmonics=300, count=4096):
     constant = {"frequency": ("run", [1.0]), "role": ("run", ["fit"])}
     return xr.DataTree.from_dict(
         {
-            "observed_data": xr.Dataset(data, coords={"run": ["a"]}),
+            "records": xr.Dataset(data, coords={"run": ["a"]}),
             "constant_data": xr.Dataset(constant),
             "prediction": xr.Dataset({"voltage_before": (dims, 0.9 * signal)}),
             "residual": xr.Dataset(e),
@@ -201,7 +201,7 @@ def broadband(harmonics=300, count=4096):
 
 def test_a_signal_of_many_harmonics_is_shown_raw_and_its_residual_by_value():
     tree = broadband()
-    signal = tree["observed_data/voltage"].values[0]
+    signal = tree["records/voltage"].values[0]
     fit = plots.fit(tree, "voltage").axes[0]
     shown = lines(fit, style.MEASURED)[0].get_ydata()
     assert np.isin(np.round(shown, 9), np.round(signal, 9)).all()
@@ -230,7 +230,7 @@ def test_many_runs_are_cut_and_that_is_said(oleo):
     wide = xr.DataTree.from_dict(
         {
             name: xr.concat([oleo[name].to_dataset()] * 2, schema.RUN)
-            for name in ("observed_data", "prediction", "constant_data")
+            for name in ("records", "prediction", "constant_data")
         }
     )
     figure = plots.fit(wide, "force")
@@ -239,10 +239,10 @@ def test_many_runs_are_cut_and_that_is_said(oleo):
 
 
 def test_labels_of_users_are_no_mathematics(oleo):
-    runs = list(oleo["observed_data"]["run"].values)
+    runs = list(oleo["records"]["run"].values)
     runs[0] = r"a$\frac{$ <b>" + "\n" + "x" * 80
     tree = oleo.copy()
-    tree["observed_data"] = xr.DataTree(oleo["observed_data"].to_dataset().assign_coords(run=runs))
+    tree["records"] = xr.DataTree(oleo["records"].to_dataset().assign_coords(run=runs))
     shown = texts(plots.records(tree))
     assert any(text.startswith(r"a\$") and len(text) < 30 for text in shown)
 

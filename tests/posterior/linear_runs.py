@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesoleo.error_models.base import RunSamples
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
-from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Normal
 from bayesoleo.solvers.status import Status
 
@@ -54,6 +54,10 @@ class LinearRuns:
     @property
     def samples(self):
         return tuple(RunSamples(time, 1.0) for time in self.times)
+
+    @property
+    def data(self):
+        return tuple(np.concatenate(self.y, axis=1))
 
     def columns(self, run):
         """Sensitivities of one output in a run, (n, l)."""

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
+from bayesoleo.error_models import ERROR_MODELS, error_model
+from bayesoleo.error_models.base import RunSamples
+from bayesoleo.error_models.correlated import covariance
+from bayesoleo.error_models.discrepancy import basis, spectrum
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models import ERROR_MODELS, error_model
-from bayesoleo.posterior.density.error_models.correlated import covariance
-from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
 from bayesoleo.posterior.outcome.predictive import sd_of_averages
 
 

@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 from linear_runs import linear_runs
 
+from bayesoleo.error_models.discrepancy import basis, spectrum
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import (
     ERROR_MODELS,
@@ -15,7 +16,6 @@ from bayesoleo.posterior import (
     sample,
     to_datasets,
 )
-from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
 
 RUNS, PERIODS, COUNT = 4, 4, 200
 

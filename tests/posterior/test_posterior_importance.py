@@ -5,10 +5,10 @@ import pytest
 from posterior_targets import Banana, Gaussian
 from scipy import stats
 
+from bayesoleo.error_models.differences import derivatives
+from bayesoleo.error_models.fitted_start import climb
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import Mixture, importance_sample
-from bayesoleo.posterior.density.differences import derivatives
-from bayesoleo.posterior.density.error_models.fitted_start import climb
 
 TAILS = np.array([0.05, 0.5, 0.95])
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal, Uniform
-from bayesoleo.posterior.density.transforms import Transform, Transforms
+from bayesoleo.model.transforms import Transform, Transforms
 
 SUPPORTS = [(-np.inf, np.inf), (2.0, np.inf), (-np.inf, -3.0), (1e3, 5e3)]
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesoleo.error_models import error_model
+from bayesoleo.error_models.base import RunSamples
+from bayesoleo.error_models.discrepancy import basis, spectrum
+from bayesoleo.error_models.shared import _dense, _diagonal
 from bayesoleo.estimation.problems.campaign_problem import _samples_of
-from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models import error_model
-from bayesoleo.posterior.density.error_models.discrepancy import basis, spectrum
-from bayesoleo.posterior.density.error_models.shared import _dense, _diagonal
 from bayesoleo.prediction.records import Harmonics, Record
 
 WORD = "shared-discrepancy"

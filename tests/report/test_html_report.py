@@ -94,7 +94,7 @@ def test_what_a_user_wrote_is_text(synthetic):
 @pytest.mark.parametrize(
     "names",
     [
-        ("posterior", "sample_stats", "posterior_predictive"),
+        ("posterior", "sample_stats", "period_predictive"),
         ("residual",),
         ("noise", "constant_data"),
         tuple(name for name in schema.GROUPS),

@@ -108,7 +108,7 @@ def test_the_file_reads_back_as_the_tree(closed):
 
 def test_names_dims_and_units_are_those_of_the_schema(closed):
     tree, _ = closed
-    observed, residual = tree[schema.OBSERVED_DATA], tree[schema.RESIDUAL]
+    observed, residual = tree[schema.RECORDS], tree[schema.RESIDUAL]
     assert observed["force"].dims == (schema.RUN, schema.SAMPLE)
     assert observed["force"].attrs["units"] == "N"
     assert observed["displacement"].attrs["units"] == "m"
@@ -130,7 +130,7 @@ def test_names_dims_and_units_are_those_of_the_schema(closed):
 
 def test_residuals_are_measured_less_predicted(closed):
     tree, _ = closed
-    measured = tree[schema.OBSERVED_DATA]["force"]
+    measured = tree[schema.RECORDS]["force"]
     for stage in (schema.before("force"), schema.after("force")):
         predicted, residual = tree[schema.PREDICTION][stage], tree[schema.RESIDUAL][stage]
         there = measured.sel(run=predicted.run)
@@ -223,13 +223,13 @@ def test_another_seed_draws_other_samples_of_the_same_posterior(closed, campaign
 
 
 def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
-    records = {schema.OBSERVED_DATA, schema.CONSTANT_DATA, schema.NOISE}
+    records = {schema.RECORDS, schema.CONSTANT_DATA, schema.NOISE}
     point = workflow.estimate(campaign, MODEL, SETTINGS, out=tmp_path / "estimate")
     assert set(point.children) == records | {schema.POINT}
     assert set(read_tree(tmp_path / "estimate" / "results.nc").children) == set(point.children)
     sampled = workflow.sample(campaign, MODEL, SETTINGS, out=tmp_path / "sample")
     more = {schema.POSTERIOR, schema.PRIOR, schema.SAMPLE_STATS, schema.LOG_LIKELIHOOD}
-    more |= {schema.LOG_PRIOR, schema.PREDICTION, schema.POSTERIOR_PREDICTIVE, schema.COMPARISON}
+    more |= {schema.LOG_PRIOR, schema.PREDICTION, schema.PERIOD_PREDICTIVE, schema.COMPARISON}
     assert set(sampled.children) == set(point.children) | more
     xr.testing.assert_identical(
         sampled[schema.POINT].to_dataset(), point[schema.POINT].to_dataset()

@@ -58,7 +58,7 @@ def test_closed_loop_finds_physics_and_offset(campaign):
         assert abs(float(draws.mean()) - value) < 4 * float(draws.std()), name
     # nothing but the prior bounds the gain, beside a stiffness and a damping that are free
     gain = posterior["sensor_gain_force"]
-    largest = float(free[schema.OBSERVED_DATA]["force"].max())
+    largest = float(free[schema.RECORDS]["force"].max())
     assert float(gain.std()) == pytest.approx(ACCURACY / (2 * np.sqrt(2)) / largest, rel=0.35)
     summaries = [json.loads(tree.attrs[schema.SUMMARY]) for tree in (free, held)]
     assert summaries[0]["verdict"] == schema.EFFECT_ADDED

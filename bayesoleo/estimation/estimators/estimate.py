@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.iterate import iterate
 from bayesoleo.estimation.estimators.known import with_measured, without_measured
@@ -19,7 +20,6 @@ from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.estimators.summarise import summarise
-from bayesoleo.estimation.objectives.diagonal import output_counts
 from bayesoleo.estimation.objectives.objective import Objective, objective_of
 from bayesoleo.estimation.problems.problem import Problem, jumps_of, measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts
 from bayesoleo.estimation.estimators.newton import newton_equations
 from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.pace import Pace
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.objectives.bounded import is_cut
-from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts
 from bayesoleo.estimation.objectives.equations import Equations
-from bayesoleo.estimation.objectives.objective import Objective
+from bayesoleo.estimation.objectives.objective import Objective, log_prior
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.parallel import single_blas_thread

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.linearise import Linearised, least_squares
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.objectives.linearise import Linearised, least_squares
 from bayesoleo.estimation.problems.held import Held
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.model.correlated import scaled_root

@@ -17,9 +17,9 @@ from typing import ClassVar
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.linearise import RANK
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.objectives.equations import Equations
-from bayesoleo.estimation.objectives.linearise import RANK
 
 # A step may miss the radius by this part of it, which saves iterations of the secular equation.
 _SLACK = 0.1

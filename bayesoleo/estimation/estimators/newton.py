@@ -21,9 +21,9 @@ from typing import cast
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.objectives.diagonal import output_counts
+from bayesoleo.error_models.base import ProfiledErrorModel
+from bayesoleo.error_models.independent import output_counts
 from bayesoleo.estimation.objectives.equations import Equations
-from bayesoleo.estimation.objectives.error_models import ErrorModel
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 
@@ -38,7 +38,7 @@ _FLOOR = 1e-12
 
 def newton_equations(
     problem: Problem,
-    errors: ErrorModel,
+    errors: ProfiledErrorModel,
     scale: PriorScale,
     theta: Array,
     evaluation: Evaluation,
@@ -52,7 +52,7 @@ def newton_equations(
     Parameters
     ----------
     problem : Problem
-    errors : ErrorModel
+    errors : ProfiledErrorModel
     scale : PriorScale
     theta : ndarray, shape (l,)
     evaluation : Evaluation

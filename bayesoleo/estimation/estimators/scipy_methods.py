@@ -19,10 +19,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares, minimize
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
-from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts
-from bayesoleo.estimation.objectives.objective import Objective
+from bayesoleo.estimation.objectives.objective import Objective, log_prior
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.parallel import single_blas_thread

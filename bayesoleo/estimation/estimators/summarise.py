@@ -5,18 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.estimators.outcome import Outcome
-from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.objectives.bounded import on_limit
-from bayesoleo.estimation.objectives.diagonal import output_counts, staged_variance, sums_of_squares
-from bayesoleo.estimation.objectives.error_models import CommonErrors, DiagonalErrors
-from bayesoleo.estimation.objectives.linearise import (
+from bayesoleo.error_models.independent import (
+    ProfiledCommonErrors,
+    ProfiledIndependentErrors,
+    output_counts,
+    staged_variance,
+    sums_of_squares,
+)
+from bayesoleo.error_models.linearise import (
     RANK,
     Linearised,
     inverse_gram,
     masked,
     pseudo_inverse_gram,
 )
+from bayesoleo.estimation.estimators.outcome import Outcome
+from bayesoleo.estimation.estimators.point import PointEstimate
+from bayesoleo.estimation.objectives.bounded import on_limit
 from bayesoleo.estimation.objectives.objective import Objective
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -104,7 +109,9 @@ def _error_covariance(
 ) -> Array:
     """Covariance of the outputs' errors at the estimate, (s, s)."""
     counts, errors = output_counts(problem.counts), objective.errors
-    if isinstance(errors, CommonErrors):  # what weights all alike says nothing of their errors
+    if isinstance(
+        errors, ProfiledCommonErrors
+    ):  # what weights all alike says nothing of their errors
         sums = sums_of_squares(outcome.evaluation)
         unknowns = len(problem.names)
         staged = staged_variance(sums, counts, unknowns, bias_corrected=bias_corrected)
@@ -126,14 +133,14 @@ def _covariances(
     """
     unit, errors = scale.unit(outcome.theta), objective.errors
     units = np.outer(unit, unit)
-    if isinstance(errors, CommonErrors):
+    if isinstance(errors, ProfiledCommonErrors):
         size = len(error)
         rows = errors.rows(outcome.evaluation, unit, np.ones(size))[0]
         plain, undetermined = pseudo_inverse_gram(rows, RANK)
         scores = Linearised.of(outcome.evaluation, unit).whitened(1 / np.diag(error))[0]
         likelihood = masked(plain @ (scores.T @ scores) @ plain * units, undetermined)
         return likelihood, likelihood
-    held = np.diag(error) if isinstance(errors, DiagonalErrors) else error
+    held = np.diag(error) if isinstance(errors, ProfiledIndependentErrors) else error
     rows = errors.rows(outcome.evaluation, unit, held)[0]
     likelihood = units * inverse_gram(rows, RANK)
     if not objective.prior:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.objectives.linearise import least_squares
+from bayesoleo.error_models.linearise import least_squares
 
 # A step goes at most this part of the way to a limit, so that a limit is approached, not hit.
 _PART = 0.9
@@ -29,7 +29,7 @@ def bounded_step(
     room : tuple of ndarray, each shape (l,)
         Distances down and up to the limits, infinite where there is none.
     rank : float, optional
-        See :func:`~bayesoleo.estimation.objectives.linearise.least_squares`.
+        See :func:`~bayesoleo.error_models.linearise.least_squares`.
 
     Returns
     -------

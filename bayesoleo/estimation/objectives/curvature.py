@@ -11,8 +11,8 @@ from typing import cast
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts, sums_of_squares
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.objectives.diagonal import output_counts, sums_of_squares
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.model.correlated import Correlated, scaled_root
 from bayesoleo.model.priors import Normal, Prior

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from bayesoleo._types import Array, Float
+from bayesoleo.error_models.linearise import RANK, inverse_gram
 from bayesoleo.estimation.objectives.bounded import bounded_step, on_limit
-from bayesoleo.estimation.objectives.linearise import RANK, inverse_gram
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,21 @@ Verbeek (1993), eqs. 2.25-2.35.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._types import Array
+from bayesoleo.error_models import profiled_error_model
+from bayesoleo.error_models.base import ProfiledErrorModel
+from bayesoleo.error_models.given import GivenErrors
+from bayesoleo.error_models.independent import log_likelihood
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.objectives.error_models import (
-    CommonErrors,
-    DiagonalErrors,
-    ErrorModel,
-    FullErrors,
-    GivenErrors,
-)
 from bayesoleo.estimation.problems.problem import Problem
+from bayesoleo.model.correlated import log_density_of
+from bayesoleo.model.priors import Prior
 
 #: What each word stands for.
 OBJECTIVES = {
@@ -30,6 +34,8 @@ OBJECTIVES = {
     "unweighted": "least squares, all samples alike (2.35)",
 }
 _KNOWN = ("given", "weighted")
+# Error models of the others, where they are not independent.
+_ERRORS = {"full": "full", "determinant": "full", "unweighted": "common"}
 
 
 @dataclass(frozen=True)
@@ -40,13 +46,13 @@ class Objective:
     ----------
     name : str
         One of :data:`OBJECTIVES`.
-    errors : ErrorModel
+    errors : ProfiledErrorModel
     prior : bool
         Whether the prior is part of it. Estimators that re-centre the prior never count it.
     """
 
     name: str
-    errors: ErrorModel
+    errors: ProfiledErrorModel
     prior: bool
 
 
@@ -88,7 +94,7 @@ def objective_of(
                 value=None,
                 hint='give error_covariance=…, or use objective="diagonal"',
             )
-        errors: ErrorModel = GivenErrors.of(error_covariance, len(problem.outputs))
+        errors: ProfiledErrorModel = GivenErrors.of(error_covariance, len(problem.outputs))
     elif error_covariance is not None:
         raise InputError(
             "this objective estimates the errors' covariance",
@@ -96,8 +102,38 @@ def objective_of(
             hint='leave it out, or use objective="given" or "weighted"',
         )
     else:
-        errors = {"full": FullErrors, "determinant": FullErrors, "unweighted": CommonErrors}.get(
-            name, DiagonalErrors
-        )()
+        errors = profiled_error_model(_ERRORS.get(name, "independent"))
     errors.check(problem.counts)
     return Objective(name, errors, prior=name in ("diagonal", "full", "given"))
+
+
+def log_prior(priors: Sequence[Prior], theta: Array) -> float:
+    """Log density of the priors together; minus infinity outside their support."""
+    return float(log_density_of(priors, np.asarray(theta, dtype=float)[None])[0])
+
+
+def log_posterior(
+    sums: Array,
+    variance: Array,
+    counts: NDArray[np.int64],
+    priors: Sequence[Prior],
+    theta: Array,
+) -> float:
+    """Objective of the Bayesian estimator, ``Phi_B(theta, v)`` (Verbeek 1993, eq. 2.29).
+
+    Parameters
+    ----------
+    sums, variance : ndarray, shape (s,)
+        Sums of squared residuals and error variances.
+    counts : ndarray of int, shape (s,)
+        Number of samples.
+    priors : sequence of Prior, length l
+        Priors of the parameters.
+    theta : ndarray, shape (l,)
+        Parameters.
+
+    Returns
+    -------
+    float
+    """
+    return log_likelihood(sums, variance, counts) + log_prior(priors, theta)

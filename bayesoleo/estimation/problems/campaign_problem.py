@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.base import RunSamples
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
-from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model import Prior
 from bayesoleo.parallel import thread_map
 from bayesoleo.prediction.predictor import Predictor

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.base import RunSamples
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.batch import NormalEquations, reduce_rows
 from bayesoleo.estimation.problems.broadcast import Broadcast
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
-from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Prior
 from bayesoleo.solvers.status import Status
 

@@ -24,7 +24,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesoleo._types import Array, Float
-from bayesoleo.estimation.objectives.diagonal import log_likelihood, log_prior
+from bayesoleo.error_models.independent import log_likelihood
+from bayesoleo.estimation.objectives.objective import log_prior
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.problem import ShootingProblem

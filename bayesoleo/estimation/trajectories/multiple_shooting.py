@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesoleo._types import Array, Float
+from bayesoleo.error_models.linearise import inverse_gram
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
-from bayesoleo.estimation.objectives.linearise import inverse_gram
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.iterate import Outcome, iterate, joined
 from bayesoleo.estimation.trajectories.problem import ShootingProblem

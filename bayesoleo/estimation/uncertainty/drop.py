@@ -12,10 +12,11 @@ from typing import Literal
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts, staged_variance
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.point import PointEstimate
-from bayesoleo.estimation.objectives.diagonal import log_prior, output_counts, staged_variance
+from bayesoleo.estimation.objectives.objective import log_prior
 from bayesoleo.estimation.problems.held import Held
 from bayesoleo.estimation.problems.problem import Problem, measured_of
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.objectives.diagonal import output_counts, staged_variance, sums_of_squares
-from bayesoleo.estimation.objectives.linearise import Linearised, inverse_gram
+from bayesoleo.error_models.independent import output_counts, staged_variance, sums_of_squares
+from bayesoleo.error_models.linearise import Linearised, inverse_gram
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 

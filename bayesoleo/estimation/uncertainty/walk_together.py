@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.independent import output_counts, staged_variance
 from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.steps import Step
-from bayesoleo.estimation.objectives.diagonal import output_counts, staged_variance
 from bayesoleo.estimation.problems.batch import BatchProblem, NormalEquations
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.solvers.status import Status

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesoleo._types import Array, Float
+from bayesoleo.error_models.differences import derivatives
 from bayesoleo.errors import InputError
 from bayesoleo.posterior.approximation.mixture import DEGREES_OF_FREEDOM, Mixture
-from bayesoleo.posterior.density.differences import derivatives
 from bayesoleo.posterior.density.information import information_at, residuals_at
 from bayesoleo.posterior.density.log_density import LogDensity
 from bayesoleo.solvers.status import Status

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
+from bayesoleo.error_models.differences import derivatives
 from bayesoleo.posterior.approximation.laplace import Mode
 from bayesoleo.posterior.approximation.mixture import Mixture
-from bayesoleo.posterior.density.differences import derivatives
 from bayesoleo.posterior.density.log_density import Density
 from bayesoleo.solvers.status import Status
 

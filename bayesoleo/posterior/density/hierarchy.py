@@ -49,12 +49,12 @@ from scipy.special import ndtr, ndtri
 
 from bayesoleo import schema
 from bayesoleo._types import Array
+from bayesoleo.error_models import ErrorModel, error_model
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.model.priors import Prior
-from bayesoleo.posterior.density.error_models import ErrorModel, error_model
+from bayesoleo.model.transforms import Transform
 from bayesoleo.posterior.density.information import information_at, residuals_at
-from bayesoleo.posterior.density.transforms import Transform
 from bayesoleo.posterior.density.unknowns import PlainUnknowns, Unknowns
 
 _HALF_NORMAL = 0.5 * float(np.log(2 / np.pi))

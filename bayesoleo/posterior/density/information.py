@@ -7,10 +7,10 @@ from typing import cast
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.error_models import ErrorModel
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.residuals import ResidualProblem
-from bayesoleo.posterior.density.error_models import ErrorModel
 from bayesoleo.solvers.status import Status
 
 

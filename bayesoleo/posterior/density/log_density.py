@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo._types import Array, Float
+from bayesoleo.error_models import ErrorModel, error_model
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Misfit, Problem, jumps_of
 from bayesoleo.estimation.problems.residuals import ResidualProblem
+from bayesoleo.model.transforms import Transforms
 from bayesoleo.parallel import thread_map
-from bayesoleo.posterior.density.error_models import ErrorModel, error_model
-from bayesoleo.posterior.density.transforms import Transforms
 from bayesoleo.posterior.density.unknowns import PlainUnknowns, Unknowns
 from bayesoleo.solvers.status import Status
 
@@ -62,7 +62,7 @@ class LogDensity:
         for all rows and spreads its own work. The result does not depend on it.
     errors : ErrorModel or str, optional
         What the errors have in common, ``m`` quantities; see
-        :mod:`bayesoleo.posterior.density.error_models`. By default one variance for each output.
+        :mod:`bayesoleo.error_models`. By default one variance for each output.
     unknowns : Unknowns, optional
         How the problem's unknowns follow from ``p`` coordinates, and their prior; by default each
         is one, with the problem's prior. See :mod:`bayesoleo.posterior.density.hierarchy`.

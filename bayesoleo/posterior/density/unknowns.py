@@ -13,7 +13,7 @@ import numpy as np
 from bayesoleo._types import Array, Float
 from bayesoleo.model.correlated import log_density_of, sample_of
 from bayesoleo.model.priors import Prior
-from bayesoleo.posterior.density.transforms import Transforms
+from bayesoleo.model.transforms import Transforms
 
 #: Finite-difference step in prior standard deviations.
 STEP = 0.25

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo._types import Array
+from bayesoleo.autocovariance import lagged_products
 
 
 def autocorrelation_time(draws: Array) -> Array:
@@ -37,9 +38,7 @@ def autocorrelation_time(draws: Array) -> Array:
     """
     centred = draws - draws.mean(axis=(0, 1))
     length = draws.shape[1]
-    spectrum = np.fft.rfft(centred, n=2 * length, axis=1)
-    power = np.mean(np.abs(spectrum) ** 2, axis=0)
-    covariance = np.fft.irfft(power, n=2 * length, axis=0)[:length]
+    covariance = lagged_products(centred, 2 * length)
     # The sum at lag t has length - t terms; dividing by that number makes short chains unbiased.
     covariance /= np.arange(length, 0, -1)[:, None]
     times = np.full(draws.shape[2], np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -77,6 +77,26 @@ class Samples:
     failed: Int[Integers, "_draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
+
+    def thinned(self, most: int) -> Samples:
+        """Equally spaced draws of each chain, so that about ``most`` draws remain.
+
+        Fewer than twice as many are left as they are. Diagnostics stay those of all draws.
+        """
+        stride = self.log_density.size // most
+        if stride < 2:
+            return self
+        rows = slice(None, None, stride)
+        failed = self.failed
+        if len(failed):  # proposals on the way to each draw that is left
+            failed = np.add.reduceat(failed, np.arange(0, len(failed), stride), axis=0)
+        return replace(
+            self,
+            draws=self.draws[:, rows],
+            log_density=self.log_density[:, rows],
+            log_likelihood=self.log_likelihood[:, rows],
+            failed=failed,
+        )
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -10,13 +10,13 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo._types import Array
+from bayesoleo.error_models import ERROR_MODELS, check_word
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation import multistart
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.posterior.approximation.laplace import Mode, find_mode, start_coordinates
-from bayesoleo.posterior.density.error_models import ERROR_MODELS, check_word
 from bayesoleo.posterior.density.hierarchy import hierarchical
 from bayesoleo.tracing.fitting.fit import Fit
 
@@ -28,7 +28,7 @@ class Inference:
     Parameters
     ----------
     error_model : str
-        One of :data:`~bayesoleo.posterior.density.error_models.ERROR_MODELS`.
+        One of :data:`~bayesoleo.error_models.ERROR_MODELS`.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated.
 

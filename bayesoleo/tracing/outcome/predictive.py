@@ -10,9 +10,9 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo._types import Array
-from bayesoleo.estimation.problems.residuals import RunSamples
+from bayesoleo.error_models import ErrorModel
+from bayesoleo.error_models.base import RunSamples
 from bayesoleo.posterior import Samples
-from bayesoleo.posterior.density.error_models import ErrorModel
 from bayesoleo.posterior.outcome.predictive import choose_all, sd_of_averages
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo._types import Array
@@ -14,6 +16,7 @@ from bayesoleo.data import Campaign
 from bayesoleo.estimation import to_dataset
 from bayesoleo.model import Coordinate
 from bayesoleo.posterior import LogDensity, Samples, to_datasets
+from bayesoleo.posterior.outcome.blocks import block_groups
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.rounds import Ranked, Round
@@ -27,6 +30,8 @@ from bayesoleo.tracing.outcome.predictive import PHASES, predictive_group
 from bayesoleo.tracing.outcome.shapes import shape_group
 from bayesoleo.tracing.outcome.summary import titles_of, told
 
+#: Draws beyond which the stored ones are thinned: files stay below a hundred megabytes.
+MOST_DRAWS = 20_000
 _OUTPUT_UNIT = "SI unit of each output"
 
 
@@ -66,7 +71,7 @@ def records_tree(records: Sequence[Record], campaign: Campaign) -> dict[str, xr.
     }
     coords = {schema.RUN: labels}
     return {
-        schema.OBSERVED_DATA: xr.Dataset(observed, coords=coords),
+        schema.RECORDS: xr.Dataset(observed, coords=coords),
         schema.CONSTANT_DATA: xr.Dataset(constant, coords=coords),
         schema.NOISE: xr.Dataset(noise, coords=coords),
     }
@@ -99,7 +104,7 @@ def _units(fit: Fit) -> list[str]:
 def posterior_groups(
     fit: Fit, samples: Samples, seed: int, density: LogDensity | None = None
 ) -> dict[str, xr.Dataset]:
-    """The groups posterior, prior, sample_stats, log_likelihood and log_prior."""
+    """The groups of :func:`to_datasets` and :func:`block_groups`, of at most so many draws."""
     units = dict(zip(fit.problem.names, _units(fit), strict=True))
     units |= {name: fit.model.outputs[name].unit for name in fit.predictor.outputs}
     scattering = [] if density is None else density.unknowns.scattering
@@ -109,26 +114,38 @@ def posterior_groups(
         units[schema.population_mean(name)] = unit
         # With a bound the spread is that of a logarithm.
         units[schema.spread(name)] = "1" if np.isfinite(support).any() else unit
+    samples = samples.thinned(MOST_DRAWS)
     groups = to_datasets(samples, fit.problem.priors, units=units, seed=seed, density=density)
     groups[schema.POSTERIOR].attrs[schema.BETWEEN_RUNS] = json.dumps(list(scattering))
+    if density is not None:
+        units |= fit.model.inputs
+        inputs = partial(_inputs, fit)
+        groups |= block_groups(samples, density, inputs, units=units, seed=seed)
     return groups
+
+
+def _inputs(fit: Fit, run: int, shown: NDArray[np.int64]) -> dict[str, Array]:
+    """Measured inputs of a run at some of the samples that count."""
+    record, problem = fit.predictor.records[run], fit.problem
+    names = [name for name in fit.model.inputs if name in record.samples]
+    return {name: problem.kept(run, record.samples[name])[shown] for name in names}
 
 
 def predictive_groups(
     fit: Fit, samples: Samples, density: LogDensity, seed: int
 ) -> dict[str, xr.Dataset]:
-    """The groups prediction and posterior_predictive of the fitted runs."""
+    """The groups prediction and period_predictive of the fitted runs."""
     found = predict_fitted(fit)
     return {
         schema.PREDICTION: _predictions([("before", fit, found)]),
-        schema.POSTERIOR_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
+        schema.PERIOD_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
     }
 
 
 def loop_groups(
     loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
 ) -> dict[str, xr.Dataset]:
-    """The groups prediction, residual, discovery, unnamed and posterior_predictive."""
+    """The groups prediction, residual, discovery, unnamed and period_predictive."""
     groups = {
         schema.PREDICTION: _predictions(
             [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
@@ -141,7 +158,7 @@ def loop_groups(
         groups[schema.UNNAMED] = shape
     if drawn is not None:
         final, (samples, density) = loop.final, drawn
-        groups[schema.POSTERIOR_PREDICTIVE] = predictive_group(
+        groups[schema.PERIOD_PREDICTIVE] = predictive_group(
             final.fit, ordered(final), samples, density.errors, seed
         )
     return groups

@@ -29,14 +29,14 @@ from typing import cast
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from bayesoleo import schema
 from bayesoleo._types import Array, Integers
-from bayesoleo.estimation.problems.residuals import RunSamples
+from bayesoleo.error_models.base import Frame, Quantity, RunSamples
+from bayesoleo.error_models.by_output import ByOutput
 from bayesoleo.model.priors import LogNormal, Uniform
-from bayesoleo.posterior.density.error_models.base import Frame, Quantity
-from bayesoleo.posterior.density.error_models.by_output import ByOutput
 
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
@@ -86,8 +86,10 @@ def _log_likelihood(residual: Array, kind: Integers, steps: Array, eta: Array, o
 
 
 @jit
-def _whiten(columns: Array, kind: Integers, steps: Array, eta: Array, out: Array) -> None:
-    """Rows ``(k, n)`` as innovations of unit variance."""
+def _whiten(
+    columns: Array, kind: Integers, steps: Array, eta: Array, out: Array, log_sd: Array
+) -> None:
+    """Rows ``(k, n)`` as innovations of unit variance, ``log_sd (n)`` what they are divided by."""
     share, white = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
     rate, sd = np.exp(-eta[2]), np.exp(0.5 * eta[0])
     for row in range(columns.shape[0]):
@@ -97,6 +99,7 @@ def _whiten(columns: Array, kind: Integers, steps: Array, eta: Array, out: Array
             gain = power / size
             innovation = columns[row, i] - mean
             out[row, i] = innovation / (sd * np.sqrt(size))
+            log_sd[i] = 0.5 * (eta[0] + np.log(size))
             if i < columns.shape[1] - 1:
                 a = np.exp(-steps[kind[i]] * rate)
                 mean = a * (mean + gain * innovation)
@@ -165,9 +168,19 @@ class CorrelatedErrors(ByOutput):
         _log_likelihood(residual, *self._steps[run], eta, out)
         return out
 
+    def blocks_of_output(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        white, log_sd = np.empty_like(residual), np.empty_like(residual)
+        for lane in range(len(residual)):
+            rows = slice(lane, lane + 1)
+            _whiten(residual[rows], *self._steps[run], eta[lane], white[rows], log_sd[lane])
+        logs = -0.5 * (white * white + _LOG_2_PI) - log_sd
+        return np.asarray(np.add.reduceat(logs, starts, axis=1))
+
     def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
         white = np.empty_like(columns)
-        _whiten(columns, *self._steps[run], eta, white)
+        _whiten(columns, *self._steps[run], eta, white, np.empty(columns.shape[1]))
         return np.asarray(white @ white.T)
 
     def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.problems.problem import Evaluation
+from bayesoleo.error_models.base import Residuals
 
 # Rows of one block of a tall matrix.
 _BLOCK = 1024
@@ -37,7 +37,7 @@ class Linearised:
     factors: tuple[Array, ...]
 
     @classmethod
-    def of(cls, evaluation: Evaluation, scale: Array) -> Linearised:
+    def of(cls, evaluation: Residuals, scale: Array) -> Linearised:
         """Compress an evaluation whose unknowns are measured in ``scale``, shape (l,)."""
         return cls(
             tuple(

@@ -31,14 +31,14 @@ import math
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from bayesoleo import schema
 from bayesoleo._types import Array
-from bayesoleo.estimation.problems.residuals import RunSamples
+from bayesoleo.error_models.base import Frame, Quantity, RunSamples
+from bayesoleo.error_models.by_output import ByOutput
 from bayesoleo.model.priors import LogNormal, Uniform
-from bayesoleo.posterior.density.error_models.base import Frame, Quantity
-from bayesoleo.posterior.density.error_models.by_output import ByOutput
 
 #: Harmonics of the series: the shortest length that it shows is about a fiftieth of a cycle.
 HARMONICS = 24
@@ -225,6 +225,23 @@ class DiscrepancyErrors(ByOutput):
         weight = spectrum(np.exp(eta[:, 2]))
         self._kernels[run](projected, squares, residual.shape[1], gram, weight, eta, out)
         return out
+
+    def blocks_of_output(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        # The density of all blocks up to one, less that of all before it.
+        table, weight = self._tables[run], spectrum(np.exp(eta[:, 2]))
+        lanes, size = len(residual), table.shape[1]
+        gram, projected, squares = np.zeros((size, size)), np.zeros((lanes, size)), np.zeros(lanes)
+        total = np.zeros((lanes, len(starts) + 1))
+        more, square = np.empty_like(projected), np.empty_like(squares)
+        ends = np.append(starts[1:], residual.shape[1])
+        for k, (first, last) in enumerate(zip(starts, ends, strict=True)):
+            rows = table[first:last]
+            project(np.ascontiguousarray(residual[:, first:last]), rows, more, square)
+            gram, projected, squares = gram + rows.T @ rows, projected + more, squares + square
+            _log_likelihood(projected, squares, int(last), gram, weight, eta, total[:, k + 1])
+        return np.diff(total, axis=1)
 
     def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
         share, noise = ndtr(eta[1]), ndtr(-eta[1])

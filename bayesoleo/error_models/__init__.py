@@ -1,4 +1,8 @@
-"""What the errors of the outputs have in common: one word each, sampled with the parameters.
+"""What the errors of the outputs have in common: one file and one word a model.
+
+Each model has up to two forms: quantities that are sampled with the parameters
+(:class:`ErrorModel`), and a covariance that point estimators eliminate in each iteration
+(:class:`ProfiledErrorModel`). A new model is one file and one line in the table below.
 
 =============== ====================================================================================
 word            errors
@@ -17,16 +21,28 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
+from dataclasses import dataclass
 
+from bayesoleo.error_models.base import (
+    ErrorModel,
+    Frame,
+    Measured,
+    ProfiledErrorModel,
+    Quantity,
+)
+from bayesoleo.error_models.correlated import CorrelatedErrors
+from bayesoleo.error_models.discrepancy import DiscrepancyErrors
+from bayesoleo.error_models.full import FullErrors, ProfiledFullErrors
+from bayesoleo.error_models.given import GivenErrors
+from bayesoleo.error_models.independent import (
+    IndependentErrors,
+    PerRunErrors,
+    ProfiledCommonErrors,
+    ProfiledIndependentErrors,
+)
+from bayesoleo.error_models.shared import SharedDiscrepancyErrors
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.model.priors import Prior
-from bayesoleo.posterior.density.error_models.base import ErrorModel, Frame, Quantity
-from bayesoleo.posterior.density.error_models.correlated import CorrelatedErrors
-from bayesoleo.posterior.density.error_models.discrepancy import DiscrepancyErrors
-from bayesoleo.posterior.density.error_models.full import FullErrors
-from bayesoleo.posterior.density.error_models.independent import IndependentErrors, PerRunErrors
-from bayesoleo.posterior.density.error_models.shared import SharedDiscrepancyErrors
 
 __all__ = [
     "ERROR_MODELS",
@@ -35,24 +51,38 @@ __all__ = [
     "ErrorModel",
     "Frame",
     "FullErrors",
+    "GivenErrors",
     "IndependentErrors",
     "PerRunErrors",
+    "ProfiledErrorModel",
     "Quantity",
     "SharedDiscrepancyErrors",
     "check_word",
     "error_model",
+    "profiled_error_model",
 ]
 
-_KINDS: tuple[type[ErrorModel], ...] = (
-    IndependentErrors,
-    PerRunErrors,
-    FullErrors,
-    CorrelatedErrors,
-    DiscrepancyErrors,
-    SharedDiscrepancyErrors,
-)
-#: The words that choose them; the first is the default.
-ERROR_MODELS: tuple[str, ...] = tuple(kind.word for kind in _KINDS)
+
+@dataclass(frozen=True)
+class _Forms:
+    """The two forms of a model; None where it has only the other."""
+
+    sampled: type[ErrorModel] | None
+    profiled: type[ProfiledErrorModel] | None
+
+
+_REGISTRY = {
+    "independent": _Forms(IndependentErrors, ProfiledIndependentErrors),
+    "per-run": _Forms(PerRunErrors, None),
+    "full": _Forms(FullErrors, ProfiledFullErrors),
+    "correlated": _Forms(CorrelatedErrors, None),
+    "discrepancy": _Forms(DiscrepancyErrors, None),
+    "shared-discrepancy": _Forms(SharedDiscrepancyErrors, None),
+    "common": _Forms(None, ProfiledCommonErrors),
+    "given": _Forms(None, GivenErrors),
+}
+#: Those that are sampled; the first is the default.
+ERROR_MODELS: tuple[str, ...] = tuple(word for word, form in _REGISTRY.items() if form.sampled)
 
 
 def check_word(word: str) -> str:
@@ -76,7 +106,7 @@ def check_word(word: str) -> str:
 
 
 def error_model(
-    word: str, problem: Problem, *, log_variance_prior: Mapping[str, Prior] | None = None
+    word: str, problem: Measured, *, log_variance_prior: Mapping[str, Prior] | None = None
 ) -> ErrorModel:
     """The error model of that name, bound to a problem's outputs and runs.
 
@@ -95,5 +125,13 @@ def error_model(
     InputError
         If there is no such model, or it does not suit the problem.
     """
-    kind = _KINDS[ERROR_MODELS.index(check_word(word))]
+    kind = _REGISTRY[check_word(word)].sampled
+    assert kind is not None
     return kind(Frame.of(problem, log_variance_prior))
+
+
+def profiled_error_model(word: str) -> ProfiledErrorModel:
+    """The form of an error model that point estimators eliminate, for ``V`` that is unknown."""
+    kind = _REGISTRY[word].profiled
+    assert kind is not None
+    return kind()

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import ClassVar, Protocol, cast
 
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -19,14 +19,75 @@ from scipy.special import ndtr, ndtri
 from bayesoleo import schema
 from bayesoleo._types import Array, Int, Integers
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.problems.residuals import RunSamples
 from bayesoleo.model.priors import Prior
-from bayesoleo.posterior.density.transforms import Transform
+from bayesoleo.model.transforms import Transform
 
 #: Spread of the logarithm of a variance before anything is known of it: walkers start from the
 #: residuals' own size, and Newton's method needs a scale only.
 _LOG_VARIANCE_SD = 0.3
+
+
+Counts = Integers
+
+
+class Measured(Protocol):
+    """What an error model asks of a problem."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The ``s`` output channels."""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """The ``N`` runs."""
+
+    @property
+    def counts(self) -> Counts:
+        """Number of samples, shape (N, s)."""
+
+
+class Residuals(Protocol):
+    """Residuals and sensitivities of all runs at one parameter vector, by output."""
+
+    @property
+    def residual(self) -> tuple[Array, ...]:
+        """``e = y - yhat``, (n_b,) of each output, runs one after the other."""
+
+    @property
+    def sensitivity(self) -> tuple[Array, ...]:
+        """Derivatives of ``yhat``, (n_b, l) of each output."""
+
+
+@dataclass(frozen=True)
+class RunSamples:
+    """When the samples of a run were taken.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Ascending; in seconds, or in the unit of a regression's abscissa.
+    frequency : float or None
+        Of the motion that repeats itself, in cycles per unit of ``time``; None for a run that does
+        not.
+    origin : float
+        Cycles from the crest of what drives the run to the first sample.
+    """
+
+    time: Array
+    frequency: float | None
+    origin: float = 0.0
+
+    @property
+    def phase(self) -> Array:
+        """Cycles since the first sample, shape (n,).
+
+        A run that does not repeat itself goes through half a cycle, so that a periodic function of
+        phase can end elsewhere than it began.
+        """
+        since = self.time - self.time[0]
+        if self.frequency is not None:
+            return np.asarray(self.frequency * since)
+        return np.asarray(0.5 * since / since[-1]) if since[-1] > 0 else since
 
 
 class Probit:
@@ -110,7 +171,7 @@ class Frame:
     log_variance_prior: Mapping[str, Prior]
 
     @classmethod
-    def of(cls, problem: Problem, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
+    def of(cls, problem: Measured, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
         """Of a problem; one without residuals by sample suits models that need sums only."""
         samples = getattr(problem, "samples", None)
         return cls(
@@ -166,6 +227,8 @@ class ErrorModel(ABC):
         Whether sums of squares by run and output are all it needs.
     over_runs : bool
         Whether runs have errors in common, so that :meth:`of_runs` needs all of them at once.
+    data_points : str
+        What a block's log density is conditional on, as results say it.
     quantities : tuple of Quantity, length m
         The first ``s`` are the logarithms of the outputs' total variances.
     """
@@ -173,6 +236,7 @@ class ErrorModel(ABC):
     word: ClassVar[str]
     by_sums: ClassVar[bool] = False
     over_runs: ClassVar[bool] = False
+    data_points: ClassVar[str] = "one period of one run; independent of the others"
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
@@ -244,6 +308,32 @@ class ErrorModel(ABC):
         """
         return np.stack([self.of_run(r, e, eta) for r, e in enumerate(residuals)], axis=1)
 
+    def of_blocks(
+        self, residuals: Sequence[Array], eta: Array, starts: Sequence[Integers]
+    ) -> list[Array]:
+        """Log density of blocks of samples, given those before; their sum is the joint one.
+
+        Parameters
+        ----------
+        residuals : sequence over runs of ndarray, shape (L, s, n)
+            ``y - yhat`` of ``L`` parameter vectors.
+        eta : ndarray, shape (L, m)
+            Coordinates.
+        starts : sequence over runs of ndarray of int, shape (B,)
+            First sample of each block.
+
+        Returns
+        -------
+        list over runs of ndarray, shape (L, s, B)
+            Of an output given the outputs before it where these are correlated.
+        """
+        parts = zip(residuals, starts, strict=True)
+        return [self.blocks_of_run(run, e, eta, first) for run, (e, first) in enumerate(parts)]
+
+    def blocks_of_run(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
+        """The same of one run, shape (L, s, B), where runs are independent of each other."""
+        raise NotImplementedError(f"{self.word} needs all runs at once")
+
     @abstractmethod
     def products(self, run: int, columns: Sequence[Array], eta: Array) -> Array:
         """``C V^-1 C'`` of one run.
@@ -302,6 +392,77 @@ class ErrorModel(ABC):
         """
         sd = np.sqrt(self.variance(natural, run))
         return sd[:, :, None] * rng.standard_normal((*sd.shape, samples.time.size))
+
+
+@dataclass(frozen=True)
+class ProfiledErrorModel(ABC):
+    """Covariance of the ``s`` outputs' errors as point estimators eliminate it in each iteration.
+
+    It says three things of residuals ``e``: which covariance ``V`` maximises the objective at fixed
+    parameters (the staged elimination), how likely they are given one, and which rows of a
+    least-squares problem they make when whitened by it. ``V`` is kept as (s,) where it is diagonal.
+
+    References
+    ----------
+    Verbeek (1993), eqs. 2.25-2.35 for the models, 3.17 and 3.18 for the staging; Bard (1974),
+    *Nonlinear Parameter Estimation*, section 4-9, for the determinant criterion.
+    """
+
+    def check(self, counts: Counts) -> None:
+        """Raise an :class:`InputError` if samples by run and output, (N, s), do not suit."""
+        return
+
+    @abstractmethod
+    def moments(self, evaluation: Residuals) -> Array:
+        """What the likelihood knows of the residuals."""
+
+    @abstractmethod
+    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+        """``V`` that maximises the objective at fixed parameters, (s,) or (s, s)."""
+
+    @abstractmethod
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+        """Logarithm of the likelihood with ``V`` held."""
+
+    @abstractmethod
+    def rows(self, evaluation: Residuals, unit: Array, covariance: Array) -> tuple[Array, Array]:
+        """Whitened rows ``J`` (k, l) in unknowns of size ``unit``, and ``e`` (k,)."""
+
+    @abstractmethod
+    def weighted(self, residual: Sequence[Array], covariance: Array) -> tuple[Array, ...]:
+        """``V^-1 e`` of each output."""
+
+    def eliminated(
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+    ) -> Array:
+        """What eliminating ``V`` takes from the Hessian, (l, l): ``H_tv H_vv^-1 H_vt``.
+
+        References
+        ----------
+        Verbeek (1993), Appendix A.
+        """
+        return np.zeros((unit.size, unit.size))
+
+
+def normal_blocks(white: Array, log_sd: Array, starts: Integers) -> Array:
+    """Log density of blocks of whitened samples.
+
+    Parameters
+    ----------
+    white : ndarray, shape (L, s, n)
+        Independent, of unit variance.
+    log_sd : ndarray, shape (L, s)
+        Logarithm of the standard deviation that was divided by.
+    starts : ndarray of int, shape (B,)
+        First sample of each block.
+
+    Returns
+    -------
+    ndarray, shape (L, s, B)
+    """
+    sizes = np.diff(starts, append=white.shape[2])
+    squares = np.add.reduceat(white * white, starts, axis=2)
+    return np.asarray(-0.5 * squares - sizes * (log_sd[:, :, None] + 0.5 * np.log(2 * np.pi)))
 
 
 def log_mean_squares(residuals: Sequence[Array]) -> Array:

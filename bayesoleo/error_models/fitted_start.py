@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.posterior.density.differences import derivatives
+from bayesoleo.error_models.differences import derivatives
 
 # Differences are taken over so much, in coordinates of about unit spread.
 _SCALE = 0.2

@@ -14,31 +14,54 @@ correlation matrices based on vines and extended onion method", *Journal of Mult
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.special import betaln
 
 from bayesoleo import schema
 from bayesoleo._types import Array
-from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models.base import (
+from bayesoleo.error_models.base import (
+    Counts,
     ErrorModel,
     Frame,
+    ProfiledErrorModel,
     Quantity,
+    Residuals,
+    RunSamples,
     log_mean_squares,
+    normal_blocks,
 )
+from bayesoleo.error_models.independent import staged_variance
+from bayesoleo.error_models.linearise import triangle
+from bayesoleo.errors import InputError
 
 _LOG_2_PI = float(np.log(2 * np.pi))
 # Correlations of a start are kept so far from one that their coordinates are finite.
 _MOST = 0.999
+# A covariance of outputs that repeat each other is singular; this part of its trace keeps it apart.
+_RIDGE = 1e-14
+
+
+def _check_same_samples(counts: Counts, key: str, instead: str) -> None:
+    """Raise an :class:`InputError` unless all outputs of a run have as many samples, (N, s)."""
+    if (counts != counts[:, :1]).any():
+        raise InputError(
+            "a covariance between outputs needs them at the same samples",
+            key=key,
+            value=counts.tolist(),
+            hint=f'use {key}="{instead}"',
+        )
 
 
 class FullErrors(ErrorModel):
     """Outputs of one sample are correlated, samples are independent."""
 
     word = "full"
+    data_points = "one period of one run; an output given the outputs before it"
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
@@ -50,13 +73,7 @@ class FullErrors(ErrorModel):
                 value=self.word,
                 hint='use error_model="independent"',
             )
-        if (frame.counts != frame.counts[:, :1]).any():
-            raise InputError(
-                "a covariance over outputs needs them at the same samples",
-                key="error_model",
-                value=frame.counts.tolist(),
-                hint='use error_model="independent"',
-            )
+        _check_same_samples(frame.counts, "error_model", "independent")
         self._pairs = [(i, j) for i in range(len(frame.outputs)) for j in range(i)]
 
     def _declare(self) -> tuple[Quantity, ...]:
@@ -143,6 +160,15 @@ class FullErrors(ErrorModel):
                 total[lane] -= 0.5 * np.sum(row_of_lane * row_of_lane)
         return total
 
+    def blocks_of_run(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        s = len(self.frame.outputs)
+        factor, sd = self._factor(eta), np.exp(0.5 * eta[:, :s])
+        white = np.linalg.solve(factor, residual / sd[:, :, None])
+        log_sd = np.log(sd * np.einsum("lss->ls", factor))
+        return normal_blocks(white, log_sd, starts)
+
     def products(self, run: int, columns: Sequence[Array], eta: Array) -> Array:
         s = len(self.frame.outputs)
         root = np.exp(0.5 * eta[:s])[:, None] * self._factor(eta[None])[0]
@@ -170,3 +196,56 @@ class FullErrors(ErrorModel):
         sd = super().spread()
         sd[len(self.frame.outputs) :] = 1.0 / np.sqrt(self.frame.counts[:, 0].sum())
         return sd
+
+
+@dataclass(frozen=True)
+class ProfiledFullErrors(ProfiledErrorModel):
+    """One full covariance for all samples: the determinant criterion (eqs. 2.27-2.28)."""
+
+    def check(self, counts: Counts) -> None:
+        _check_same_samples(counts, "objective", "diagonal")
+
+    def moments(self, evaluation: Residuals) -> Array:
+        residual = np.stack(evaluation.residual)
+        return residual @ residual.T
+
+    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+        floor = np.diag(
+            staged_variance(np.diag(moments), counts, unknowns, bias_corrected=bias_corrected)
+        )
+        degrees = counts[0] - unknowns / len(counts) if bias_corrected else counts[0]
+        return moments / degrees + _RIDGE * floor
+
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+        determinant = np.linalg.slogdet(covariance)[1]
+        return float(
+            -0.5 * (counts[0] * determinant + np.trace(np.linalg.solve(covariance, moments)))
+        )
+
+    def rows(self, evaluation: Residuals, unit: Array, covariance: Array) -> tuple[Array, Array]:
+        # One factor of all outputs side by side holds their products with each other as well.
+        columns = zip(evaluation.sensitivity, evaluation.residual, strict=True)
+        factor = triangle(np.column_stack([part for j, e in columns for part in (j * unit, e)]))
+        outputs, width = len(covariance), unit.size + 1
+        blocks = factor.reshape(len(factor), outputs, width).swapaxes(0, 1)
+        stacked = triangle(np.einsum("ab,bkw->akw", _root(covariance), blocks).reshape(-1, width))
+        return stacked[:, :-1], stacked[:, -1]
+
+    def weighted(self, residual: Sequence[Array], covariance: Array) -> tuple[Array, ...]:
+        return tuple(np.linalg.solve(covariance, np.stack(residual)))
+
+    def eliminated(
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+    ) -> Array:
+        root = _root(covariance)
+        residual = root @ np.stack(evaluation.residual)
+        sensitivity = np.einsum("ab,bnk->ank", root, np.stack(evaluation.sensitivity) * unit)
+        slope = np.einsum("ank,bn->kab", sensitivity, residual)
+        slope = slope + slope.swapaxes(1, 2)
+        return np.asarray(np.einsum("kab,jab->kj", slope, slope) / (2 * counts[0]))
+
+
+def _root(covariance: Array) -> Array:
+    """``L^-1`` with ``V = L L'``."""
+    lower = np.linalg.cholesky(covariance)
+    return np.asarray(solve_triangular(lower, np.eye(len(lower)), lower=True))

@@ -7,16 +7,11 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.posterior.density.error_models.base import (
-    ErrorModel,
-    Frame,
-    Quantity,
-    log_mean_squares,
-)
-from bayesoleo.posterior.density.error_models.fitted_start import climb
+from bayesoleo.error_models.base import ErrorModel, Frame, Quantity, RunSamples, log_mean_squares
+from bayesoleo.error_models.fitted_start import climb
 
 #: Coordinates of a share from which the climb to its most likely value starts: a fifth, a half, and
 #: nine tenths.
@@ -34,6 +29,7 @@ class ByOutput(ErrorModel):
     that densities over both are equal.
     """
 
+    data_points = "one period of one run, given the periods before it"
     #: Rough standard deviations of the logit of a share and of a logarithm of a length.
     _SHARE_SD, _LENGTH_SD = 0.3, 0.3
 
@@ -47,6 +43,12 @@ class ByOutput(ErrorModel):
 
         ``eta`` (L, 3) holds ``ln v``, the share's quantile and the logarithm of the length.
         """
+
+    @abstractmethod
+    def blocks_of_output(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        """Log density of blocks of one output, each given those before it, shape (L, B)."""
 
     @abstractmethod
     def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
@@ -92,6 +94,17 @@ class ByOutput(ErrorModel):
             row = np.ascontiguousarray(residual[:, b])
             total += self.of_output(run, row, self._part(eta, b))
         return total
+
+    def blocks_of_run(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        parts = [
+            self.blocks_of_output(
+                run, np.ascontiguousarray(residual[:, b]), self._part(eta, b), starts
+            )
+            for b in range(len(self.frame.outputs))
+        ]
+        return np.stack(parts, axis=1)
 
     def products(self, run: int, columns: Sequence[Array], eta: Array) -> Array:
         parts = [

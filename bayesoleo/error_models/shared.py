@@ -10,7 +10,7 @@ r"""A discrepancy part of which all runs share.
 
 A run shows what a model lacks, and so do the others: what is missing in all of them is alike where
 they go through the same part of the motion. If each had a discrepancy of its own
-(:class:`~bayesoleo.posterior.density.error_models.DiscrepancyErrors`), more runs would average it
+(:class:`~bayesoleo.error_models.DiscrepancyErrors`), more runs would average it
 away, and intervals would shrink about a value that stays off. Here :math:`\kappa` says how much of
 it they share; at zero each has its own. Phases count from the crest of what drives a run.
 
@@ -32,19 +32,19 @@ from collections.abc import Sequence
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesoleo import schema
 from bayesoleo._types import Array, Integers
-from bayesoleo.estimation.problems.residuals import RunSamples
-from bayesoleo.model.priors import Uniform
-from bayesoleo.posterior.density.error_models.base import Frame, Quantity
-from bayesoleo.posterior.density.error_models.discrepancy import (
+from bayesoleo.error_models.base import Frame, Quantity, RunSamples
+from bayesoleo.error_models.discrepancy import (
     DiscrepancyErrors,
     factorise,
     project,
     spectrum,
     without_products,
 )
+from bayesoleo.model.priors import Uniform
 
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
@@ -167,12 +167,13 @@ def _parts(eta: Array) -> tuple[float, float, float, float]:
 class SharedDiscrepancyErrors(DiscrepancyErrors):
     """White noise, a Gaussian process over phase that all runs share, and one of each run.
 
-    Priors as of :class:`~bayesoleo.posterior.density.error_models.DiscrepancyErrors`; uniform
+    Priors as of :class:`~bayesoleo.error_models.DiscrepancyErrors`; uniform
     in the part of the discrepancy that is common.
     """
 
     word = "shared-discrepancy"
     over_runs = True
+    data_points = "one run, given the runs before it"
 
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
@@ -201,9 +202,24 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
         eta[3 * len(self.frame.outputs) :] = 0.0
         return eta
 
+    def of_blocks(
+        self, residuals: Sequence[Array], eta: Array, starts: Sequence[NDArray[np.int64]]
+    ) -> list[Array]:
+        """Whole runs: a period given those before it and all other runs would cost too much."""
+        if any(len(first) != 1 for first in starts):
+            raise ValueError("blocks of runs that have errors in common are whole runs")
+        every = np.stack(self._by_output(residuals, eta), axis=1)
+        return [every[:, :, run : run + 1] for run in range(len(residuals))]
+
     def of_runs(self, residuals: Sequence[Array], eta: Array) -> Array:
-        outputs, lanes = len(self.frame.outputs), len(eta)
-        total = np.zeros((lanes, len(residuals)))
+        total = np.zeros((len(eta), len(residuals)))
+        for part in self._by_output(residuals, eta):
+            total += part
+        return total
+
+    def _by_output(self, residuals: Sequence[Array], eta: Array) -> list[Array]:
+        """Log-likelihood of each run given those before it, (L, N) by output."""
+        outputs, lanes, found = len(self.frame.outputs), len(eta), []
         counts = np.array([e.shape[2] for e in residuals])
         for b in range(outputs):
             projected = np.empty((len(residuals), lanes, self._stack.shape[1]))
@@ -213,7 +229,7 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
                 project(rows, self._tables[run], projected[run], squares[run])
             part = np.column_stack([self._part(eta, b), eta[:, 3 * outputs + b]])
             weight = spectrum(np.exp(np.ascontiguousarray(part[:, 2])))
-            out = np.empty_like(total)
+            out = np.empty((lanes, len(residuals)))
             self._kernel(projected, squares, counts, self._stack, weight, part, out)
-            total += out
-        return total
+            found.append(out)
+        return found
