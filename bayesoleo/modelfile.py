@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import inspect
+import os
 import re
 import sys
 import traceback
@@ -27,12 +28,12 @@ DEFAULT_OBJECT, DEFAULT_EFFECTS = "model", "effects"
 _HINT = "write file.py:object"
 
 
-def load_model(text: str) -> Model:
+def load_model(text: str | os.PathLike[str]) -> Model:
     """The model that a text names.
 
     Parameters
     ----------
-    text : str
+    text : str or path-like
         Name of a built-in system, or ``file.py:object``; ``object`` is ``model`` where it is left
         out. A file is code: it is run here, and only when it is named.
 
@@ -56,6 +57,7 @@ def load_model(text: str) -> Model:
     >>> load_model("gas_spring").name
     'gas_spring'
     """
+    text = os.fspath(text)
     file, colon, name = text.rpartition(":")
     if text.endswith(".py"):
         file, name = text, DEFAULT_OBJECT

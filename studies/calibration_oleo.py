@@ -9,9 +9,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo import LogNormal, Model, Normal, driven_by, system
+from bayesoleo import Model, system
 from bayesoleo.effects import Scales, find_effect
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.model import LogNormal, Normal, driven_by
 from bayesoleo.model.correlated import sample_of
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import bayesoleo
-from bayesoleo import Model, driven_by
+from bayesoleo import Model
 from bayesoleo.estimation import PointEstimate, data_against_prior
+from bayesoleo.model import driven_by
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Record
 from bayesoleo.systems.drop import drop_test

@@ -100,7 +100,7 @@ def run(campaign: Campaign) -> dict[str, Any]:
         # A frame is no part of the strut: it shows in what is measured.
         frame = values.pop("frame_compliance", 0.0)
         reduced = simulated(model, values, int(rng.integers(2**31)), frame)
-    except bayesoleo.BayesoleoError as error:
+    except bayesoleo.errors.BayesoleoError as error:
         return asdict(campaign) | {"failed": str(error).splitlines()[0]}
     assembly = Assembly(system(SYSTEM), DRIVE)
     loop = close_loop(assembly, assign(reduced.records), NUMERICS, max_effects=2, unnamed=False)

@@ -16,9 +16,10 @@ import numpy as np
 import xarray as xr
 
 import bayesoleo
-from bayesoleo import Model, Parameter, driven_by
+from bayesoleo import Model, Parameter
 from bayesoleo.data import ReducedCampaign
 from bayesoleo.errors import InputError
+from bayesoleo.model import driven_by
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 
 #: Models by physics and variant; ``thesis`` leaves theta_4 and theta_6 unlinked.
@@ -109,7 +110,9 @@ class Shaker:
         root = os.environ.get("BAYESOLEO_DATA")
         if root is None:
             raise InputError("BAYESOLEO_DATA is not set", hint="name the folder with campaigns/")
-        return cls(bayesoleo.reduce(Path(root) / "campaigns" / "shaker-plain", jobs=jobs), jobs)
+        return cls(
+            bayesoleo.workflow.reduce(Path(root) / "campaigns" / "shaker-plain", jobs=jobs), jobs
+        )
 
     @property
     def runs(self) -> list[str]:
@@ -152,14 +155,16 @@ class Shaker:
     def each(self, physics: str, variant: str, drive: str) -> xr.Dataset:
         """Estimates of each run."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive=drive)
-        return bayesoleo.estimate_each(self.reduced, self.model(physics, variant), settings)
+        return bayesoleo.workflow.estimate_each(
+            self.reduced, self.model(physics, variant), settings
+        )
 
     @cache  # noqa: B019
     def each_at_nominal_friction(self) -> xr.Dataset:
         """Table 6.5 by force with the friction of the thesis's tables C.1 and D.1."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive="force")
         model = bayesoleo.system(MODELS["thermo-mechanical", "thesis"])
-        return bayesoleo.estimate_each(self.reduced, model, settings)
+        return bayesoleo.workflow.estimate_each(self.reduced, model, settings)
 
     @cache  # noqa: B019
     def joint(self, physics: str, variant: str, drive: str) -> Fit:

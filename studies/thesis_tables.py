@@ -13,9 +13,10 @@ import numpy as np
 import xarray as xr
 
 import bayesoleo
-from bayesoleo import Model, driven_by
+from bayesoleo import Model
 from bayesoleo.data import SimulatedRun, write_campaign
 from bayesoleo.errors import InputError
+from bayesoleo.model import driven_by
 from bayesoleo.prediction.simulate import RunPlan, Simulation, motion, simulate_run
 from bayesoleo.systems.verbeek import SHAKER_RUNS, TABLE_6_2, TABLE_6_5, ShakerRun
 
@@ -49,7 +50,7 @@ def table_6_5_to_6_2(variant: str, jobs: int | None = None) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Of ``bayesoleo.estimate_each``, with the highest simulated ``pressure`` (run), Pa gauge, and
+        Of ``workflow.estimate_each``, with the highest simulated ``pressure`` (run), Pa gauge, and
         the attribute ``no_orbit``: runs that could not be simulated, with the reason.
     """
     model = _model(variant)
@@ -75,7 +76,7 @@ def table_6_5_to_6_2(variant: str, jobs: int | None = None) -> xr.Dataset:
         channels = {"force": ("F", "N"), "displacement": ("q", "m")}
         write_campaign(path, name="table 6.5", channels=channels, runs=runs)
         settings = bayesoleo.Settings(drive="model", steps=1024, jobs=jobs)
-        each = bayesoleo.estimate_each(path, bayesoleo.system("f16n1d1_thesis"), settings)
+        each = bayesoleo.workflow.estimate_each(path, bayesoleo.system("f16n1d1_thesis"), settings)
     highest = [float(made[run].samples["pressure"].max()) for run in each.run.values]
     each["pressure"] = ("run", highest)
     each.attrs["no_orbit"] = failed

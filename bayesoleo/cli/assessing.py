@@ -175,16 +175,14 @@ def predict(
       bayesoleo predict point/results.nc shaker --runs c,h
       bayesoleo predict point/results.nc drops --model drop.py:model --figure drops.png
     """
-    from bayesoleo import plots, workflow
-    from bayesoleo.forecast import predict as foresee
+    from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
-    from bayesoleo.storage import read_tree
+    from bayesoleo.session import load_result
 
     if figure is not None:
         shell.check_writable(figure.parent)
     labels = None if runs is None else [label.strip() for label in runs.split(",")]
-    found = foresee(
-        read_tree(results),
+    found = load_result(results).predict(
         workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet)),
         model=None if model is None else load_model(model),
         runs=labels,
@@ -200,7 +198,7 @@ def predict(
     if figure is not None:
         for output in found.data[schema.OUTPUT].values:
             path = figure.with_stem(f"{figure.stem}-{output}")
-            plots.forecast(found.data, str(output)).savefig(path)
+            found.plot(output=str(output)).savefig(path)
 
 
 def replicate(

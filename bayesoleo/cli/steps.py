@@ -173,6 +173,7 @@ def sample(
     """
     from bayesoleo import workflow
     from bayesoleo.modelfile import load_model
+    from bayesoleo.session import Posterior
 
     folder = shell.output_folder(out, campaign, "-sample")
     chosen = options.settings(
@@ -194,26 +195,11 @@ def sample(
     with shell.stoppable(folder):
         tree = workflow.sample(campaign, declared, chosen, out=folder, say=say, progress=progress)
     console = shell.console()
-    _print_posterior(tree, console)
+    summary = Posterior(tree).summary()
+    console.print(str(summary), markup=False, soft_wrap=True)
+    if summary.data.attrs["warning"]:
+        shell.complain(f"warning: {summary.data.attrs['warning']}")
     _print_written(folder, console)
-
-
-def _print_posterior(tree: xr.DataTree, console: Console) -> None:
-    posterior = tree[schema.POSTERIOR].to_dataset()
-    about = tree[schema.SAMPLE_STATS].attrs
-    size = json.loads(str(about.get("effective_sample_size", "{}")))
-    rows = []
-    for name, draws in posterior.data_vars.items():
-        low, high = draws.quantile([0.025, 0.975]).values
-        values = [float(draws.mean()), float(draws.std()), float(low), float(high)]
-        # One number for all, or one for each.
-        effective = size.get(str(name)) if isinstance(size, dict) else size
-        count = None if effective is None else round(effective)
-        rows.append([str(name), str(draws.attrs.get(schema.UNITS, "")), *values, count])
-    head = ["parameter", "unit", "mean", "sd", "2.5 %", "97.5 %", "effective draws"]
-    console.print(tables.table(head, rows, words=2))
-    if about.get("warning"):
-        shell.complain(f"warning: {about['warning']}")
 
 
 def trace(

@@ -62,7 +62,7 @@ class ReducedCampaign:
 
 
 def reduce_campaign(
-    campaign: Campaign, jobs: int | None = None, progress: bool = False
+    campaign: Campaign, jobs: int | None = None, progress: bool | float = False
 ) -> ReducedCampaign:
     """Reduce all runs of a campaign.
 
@@ -72,8 +72,8 @@ def reduce_campaign(
         From :func:`load_campaign`.
     jobs : int, optional
         Threads; by default the cores this process may use.
-    progress : bool
-        Show a progress bar.
+    progress : bool or float
+        Show a progress bar, at once or after so many seconds.
 
     Returns
     -------
@@ -89,7 +89,8 @@ def reduce_campaign(
         return ReducedCampaign(campaign, tuple(thread_map(reduce_run, campaign.runs, jobs)))
     from tqdm.auto import tqdm
 
-    with tqdm(total=len(campaign.runs), desc="reduce", unit="run") as bar:
+    delay = 0.0 if progress is True else progress
+    with tqdm(total=len(campaign.runs), desc="reduce", unit="run", delay=delay) as bar:
 
         def reduce_and_count(run: Run) -> Record:
             record = reduce_run(run)

@@ -214,7 +214,7 @@ class ProfiledFullErrors(ProfiledErrorModel):
             staged_variance(np.diag(moments), counts, unknowns, bias_corrected=bias_corrected)
         )
         degrees = counts[0] - unknowns / len(counts) if bias_corrected else counts[0]
-        return moments / degrees + _RIDGE * floor
+        return np.asarray(moments / degrees + _RIDGE * floor)
 
     def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
         determinant = np.linalg.slogdet(covariance)[1]

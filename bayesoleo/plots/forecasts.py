@@ -24,7 +24,7 @@ def forecast(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None)
     Parameters
     ----------
     found : Shown, xarray.Dataset or xarray.DataTree
-        Of :func:`bayesoleo.predict`.
+        Of :func:`bayesoleo.forecast.predict`.
     output : str, optional
         By default the first.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import xarray as xr
 
@@ -42,9 +43,8 @@ def trace(
     output = Output.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
     stages = Stages(say)
-    loop = run_loop(task, 0, stages, output)
-    questions = stages.attempt(PROPOSALS, lambda: what_next(task, loop, say), no_questions)
-    return _written(task, loop, None, output, stages, questions)
+    loop, questions = search(task, 0, stages, output)
+    return written(task, loop, None, output, stages, questions)
 
 
 def close(
@@ -95,8 +95,7 @@ def close(
     task = prepare(campaign, model, settings, progress=progress)
     with output.alone():
         stages = Stages(say)
-        loop = run_loop(task, settings.max_effects, stages, output, resume=True)
-        questions = stages.attempt(PROPOSALS, lambda: what_next(task, loop, say), no_questions)
+        loop, questions = search(task, settings.max_effects, stages, output, resume=True)
         if not settings.quick:
             _write_found(task, loop, output, stages, questions)
         say("sample the posterior")
@@ -104,7 +103,7 @@ def close(
         drawn = stages.attempt(
             POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
         )
-        return _written(task, loop, drawn, output, stages, questions)
+        return written(task, loop, drawn, output, stages, questions)
 
 
 def no_questions() -> tuple[Question, ...]:
@@ -127,7 +126,7 @@ def _write_found(
         stages.say(f"what is known so far could not be written: {reason_of(error)}")
 
 
-def _written(
+def written(
     task: Task,
     loop: ClosedLoop,
     drawn: Drawn | None,
@@ -147,6 +146,15 @@ def _written(
     stages.finish(tree, output.folder)
     output.finish()
     return tree
+
+
+def search(
+    task: Task, max_effects: int, stages: Stages, output: Output, *, resume: bool = False
+) -> tuple[ClosedLoop, tuple[Question, ...]]:
+    """The loop of :func:`run_loop`, and the runs that would tell apart what it could not."""
+    loop = run_loop(task, max_effects, stages, output, resume=resume)
+    ask = partial(what_next, task, loop, stages.say)
+    return loop, stages.attempt(PROPOSALS, ask, no_questions)
 
 
 def run_loop(

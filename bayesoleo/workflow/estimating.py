@@ -62,10 +62,11 @@ def estimate(
     return tree
 
 
-def estimated(task: Task, stages: Stages) -> tuple[Fit, dict[str, xr.Dataset]]:
+def estimated(task: Task, stages: Stages, method: str = "mbe") -> tuple[Fit, dict[str, xr.Dataset]]:
     """The estimate, at the mode under the error model that was chosen if that was found."""
     settings, say = task.settings, stages.say
-    fit = fit_model(task.assembly.model(), task.roles.fitted, settings.numerics, progress=say)
+    model, runs = task.assembly.model(), task.roles.fitted
+    fit = fit_model(model, runs, settings.numerics, method=method, progress=say)
     plain: tuple[Fit, dict[str, xr.Dataset]] = (fit, {})
     return stages.attempt(POSTERIOR, lambda: under_error_model(fit, settings, say), lambda: plain)
 

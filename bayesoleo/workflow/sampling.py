@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import Array
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
@@ -60,7 +61,7 @@ def sample(
             POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
         )
         if drawn is not None:
-            groups |= _groups(fit, drawn, seed, groups, stages)
+            groups |= drawn_groups(fit, drawn, seed, groups, stages)
         tree = finish(task, groups, fit)
         mark_unfinished(tree, stages.failed)
         output.write(tree)
@@ -74,7 +75,7 @@ def no_groups() -> dict[str, xr.Dataset]:
     return {}
 
 
-def _groups(
+def drawn_groups(
     fit: Fit,
     drawn: tuple[Samples, LogDensity],
     seed: int,
@@ -96,19 +97,48 @@ def _groups(
 
 
 def draw(
-    task: Task, fit: Fit, checkpoints: Path | None, say: Say, progress: bool
+    task: Task, fit: Fit, checkpoints: Path | None, say: Say, progress: bool | float
 ) -> tuple[Samples, LogDensity]:
     """Draws of the posterior, from the checkpoints if there are some."""
     settings = task.settings
     density = settings.inference.density(fit, settings.jobs)
+    of = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
+    of += [] if settings.solver == COLLOCATION else [settings.solver]
+    samples = draw_from(
+        density, fit.point.theta, settings, of=of, checkpoints=checkpoints, progress=progress
+    )
+    return samples, density
+
+
+def draw_from(
+    density: LogDensity,
+    theta: Array,
+    settings: Settings,
+    *,
+    of: Sequence[object],
+    checkpoints: Path | None,
+    progress: bool | float,
+) -> Samples:
+    """Draws of a density, from the checkpoints if there are some.
+
+    Parameters
+    ----------
+    density : LogDensity
+    theta : ndarray, shape (l,)
+        The estimate.
+    settings : Settings
+    of : sequence
+        What the density depends on beside the settings; JSON can hold it.
+    checkpoints : Path, optional
+    progress : bool or float
+        Whether to show a bar, at once or after so many seconds.
+    """
     starts = 0 if settings.quick else STARTS
-    start = mixture_at(density, fit.point.theta, starts=starts, seed=settings.seed)
+    start = mixture_at(density, theta, starts=starts, seed=settings.seed)
     # Another seed or quality is another run, with a folder of its own.
-    parts = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
-    parts += [] if settings.solver == COLLOCATION else [settings.solver]
-    parts += [settings.seed, settings.quick, settings.error_model, settings.between_runs]
+    parts = [*of, settings.seed, settings.quick, settings.error_model, settings.between_runs]
     fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-    samples = draw_samples(
+    return draw_samples(
         density,
         start,
         effective_size=settings.effective_size,
@@ -120,4 +150,3 @@ def draw(
         climbs=CLIMBS,
         scheduler=settings.scheduler,
     )
-    return samples, density

@@ -42,7 +42,9 @@ def silent(_: str) -> None:
     """Say nothing."""
 
 
-def reduce(campaign: Source, *, jobs: int | None = None, progress: bool = False) -> ReducedCampaign:
+def reduce(
+    campaign: Source, *, jobs: int | None = None, progress: bool | float = False
+) -> ReducedCampaign:
     """Load a campaign and reduce its runs to records.
 
     Parameters
@@ -51,8 +53,8 @@ def reduce(campaign: Source, *, jobs: int | None = None, progress: bool = False)
         Folder with ``campaign.toml``, or what was loaded from one.
     jobs : int, optional
         Threads.
-    progress : bool
-        Whether to show a bar.
+    progress : bool or float
+        Whether to show a bar, at once or after so many seconds.
 
     Raises
     ------
@@ -107,7 +109,9 @@ class Task:
         }
 
 
-def prepare(campaign: Source, model: Model, settings: Settings, *, progress: bool = False) -> Task:
+def prepare(
+    campaign: Source, model: Model, settings: Settings, *, progress: bool | float = False
+) -> Task:
     """Bring a campaign and a model together, and find out early what does not fit.
 
     Raises
@@ -254,8 +258,13 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         candidate effects, what the model says at its nominal values by run and output (``start``),
         and what deserves a look in records and start.
     """
-    task = prepare(campaign, model, settings)
-    driven = task.assembly.model()
+    return checked(prepare(campaign, model, settings))
+
+
+def checked(task: Task) -> dict[str, Any]:
+    """What :func:`check` says of a campaign and a model that were brought together."""
+    settings, driven = task.settings, task.assembly.model()
+    native = task.assembly.declared or task.assembly.native
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
     steps = settings.steps or first_steps(driven, task.roles.fitted)
     starts = starts_of(
@@ -269,10 +278,10 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
         "hold_out": [record.label for record in task.roles.held_out],
         "strategy": task.roles.description,
         "unknowns": list(predictor.layout.names),
-        "possible_drives": list(possible_drives(model)),
+        "possible_drives": list(possible_drives(native)),
         "steps": steps,
         "effects": sum(
-            bool(effect.places(driven if effect.family == "sensor" else model))
+            bool(effect.places(driven if effect.family == "sensor" else native))
             for effect in settings.searched
         ),
         "start": as_plain(starts),

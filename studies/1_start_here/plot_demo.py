@@ -24,16 +24,16 @@ from bayesoleo.effects.titles import called
 
 folder = demo_campaign(Path(tempfile.mkdtemp()) / "campaign", seed=0)
 model = bayesoleo.system(DEMO_SYSTEM)
-for name, value in bayesoleo.check(folder, model).items():
+for name, value in bayesoleo.workflow.check(folder, model).items():
     print(f"{name:16} {value}")
 
 # %%
 # One call estimates the parameters, holds the residual against the noise, names what is missing,
 # adds it, samples the posterior and compares the error before and after.
 
-tree = bayesoleo.close(folder, model, bayesoleo.Settings(seed=0, quick=True))
+tree = bayesoleo.workflow.close(folder, model, bayesoleo.Settings(seed=0, quick=True))
 summary = json.loads(tree.attrs["summary"])
-bayesoleo.print_summary(summary, Console(width=100))
+bayesoleo.report.print_summary(summary, Console(width=100))
 
 # %%
 # What the first round saw. Each bar is a candidate of the catalogue, scored without a refit by the

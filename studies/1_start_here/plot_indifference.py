@@ -15,7 +15,7 @@ for a gas spring, exactly and by Taylor's second order, and lets the sloppy dire
 import numpy as np
 import xarray as xr
 
-from bayesoleo import Normal, plots
+from bayesoleo import plots
 from bayesoleo.estimation import (
     FunctionProblem,
     estimate,
@@ -24,6 +24,7 @@ from bayesoleo.estimation import (
     principal_axes,
     profile,
 )
+from bayesoleo.model import Normal
 from bayesoleo.posterior import (
     LogDensity,
     compare,

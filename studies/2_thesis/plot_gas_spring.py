@@ -17,7 +17,6 @@ what the data say. This page repeats the numerical experiment of Verbeek (1993),
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bayesoleo import Normal
 from bayesoleo.estimation import (
     FunctionProblem,
     estimate,
@@ -28,6 +27,7 @@ from bayesoleo.estimation import (
     output_counts,
     staged_variance,
 )
+from bayesoleo.model import Normal
 
 position = np.linspace(0.0, 0.9, 100)
 rng = np.random.default_rng(0)

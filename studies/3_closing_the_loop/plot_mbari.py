@@ -51,14 +51,14 @@ study = Study("mbari", data="measured/mbari_gas_spring", slow=True)
 
 def closed(start, **options):
     """The loop from a model, and its summary."""
-    found = bayesoleo.close(
+    found = bayesoleo.workflow.close(
         study.campaign, start, bayesoleo.Settings(seed=0, quick=True, **options)
     )
     return found, json.loads(found.attrs["summary"])
 
 
 tree, summary = study.run(lambda: closed(model)) or (None, None)
-study.text("summary", lambda: bayesoleo.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
 
 # %%
 # What the first round saw. Friction with memory draws a loop too, and explains four fifths; a gas

@@ -37,10 +37,10 @@ model = Model(
 study = Study("mr_damper", data="measured/mr_damper")
 
 tree = study.run(
-    lambda: bayesoleo.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
+    lambda: bayesoleo.workflow.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
 )
 summary = tree and json.loads(tree.attrs["summary"])
-study.text("summary", lambda: bayesoleo.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
 
 # %%
 # What the first round saw. The friction models with memory are a class: with one amplitude of the

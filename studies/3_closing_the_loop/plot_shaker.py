@@ -26,11 +26,13 @@ complete = Study("shaker_f16n2d2", data="campaigns/shaker-plain")
 
 def show(tree):
     """Verdict, errors and effects."""
-    bayesoleo.print_summary(json.loads(tree.attrs["summary"]), Console(width=100))
+    bayesoleo.report.print_summary(json.loads(tree.attrs["summary"]), Console(width=100))
 
 
 settings = bayesoleo.Settings(seed=0, quick=True)
-tree = complete.run(lambda: bayesoleo.trace(complete.folder, bayesoleo.system("f16n2d2"), settings))
+tree = complete.run(
+    lambda: bayesoleo.workflow.trace(complete.folder, bayesoleo.system("f16n2d2"), settings)
+)
 complete.text("summary", lambda: show(tree))
 
 # %%
@@ -48,7 +50,7 @@ errors = complete.figure("error", lambda: plots.error(tree))
 
 polytropic = Study("shaker_f16n1d2", data="campaigns/shaker-plain", slow=True)
 found = polytropic.run(
-    lambda: bayesoleo.close(polytropic.folder, bayesoleo.system("f16n1d2"), settings)
+    lambda: bayesoleo.workflow.close(polytropic.folder, bayesoleo.system("f16n1d2"), settings)
 )
 polytropic.text("summary", lambda: show(found))
 
@@ -65,7 +67,9 @@ pressure = polytropic.figure("residual", lambda: plots.residual(found, "pressure
 
 driven = Study("shaker_f16n2d1", data="campaigns/shaker-plain", slow=True)
 own = bayesoleo.Settings(seed=0, quick=True, drive="model")
-forced = driven.run(lambda: bayesoleo.close(driven.folder, bayesoleo.system("f16n2d1"), own))
+forced = driven.run(
+    lambda: bayesoleo.workflow.close(driven.folder, bayesoleo.system("f16n2d1"), own)
+)
 driven.text("summary", lambda: show(forced))
 
 # %%

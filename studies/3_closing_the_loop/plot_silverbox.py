@@ -50,10 +50,10 @@ for line in bayesoleo.systems.equations(model).values():
 # Closing the loop.
 
 tree = study.run(
-    lambda: bayesoleo.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
+    lambda: bayesoleo.workflow.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
 )
 summary = tree and json.loads(tree.attrs["summary"])
-study.text("summary", lambda: bayesoleo.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
 
 # %%
 # Round by round, on the block that was not used for fitting. The cubic spring comes first and takes

@@ -30,7 +30,7 @@ model = bayesoleo.system(DEMO_SYSTEM)
 
 def sampled(error_model):
     """The result under one error model."""
-    return bayesoleo.sample(
+    return bayesoleo.workflow.sample(
         campaign, model, bayesoleo.Settings(seed=0, error_model=error_model, quick=True)
     )
 

@@ -16,9 +16,10 @@ import time
 
 import numpy as np
 
-from bayesoleo import Normal, plots
+from bayesoleo import plots
 from bayesoleo.assessment import assess
 from bayesoleo.estimation import FunctionProblem, estimate, over_experiments, sampling_distribution
+from bayesoleo.model import Normal
 from bayesoleo.plots.stored import Study
 
 position = np.linspace(0.0, 0.9, 100)

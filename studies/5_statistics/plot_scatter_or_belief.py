@@ -18,8 +18,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from bayesoleo import Normal
 from bayesoleo.estimation import FunctionProblem, estimate, polish, sampling_distribution
+from bayesoleo.model import Normal
 from bayesoleo.plots import style
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 

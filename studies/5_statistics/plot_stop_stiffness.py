@@ -21,8 +21,8 @@ from scipy import stats
 from scipy.interpolate import make_interp_spline
 
 import bayesoleo
-from bayesoleo import LogNormal
 from bayesoleo.estimation import FunctionProblem, estimate, polish
+from bayesoleo.model import LogNormal
 from bayesoleo.plots import style
 from bayesoleo.posterior import (
     LogDensity,

@@ -15,8 +15,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 
-from bayesoleo import Normal
 from bayesoleo.estimation import FunctionProblem, multistart
+from bayesoleo.model import Normal
 from bayesoleo.plots import style
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 

@@ -186,7 +186,7 @@ def _campaign(folder: Path, toml: str, *files: Path) -> Any:
 
 
 def _estimate(campaign: Any, model: Model) -> Array:
-    tree = bayesoleo.estimate(campaign, model, SETTINGS)
+    tree = bayesoleo.workflow.estimate(campaign, model, SETTINGS)
     point = tree["point"].to_dataset()
     return np.array([float(point.estimate.sel(parameter=name)) for name in model.estimated()])
 
@@ -239,7 +239,7 @@ def _emps(data: Path, room: Path, say: Callable[[str], Any]) -> dict[str, float]
         campaign = _campaign(room / kind, toml, room / "emps.csv")
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", DataWarning)
-            tree = bayesoleo.estimate(campaign, DRIVE, SETTINGS)
+            tree = bayesoleo.workflow.estimate(campaign, DRIVE, SETTINGS)
         for item in said:
             say(str(item.message))
         found[f"emps_{kind}_N"] = float(np.sqrt(tree["point"]["variance"].values[0]))

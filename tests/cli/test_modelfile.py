@@ -74,7 +74,7 @@ def test_folder_cannot_be_a_model(tmp_path):
 
 
 EFFECTS = """
-from bayesoleo import catalogue, force_effect
+from bayesoleo.effects import catalogue, force_effect
 
 drag = force_effect("cubic_drag", "damping", "c3*velocity**3", {"c3": "force/(position/s)**3"})
 effects = [*catalogue(), drag]

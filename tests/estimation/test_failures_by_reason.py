@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesoleo import driven_by, system
+from bayesoleo import system
 from bayesoleo.estimation import estimate, multistart, to_dataset
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model import Parameter
+from bayesoleo.model import Parameter, driven_by
 from bayesoleo.posterior import LogDensity
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run

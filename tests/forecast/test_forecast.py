@@ -122,7 +122,7 @@ def test_what_cannot_be_foreseen_is_said(estimated):
         predict(tree, reduced, runs=["z"])
     with pytest.raises(InputError, match="two or more"):
         predict(tree, reduced, draws=1)
-    assert bayesoleo.predict is predict
+    assert bayesoleo.forecast.predict is predict
 
 
 def test_model_of_another_experiment_takes_the_estimates(estimated):
@@ -131,7 +131,7 @@ def test_model_of_another_experiment_takes_the_estimates(estimated):
     model = Model(
         "release",
         inputs={},
-        dofs={"position": bayesoleo.Dof("m", initial="0.01", initial_rate="0")},
+        dofs={"position": bayesoleo.model.Dof("m", initial="0.01", initial_rate="0")},
         parameters={
             "damping": Parameter(DAMPING, "N*s/m", sd=1.0),
             "stiffness": Parameter(STIFFNESS, "N/m", sd=1.0),

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayesoleo import Normal, plots
+from bayesoleo import plots
 from bayesoleo.errors import ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate, indifference, sampling_distribution
+from bayesoleo.model import Normal
 from bayesoleo.plots.pairs import inside
 from bayesoleo.posterior import (
     LogDensity,

@@ -93,7 +93,8 @@ def _parameters(
     dims = (schema.PARAMETER,)
     start = point.start if mbe is None else mbe.start
     robust = point if mbe is None and point.method == "mbe" else mbe
-    reached = np.full(len(point.names), np.nan) if robust is None else robust.theta
+    is_mbe = robust is not None and robust.method == "mbe"
+    reached = robust.theta if robust is not None and is_mbe else np.full(len(point.names), np.nan)
     labels = [""] * len(point.names) if units is None else list(units)
     return {
         schema.START: _variable(dims, start, "start of the estimate", _MIXED),

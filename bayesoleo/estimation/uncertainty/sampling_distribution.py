@@ -106,7 +106,7 @@ def sampling_distribution(
     out: str | os.PathLike[str] | None = None,
     jobs: int | None = None,
     scheduler: str | None = None,
-    progress: bool = False,
+    progress: bool | float = False,
 ) -> Shown:
     """Simulate an experiment again and again, estimate from each, and compare with theory.
 
@@ -140,7 +140,7 @@ def sampling_distribution(
     scheduler : str, optional
         Other processes or machines that make the blocks instead: ``local:4``, or the address of a
         Dask scheduler; see :func:`bayesoleo.machines.connected`.
-    progress : bool, optional
+    progress : bool or float, optional
         Whether to show a bar.
 
     Returns
@@ -191,7 +191,7 @@ def _all_blocks(
     block: int,
     jobs: int | None,
     scheduler: str | None,
-    progress: bool,
+    progress: bool | float,
 ) -> Arrays:
     """Blocks that are stored, and those that had to be made."""
     from tqdm.auto import tqdm
@@ -199,7 +199,10 @@ def _all_blocks(
     numbers = [
         range(first, min(first + block, replications)) for first in range(0, replications, block)
     ]
-    with tqdm(total=replications, unit="fit", desc="replications", disable=not progress) as bar:
+    delay = 0.0 if progress is True else progress
+    with tqdm(
+        total=replications, unit="fit", desc="replications", disable=not progress, delay=delay
+    ) as bar:
         parts = slots.fill(
             _Blocks(work, numbers),
             len(numbers),

@@ -46,7 +46,7 @@ def sample(
     seed: int,
     out: Path | str | None = None,
     fingerprint: str = "",
-    progress: bool = True,
+    progress: bool | float = True,
     max_evaluations: int = 2_000_000,
     weights: MoveWeights | None = None,
     segment: int = 100,
@@ -78,8 +78,8 @@ def sample(
     fingerprint : str
         Hash of what the density depends on (data, model, priors); a folder with another one is
         refused.
-    progress : bool
-        Whether to show a bar of the effective size.
+    progress : bool or float
+        Whether to show a bar of the effective size, at once or after so many seconds.
     max_evaluations : int
         Rows of the log density to stop at.
     weights : MoveWeights, optional
@@ -327,16 +327,19 @@ def _samples(
 class _Bar:
     """Progress towards the effective size."""
 
-    def __init__(self, total: float, shown: bool) -> None:
+    def __init__(self, total: float, shown: bool | float) -> None:
+        self._delay = 0.0 if shown is True else shown
         self._bar = tqdm(
-            total=round(total), disable=not shown, unit=" effective draws", desc="warm-up"
+            total=round(total), disable=not shown, unit=" effective draws", delay=self._delay
         )
+        self._bar.set_description("warm-up", refresh=False)
 
     def show(self, phase: str, size: float, segments: list[Segment]) -> None:
         self._bar.set_description(phase, refresh=False)
         self._bar.set_postfix(evaluations=sum(s.evaluations for s in segments), refresh=False)
         self._bar.n = min(round(size), self._bar.total)
-        self._bar.refresh()
+        if self._bar.format_dict["elapsed"] >= self._delay:
+            self._bar.refresh()
 
     def close(self) -> None:
         self._bar.close()

@@ -88,7 +88,7 @@ class Fit:
     problem : CampaignProblem
         Over the runs that were fitted.
     mbe, point : PointEstimate
-        The MBE estimate, and the posterior's mode reached from it.
+        The estimate by MBE, or by the method asked for, and the posterior's mode reached from it.
     predictions : list of RunPrediction
         At the mode, with sensitivities, one a fitted run.
     steps : int
@@ -175,6 +175,7 @@ def fit_model(
     max_iterations: int = 50,
     share: Predictor | None = None,
     check_mesh: bool = True,
+    method: str = "mbe",
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Estimate a model's parameters from runs.
@@ -199,6 +200,8 @@ def fit_model(
     check_mesh : bool
         Whether to find out what halving the steps would move. Of a model that is only compared
         with others on one mesh nobody asks that, and it costs as much as a third of the estimate.
+    method : str
+        Estimator that leads to the posterior's mode, as in :func:`bayesoleo.estimation.estimate`.
     progress : callable, optional
         Told what is being done.
 
@@ -215,10 +218,10 @@ def fit_model(
     steps = numerics.steps or first_steps(model, records)
     while True:
         problem = _problem(model, records, numerics, steps, share)
-        say(f"MBE, {len(problem.names)} unknowns, {steps} steps")
+        say(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
         mbe = estimate(
             problem,
-            "mbe",
+            method,
             start=start,
             tolerance=tolerance,
             max_iterations=max_iterations,

@@ -32,6 +32,7 @@ from bayesoleo.tracing.outcome.summary import titles_of, told
 
 #: Draws beyond which the stored ones are thinned: files stay below a hundred megabytes.
 MOST_DRAWS = 20_000
+BEFORE = "before"
 _OUTPUT_UNIT = "SI unit of each output"
 
 
@@ -137,8 +138,22 @@ def predictive_groups(
     """The groups prediction and period_predictive of the fitted runs."""
     found = predict_fitted(fit)
     return {
-        schema.PREDICTION: _predictions([("before", fit, found)]),
+        schema.PREDICTION: _predictions([(BEFORE, fit, found)]),
         schema.PERIOD_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
+    }
+
+
+def fitted_groups(fit: Fit) -> dict[str, xr.Dataset]:
+    """The groups prediction and residual of the fitted runs, without averages over periods."""
+    found = predict_fitted(fit)
+    left = {}
+    for b, output in enumerate(fit.predictor.outputs):
+        rows = [_counted(p.record, p.record.samples[output] - p.y[b]) for p in found]
+        unit, dims = fit.model.outputs[output].unit, (schema.RUN, schema.SAMPLE)
+        left[schema.before(output)] = _padded(rows, dims, unit, f"residual of {output}")
+    return {
+        schema.PREDICTION: _predictions([(BEFORE, fit, found)]),
+        schema.RESIDUAL: xr.Dataset(left, coords={schema.RUN: [p.record.label for p in found]}),
     }
 
 
@@ -186,7 +201,7 @@ def ordered(state: State) -> list[Prediction]:
 
 
 def _stages(loop: ClosedLoop) -> list[tuple[str, State]]:
-    return [("before", loop.first)] + (
+    return [(BEFORE, loop.first)] + (
         [("after", loop.final)] if loop.final is not loop.first else []
     )
 

@@ -1,0 +1,156 @@
+"""The same verbs for a user's function."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import arviz
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import bayesoleo as bo
+from bayesoleo import schema
+from tests.session.conftest import line
+from tests.session.shown import check_shown
+
+SLOPE = {"slope": bo.Parameter(1.0, sd=5.0), "offset": bo.Parameter(0.0, sd=1.0)}
+TERMS = {"quadratic": lambda x, c: c * x**2, "cubic": lambda x, c: c * x**3}
+
+
+def vector(x, theta):
+    return theta[0] * x + theta[1]
+
+
+def test_fit_agrees_with_least_squares(table, line_problem, line_fit) -> None:
+    check_shown(line_problem, "y = line(x, …)", "60 samples", picture=False)
+    check_shown(line_problem.check(), "unknowns: slope, offset", picture=False)
+    check_shown(line_fit, "fit of line", "converged")
+    expected = np.polyfit(table["x"], table["y"], 1)
+    moved = (line_fit.parameters["estimate"] - expected) / line_fit.parameters["sd"]
+    assert (abs(moved) < 0.1).all()  # the priors are wide
+    assert line_fit.residuals["y"].sizes == {"run": 1, "sample": 60}
+    assert "x" in line_fit.residuals.coords
+
+
+@pytest.mark.parametrize("kind", [pd.DataFrame, xr.Dataset, dict])
+@pytest.mark.parametrize("function", [line, vector, lambda t, slope, offset: slope * t + offset])
+def test_every_table_and_signature(table, kind, function, line_fit) -> None:
+    data = {name: ("i", column) for name, column in table.items()}
+    given = xr.Dataset(data) if kind is xr.Dataset else kind(table)
+    fit = bo.Problem(given, function, parameters=SLOPE).fit()
+    np.testing.assert_array_equal(fit.parameters["estimate"], line_fit.parameters["estimate"])
+
+
+def test_fixed_parameters_and_columns_by_name(table) -> None:
+    parameters = {**SLOPE, "offset": bo.Parameter(0.5, fixed=True)}
+    data = {"x": table["x"], "unused": table["x"], "force": table["y"]}
+    fit = bo.Problem(data, line, parameters=parameters, output="force").fit()
+    assert list(fit.parameters.index) == ["slope"]
+
+
+def test_each_question_is_one_line(line_fit: bo.Fit) -> None:
+    check_shown(line_fit.profile(), "linear low")
+    check_shown(line_fit.indifference(), "fall of the posterior")
+    check_shown(line_fit.sampling_distribution(20), "20 of 20 replications")
+    check_shown(line_fit.assess(), "runs z")
+    check_shown(line_fit.predict(), "of 60 samples")
+    assert line_fit.profile() is line_fit.profile()
+
+
+def test_prediction_is_wider_with_noise_and_outside(line_fit: bo.Fit) -> None:
+    inside, outside = line_fit.predict([1.0], noise=False), line_fit.predict({"x": [9.0]})
+    assert float(inside["sd"][0]) < float(line_fit.predict([1.0])["sd"][0])
+    assert float(line_fit.predict([1.0])["sd"][0]) < float(outside["sd"][0])
+
+
+def test_posterior(line_fit: bo.Fit) -> None:
+    posterior = line_fit.sample(seed=1)
+    check_shown(posterior, "posterior of line")
+    check_shown(posterior.compare(line_fit.sampling_distribution(20)), "sd / monte carlo")
+    assert "slope" in arviz.summary(posterior.tree, var_names=["slope"]).index
+    assert posterior.tree.attrs[schema.SEED] == 1
+
+
+def test_missing_term_is_found(line_fit: bo.Fit, tmp_path: Path) -> None:
+    found = line_fit.explain(candidates=TERMS)
+    assert found.effects == ("cubic",)
+    assert found.verdict == "effect added"
+    check_shown(found, "cubic", "added")
+    value, sd = found.parameters.loc["cubic_c", ["estimate", "sd"]]
+    assert abs(value - 0.4) < 3 * sd
+    check_shown(found.sample(), "cubic_c")
+    assert "cubic" in found.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    loaded = bo.load_result(found.save(tmp_path / "results.nc"))
+    assert repr(loaded) == repr(found)
+    assert line_fit.explain(candidates=TERMS) is found
+
+
+def test_nothing_is_added_to_a_complete_function(table) -> None:
+    def cubic(x, slope, c3):
+        return slope * x + c3 * x**3
+
+    parameters = {"slope": bo.Parameter(1.0, sd=5.0), "c3": bo.Parameter(0.0, sd=5.0)}
+    fit = bo.Problem(table, cubic, parameters=parameters).fit()
+    found = fit.explain(candidates={**TERMS, "more": lambda x, k: k * np.sin(5 * x)})
+    assert found.effects == ()
+    assert found.verdict == "no candidate is significant"
+
+
+@pytest.mark.parametrize(
+    ("data", "function", "options", "message"),
+    [
+        (None, line, {}, r"key parameters: no parameter to estimate .*bo\.Parameter"),
+        (None, line, {"parameters": {"slope": 1.0}}, r"parameters\['slope'\].*got 1\.0.*Parameter"),
+        (
+            None, line, {"parameters": {"slope": bo.Parameter(1.0, sd=1.0)}},
+            r"argument offset: is neither a column .*line.*offset",
+        ),
+        (
+            None, line, {"parameters": {**SLOPE, "c": bo.Parameter(1.0, sd=1.0)}},
+            r"key parameters: function line .*got 'c'.*x, slope, offset",
+        ),
+        (
+            None, line, {"parameters": {"slope": bo.Parameter(2.0)}},
+            r"parameters\['slope'\]: has no prior \(got 2\.0\); write bo\.Parameter\(2, sd",
+        ),
+        (None, line, {"parameters": SLOPE, "output": "z"}, r"key output: .*got 'z'.*x, y"),
+        (None, line, {"parameters": SLOPE, "drive": "x"}, r"key drive: a function has no such"),
+        ({"x": ["a"], "y": [1.0]}, line, {"parameters": SLOPE}, r"data\['x'\].*numbers"),
+        (3, line, {"parameters": SLOPE}, r"key data: .*'int'.*\{\"x\": x, \"y\": y\}"),
+    ],
+)  # fmt: skip
+def test_what_a_function_does_not_take(table, data, function, options, message) -> None:
+    with pytest.raises(bo.errors.InputError, match=message):
+        bo.Problem(table if data is None else data, function, **options)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "message"),
+    [
+        (None, r"key candidates: a function needs named terms .*lambda x, c"),
+        ({"one": lambda x, c: 1 + c * x}, r"candidates\['one'\]: does not vanish .*got 1\.0"),
+        ({"none": lambda x: x}, r"candidates\['none'\]: has no coefficient"),
+    ],
+)
+def test_what_is_no_term(line_fit: bo.Fit, candidates, message) -> None:
+    with pytest.raises(bo.errors.InputError, match=message):
+        line_fit.explain(candidates=candidates)
+
+
+def test_sampling_goes_on_in_its_folder(line_problem: bo.Problem, tmp_path: Path) -> None:
+    first = line_problem.fit().sample(seed=2, out=tmp_path)
+    assert list(tmp_path.rglob("segment-*.npz"))
+    again = pickle.loads(pickle.dumps(line_problem)).fit()
+    second = again.sample(seed=2, out=str(tmp_path))
+    assert second is not first
+    assert repr(second) == repr(first)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_column_of_any_name(table) -> None:
+    frame = pd.DataFrame({"variables": table["x"], "y": table["y"]})
+    fit = bo.Problem(frame, lambda variables, a: a * variables, parameters={"a": SLOPE["slope"]})
+    assert "samples of variables, y" in repr(fit)
