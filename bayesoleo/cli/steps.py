@@ -134,7 +134,13 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
                 f": half as long, they would move no parameter by more than"
                 f" {status['mesh_shift']:.2g} sd"
             )
-        lines.append(mesh)  # of another mesh the notes speak
+        if status["solver"] == "collocation":
+            lines.append(mesh)  # of another mesh the notes speak
+        else:
+            lines.append(
+                f"solved by {status['solver']}: motions err by {status['motion_error']:.2g} of "
+                "their swing at most, by estimate"
+            )
     return cast(list[str], lines + json.loads(status["notes"]))
 
 

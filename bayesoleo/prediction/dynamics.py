@@ -13,7 +13,7 @@ from bayesoleo.model.switching import analytic_pieces
 from bayesoleo.prediction.inputs import harmonics_of, highest_derivatives
 from bayesoleo.prediction.records import Record
 from bayesoleo.solvers.shooting.initial_value import Dynamics
-from bayesoleo.solvers.shooting.signals import Signal, periodic_signal
+from bayesoleo.solvers.shooting.signals import InputSignal, periodic_signal
 
 
 def dynamics_of(
@@ -53,7 +53,7 @@ def dynamics_of(
                 f"model {model.name!r}: an output needs a higher derivative of {dof!r} than its"
                 " equation",
                 hint="write the output in terms of what the equations contain, or use another "
-                "solver than shooting: collocation, adaptive or library",
+                "solver than shooting: collocation or adaptive",
             )
     return Dynamics(
         kernels=kernels(pieces.model, active, backend),
@@ -65,7 +65,7 @@ def dynamics_of(
     )
 
 
-def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> Signal:
+def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSignal:
     """Fourier coefficients of input rows; the time itself, which no equation has, is left zero."""
     used = {
         name: harmonics_of(record, name).for_derivative(highest)

@@ -13,7 +13,7 @@ from bayesoleo.solvers.segments.constrained import ContinuousLeastSquares
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
+class SegmentedNormalEquations:
     """Weighted least squares of one record under continuity, in states of a common scale.
 
     Parameters
@@ -37,7 +37,7 @@ class NormalEquations:
     @classmethod
     def of(
         cls, run: SegmentedRun, linear: LinearRun, weights: Array, scale: Array, slack: Array
-    ) -> NormalEquations:
+    ) -> SegmentedNormalEquations:
         """Form and factorise; ``slack (n - 1, D)`` is the variance that each gap is allowed."""
         na, n = run.segments.active, run.segments.steps
         by_parameter = linear.columns[:, :na]

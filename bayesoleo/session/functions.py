@@ -48,7 +48,7 @@ class Call:
 
     def __getstate__(self) -> bytes:
         # A lambda has no name to be found by.
-        state: bytes = cloudpickle.dumps(self.__dict__)
+        state: bytes = cloudpickle.dumps(self.__dict__)  # type: ignore[no-untyped-call]
         return state
 
     def __setstate__(self, state: bytes) -> None:

@@ -16,7 +16,7 @@ from bayesoleo.estimation.objectives.bounded import bounded_step
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.estimation.trajectories.problem import ShootingProblem
-from bayesoleo.prediction.normal_equations import NormalEquations
+from bayesoleo.prediction.normal_equations import SegmentedNormalEquations
 from bayesoleo.prediction.segmented import LinearRun
 
 #: What the prior does: it is centred anew on every iterate and thus only limits the steps; it stays
@@ -52,7 +52,7 @@ class Local:
     problem : ShootingProblem
     scale : PriorScale
     theta, variance : ndarray, shapes (l,) and (s,)
-    normal : tuple of NormalEquations
+    normal : tuple of SegmentedNormalEquations
         Of each run.
     jacobian : ndarray, shape (l, l)
         Whitened rows of the condensed least squares in scaled parameters.
@@ -64,7 +64,7 @@ class Local:
     scale: PriorScale
     theta: Array
     variance: Array
-    normal: tuple[NormalEquations, ...]
+    normal: tuple[SegmentedNormalEquations, ...]
     jacobian: Array
     prior: str
 
@@ -86,7 +86,7 @@ class Local:
         between intervals are allowed.
         """
         normal = tuple(
-            NormalEquations.of(
+            SegmentedNormalEquations.of(
                 run,
                 item,
                 1.0 / variance[problem.places(run)],

@@ -25,7 +25,7 @@ from bayesoleo._types import Array
 from bayesoleo.solvers.adaptive.crossings import Crossings
 from bayesoleo.solvers.adaptive.error_estimate import ErrorEstimate, estimate_error
 from bayesoleo.solvers.adaptive.moving_edges import solve_on
-from bayesoleo.solvers.adaptive.remesh import Misfit, remesh
+from bayesoleo.solvers.adaptive.remesh import MeshError, remesh
 from bayesoleo.solvers.adaptive.switched import (
     Level,
     Motion,
@@ -260,7 +260,7 @@ def _finish(end: _End, problem: PeriodicProblem, p: Array) -> AdaptiveSolution:
     return AdaptiveSolution(orbit, problem, level, p, end.next_mesh)
 
 
-def compare(coarse: Level, fine: Level) -> Misfit:
+def compare(coarse: Level, fine: Level) -> MeshError:
     """What a solution gains by halving its steps.
 
     States are compared at the same part of the same step, over their largest sizes, and the edges
@@ -280,4 +280,4 @@ def compare(coarse: Level, fine: Level) -> Misfit:
     late = 0.0
     if coarse.kinks is not None and fine.kinks is not None and fine.kinks.phases.size:
         late = float(np.abs(fine.kinks.phases - coarse.kinks.phases).max())
-    return Misfit(own, max(float(np.abs(change).max()), late))
+    return MeshError(own, max(float(np.abs(change).max()), late))

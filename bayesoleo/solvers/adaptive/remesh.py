@@ -23,7 +23,7 @@ LEAST_STEPS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Misfit:
+class MeshError:
     """Errors over the states' sizes.
 
     Parameters
@@ -40,7 +40,7 @@ class Misfit:
 
 def remesh(
     mesh: Mesh,
-    misfit: Misfit,
+    misfit: MeshError,
     tolerance: float,
     before: Crossings | None,
     after: Crossings | None,
@@ -53,7 +53,7 @@ def remesh(
     ----------
     mesh : Mesh
         The present one, with ``n`` steps.
-    misfit : Misfit
+    misfit : MeshError
         Its errors.
     tolerance : float
         Largest error wanted.
@@ -87,7 +87,7 @@ def remesh(
     return Mesh(np.unique(np.append(np.concatenate(pieces), 1.0))), most <= max_steps
 
 
-def _wanted_lengths(mesh: Mesh, misfit: Misfit, tolerance: float, order: int) -> Array:
+def _wanted_lengths(mesh: Mesh, misfit: MeshError, tolerance: float, order: int) -> Array:
     """Length of a step around each present one, in cycles, shape (n,)."""
     lengths = np.diff(mesh.edges)
     # What the closure makes of a step's error is measured: it multiplies all of them alike.

@@ -52,7 +52,7 @@ def solve_stiffening(
         ``orbit.evaluations`` counts all that was spent on the way. Where the walk ends before the
         full stiffness, the direct solution and its status.
     """
-    way = _Way(problem, p, index, method, max_steps)
+    way = _Continuation(problem, p, index, method, max_steps)
     direct = way.solve(p[index], start, tolerance)
     if direct.orbit.status is Status.CONVERGED or not p[index] > 0.0:
         return direct
@@ -77,7 +77,7 @@ def _spent(solution: AdaptiveSolution, evaluations: int) -> AdaptiveSolution:
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _Continuation:
     """Solutions at any value of the stiffness."""
 
     problem: PeriodicProblem

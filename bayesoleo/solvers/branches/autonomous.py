@@ -18,8 +18,8 @@ import numpy as np
 from bayesoleo._types import Array, Float
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
-    Condition,
     Family,
+    PhaseCondition,
     end_states,
     solve_bordered,
 )
@@ -97,7 +97,7 @@ def solve_limit_cycle(problem: Boundary, p: Array, x: Array, period: float) -> L
     rows = method.sample(x[None, :, :, None], plan, period / len(x))[0, :, 0, 0]
     first = np.cumsum([0, *(order + 1 for order in method.orders)])
     moving = rows[[first[j] + k + 1 for j, o in enumerate(method.orders) for k in range(o)]]
-    condition = Condition(np.append(moving, 0.0), float(moving @ x[0, :D]))
+    condition = PhaseCondition(np.append(moving, 0.0), float(moving @ x[0, :D]))
     solution = solve_bordered(family, x, period, condition)
     orbit = Orbit(
         phases=np.arange(len(x)) / len(x),
@@ -143,7 +143,7 @@ def with_error(cycle: LimitCycle, problem: Boundary, finer: LimitCycle) -> Limit
     return replace(cycle, orbit=orbit)
 
 
-def _period_theta(family: Family, solution: BorderedSolution, condition: Condition) -> Array:
+def _period_theta(family: Family, solution: BorderedSolution, condition: PhaseCondition) -> Array:
     problem, p = family(solution.value)
     if not solution.status.ok:
         return np.full(problem.active, np.nan)

@@ -31,7 +31,7 @@ _LANE = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class BorderedSweep:
     """A period linearised with its first state held.
 
     Parameters
@@ -49,7 +49,7 @@ class Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Condition:
+class PhaseCondition:
     """The additional equation ``row @ (state, value) = target``, linear in the first state.
 
     Parameters
@@ -86,7 +86,7 @@ class BorderedSolution:
     iterations: int
 
 
-def sweep(family: Family, x: Array, value: float) -> tuple[Sweep | None, Status]:
+def sweep(family: Family, x: Array, value: float) -> tuple[BorderedSweep | None, Status]:
     """Linearise a period about unknowns ``x (n, w)``; None with the reason where it cannot be."""
     problem, p = family(value)
     method = _one_step(problem)
@@ -108,7 +108,7 @@ def sweep(family: Family, x: Array, value: float) -> tuple[Sweep | None, Status]
         return None, Status.SINGULAR
     moved = x + dx[0, :, :, 0]
     end = end_states(problem, moved[..., None])[:, 0]
-    return Sweep(moved, end - moved[0, :D], monodromy[0]), Status.CONVERGED
+    return BorderedSweep(moved, end - moved[0, :D], monodromy[0]), Status.CONVERGED
 
 
 def end_states(problem: Boundary, columns: Array) -> Array:
@@ -121,7 +121,7 @@ def end_states(problem: Boundary, columns: Array) -> Array:
 
 
 def solve_bordered(
-    family: Family, x: Array, value: float, condition: Condition, *, max_iterations: int = 25
+    family: Family, x: Array, value: float, condition: PhaseCondition, *, max_iterations: int = 25
 ) -> BorderedSolution:
     """Newton's method for a closed motion that fulfils one more condition.
 
@@ -133,7 +133,7 @@ def solve_bordered(
         Where the unknowns of the period start.
     value : float
         Where the other unknown starts.
-    condition : Condition
+    condition : PhaseCondition
     max_iterations : int
 
     Returns

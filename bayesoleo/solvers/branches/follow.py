@@ -22,8 +22,8 @@ from scipy.optimize import brentq
 from bayesoleo._types import Array, Complex, ComplexArray, Float
 from bayesoleo.solvers.branches.bordered import (
     BorderedSolution,
-    Condition,
     Family,
+    PhaseCondition,
     solve_bordered,
 )
 from bayesoleo.solvers.orbit import floquet_multipliers
@@ -158,7 +158,7 @@ def follow(
     Branch
     """
     D = family(value)[0].scheme.state_size
-    held = Condition(np.append(np.zeros(D), 1.0), value)
+    held = PhaseCondition(np.append(np.zeros(D), 1.0), value)
     first = solve_bordered(family, x, value, held)
     if not first.status.ok:
         return Branch((), (), first.status)
@@ -223,7 +223,7 @@ class _Walk:
         x = point.x.copy()
         x[0, :D] = ahead[:D]
         target = float(row @ at) + length
-        found = solve_bordered(self.family, x, float(ahead[D]), Condition(row, target))
+        found = solve_bordered(self.family, x, float(ahead[D]), PhaseCondition(row, target))
         if not found.status.ok:
             return None
         after = _point(found, self.units, point.tangent)

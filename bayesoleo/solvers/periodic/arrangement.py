@@ -49,7 +49,7 @@ class Sizes(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class SweepLayout:
     """Where the steps of a period stand while they are swept.
 
     Parameters
@@ -67,7 +67,7 @@ class Layout:
     lengths: NDArray[np.int64]
 
     @staticmethod
-    def of(n: int, front: int, block: int) -> Layout:
+    def of(n: int, front: int, block: int) -> SweepLayout:
         """Of a period of ``n`` steps in blocks of ``block``, with ``front`` rows before it."""
         lengths = chunks(n)
         first = np.concatenate(([0], np.cumsum(lengths)[:-1]))
@@ -79,10 +79,10 @@ class Layout:
         for c in range(WIDTH):
             own = np.arange(lengths[c])
             place[first[c] + own] = (front + own) * WIDTH + c
-        return Layout(place, source.ravel(), lengths)
+        return SweepLayout(place, source.ravel(), lengths)
 
 
-class Pieces(NamedTuple):
+class SweepKernels(NamedTuple):
     """Addresses of the compiled functions of a model and of a scheme."""
 
     residual: int
@@ -199,7 +199,7 @@ class Options(NamedTuple):
     initial: bool
 
 
-class Line(NamedTuple):
+class LinearStart(NamedTuple):
     """Where lanes start: ``base (w, positions)`` and ``change (L, na)`` times ``slopes (na, w,
     positions)``; empty where ``x`` says it."""
 
@@ -208,7 +208,7 @@ class Line(NamedTuple):
     change: Float[Array, "vectors active"]
 
 
-NO_LINE = Line(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+NO_LINE = LinearStart(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -219,21 +219,21 @@ class Arranged:
     ----------
     program : Program
         The scheme's compiled pieces.
-    layout : Layout
+    layout : SweepLayout
         Order of the steps.
     inputs, lengths : ndarray, shapes (b, nu, BLOCK) and (b, BLOCK)
         Of each block.
     """
 
     program: Program
-    layout: Layout
+    layout: SweepLayout
     inputs: Array
     lengths: Array
 
     @staticmethod
     def of(program: Program, inputs: Array, lengths: Array) -> Arranged:
         """From inputs ``(nu, n s)`` at the points and lengths ``(n,)`` of the steps, s."""
-        layout = Layout.of(lengths.size, program.front, program.steps)
+        layout = SweepLayout.of(lengths.size, program.front, program.steps)
         steps, s, nu = program.steps, program.stages, inputs.shape[0]
         count = -(-int(layout.lengths[0]) * WIDTH // steps)
         blocks = np.zeros((count, max(nu, 1), BLOCK))

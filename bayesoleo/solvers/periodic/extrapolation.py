@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.solvers.periodic.arrangement import Layout
+from bayesoleo.solvers.periodic.arrangement import SweepLayout
 from bayesoleo.solvers.schemes.elimination import jit
 
 
@@ -38,7 +38,7 @@ class Extrapolation:
         _extrapolate(self.x.ravel(), slopes, change, start.reshape(change.shape[0], -1))
         return start
 
-    def swept(self, layout: Layout) -> tuple[Array, Array]:
+    def swept(self, layout: SweepLayout) -> tuple[Array, Array]:
         """The same in the order of a sweep: ``(w, positions)`` and ``(na, w, positions)``."""
         known = self._swept.get("last")
         if known is None or known[0] is not layout:
@@ -48,7 +48,7 @@ class Extrapolation:
         return known[1:]
 
     @cached_property
-    def _swept(self) -> dict[str, tuple[Layout, Array, Array]]:
+    def _swept(self) -> dict[str, tuple[SweepLayout, Array, Array]]:
         return {}
 
 

@@ -164,7 +164,9 @@ def solve_extrapolated(
     if arranged is None:
         return solve_periodic(problem, p, extrapolation.starts(change), overwrite=True)
     x = np.empty((p.shape[0], *extrapolation.x.shape))
-    line = arrangement.Line(*extrapolation.swept(arranged.layout), np.ascontiguousarray(change))
+    line = arrangement.LinearStart(
+        *extrapolation.swept(arranged.layout), np.ascontiguousarray(change)
+    )
     solution = _compiled(problem, arranged, p, x, 40, True, line)
     return _with_exchange(
         problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), 40, True
@@ -195,14 +197,14 @@ def _compiled(
     x: Array,
     max_iterations: int,
     monotone: bool,
-    line: arrangement.Line = arrangement.NO_LINE,
+    line: arrangement.LinearStart = arrangement.NO_LINE,
 ) -> Solution:
     """The same iteration, lane by lane, in one compiled call, in place."""
     equations, program = problem.equations, arranged.program
     status = np.empty(x.shape[0], dtype=np.int64)
     iterations = np.zeros(x.shape[0], dtype=np.int64)
     sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
-    pieces = arrangement.Pieces(
+    pieces = arrangement.SweepKernels(
         equations.residual.address, equations.jacobian.address, equations.admissible.address,
         program.rows, program.eliminate, program.chain, program.substitute, program.follow,
         program.product, program.begin, program.update,

@@ -38,7 +38,7 @@ INTEGRATION_STEP = 1e-8
 _LANE = np.zeros(1, dtype=np.int64)
 
 
-class Equations(Protocol):
+class SegmentEquations(Protocol):
     """What is needed of implicit equations (see ``bayesoleo.model.kernels.Kernels``)."""
 
     @property
@@ -77,7 +77,7 @@ class Segments:
 
     Parameters
     ----------
-    equations : Equations
+    equations : SegmentEquations
         Residuals and partial derivatives.
     scheme : Collocation
         On an equidistant mesh.
@@ -93,7 +93,7 @@ class Segments:
         Number of parameters with derivatives.
     """
 
-    equations: Equations
+    equations: SegmentEquations
     scheme: Collocation
     duration: float
     steps: int

@@ -19,7 +19,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.solvers.shooting import march as loop
 from bayesoleo.solvers.shooting.march_step import DEGENERATE, FINISHED, LOST, NOT_A_NUMBER, OUTSIDE
 from bayesoleo.solvers.shooting.radau_step import radau_method, workspace
-from bayesoleo.solvers.shooting.signals import Signal
+from bayesoleo.solvers.shooting.signals import InputSignal
 from bayesoleo.solvers.status import Status
 
 #: Room for steps at first; more is made where it does not do.
@@ -60,7 +60,7 @@ class Dynamics:
         Their last constants are the modes of the switching functions.
     orders : tuple of int
         Order (1 or 2) of each dof.
-    signal : Signal
+    signal : InputSignal
         Inputs and their derivatives in time.
     active : int
         Number of parameters with derivatives.
@@ -72,7 +72,7 @@ class Dynamics:
 
     kernels: PiecewiseKernels
     orders: tuple[int, ...]
-    signal: Signal
+    signal: InputSignal
     active: int
     conditions: int = 0
     switches: int = 0
@@ -90,7 +90,7 @@ class Dynamics:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class DenseTrajectory:
     """A motion of one parameter vector in steps, with derivatives if asked for.
 
     Parameters
@@ -195,7 +195,7 @@ def solve_initial_value(
     scale: Array | None = None,
     first_step: float | None = None,
     exact: bool = True,
-) -> Trajectory:
+) -> DenseTrajectory:
     """Integrate one parameter vector from a start.
 
     Parameters
@@ -232,7 +232,7 @@ def solve_initial_value(
 
     Returns
     -------
-    Trajectory
+    DenseTrajectory
 
     Raises
     ------
@@ -253,7 +253,7 @@ def solve_initial_value(
     capacity = CAPACITY if adaptive else times.size + 64
     while True:
         flags = np.zeros(times.size - 1, dtype=np.bool_) if cut is None else cut
-        task = loop.Task(
+        task = loop.MarchTask(
             np.array(times, dtype=float), flags, adaptive, tolerance,
             1e-13 if exact else 1e-2 * tolerance, first, span, capacity, dense,
         )  # fmt: skip
@@ -266,7 +266,7 @@ def solve_initial_value(
             break
         capacity *= 4
     few = n if dense else 0
-    return Trajectory(
+    return DenseTrajectory(
         path.times[: n + 1].copy(), path.states[: n + 1].copy(), path.tops[:n].copy(),
         path.switched[:n].copy(), path.aims[:n].copy(), kept, path.by[: few + 1].copy(),
         path.tops_by[:few].copy(), size,
@@ -287,7 +287,7 @@ def _first_sizes(dynamics: Dynamics, start: Array, step: float, sizes: Array) ->
 
 
 def _run(
-    dynamics: Dynamics, p: Array, start: Array, task: loop.Task, columns: Array, scale: Array,
+    dynamics: Dynamics, p: Array, start: Array, task: loop.MarchTask, columns: Array, scale: Array,
     stages: int, by_parameter: bool,
 ) -> tuple[loop.Path, int, int, int]:  # fmt: skip
     constants = np.concatenate([p, np.ones(dynamics.switches + 1)])

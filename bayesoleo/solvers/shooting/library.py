@@ -17,6 +17,7 @@ from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.solvers.orbit import Orbit
 from bayesoleo.solvers.status import Status
+from bayesoleo.solvers.transient.integrate import TooLongError
 from bayesoleo.solvers.transient.state_space import StateSpace
 
 INTEGRATORS = ("LSODA", "Radau", "BDF", "DOP853")
@@ -124,10 +125,6 @@ def shoot_by_library(
     return _Library(space, p, period, integrator, tolerance, fewest_steps).run(start)
 
 
-class _TooLongError(Exception):
-    """The integrator asks for too many evaluations."""
-
-
 class _Library:
     """One search; evaluations are counted from pass to pass."""
 
@@ -174,7 +171,7 @@ class _Library:
             nonlocal left
             left -= 1
             if left < 0:
-                raise _TooLongError
+                raise TooLongError
             return np.asarray(rates(t, s))
 
         try:
@@ -184,7 +181,7 @@ class _Library:
                     atol=atol, max_step=self.period / self.fewest, dense_output=True,
                 )  # fmt: skip
         # SciPy raises where a Jacobian or a first step is not a number.
-        except (_TooLongError, ValueError, np.linalg.LinAlgError):
+        except (TooLongError, ValueError, np.linalg.LinAlgError):
             return None
         finally:
             self.evaluations += MOST_EVALUATIONS - left

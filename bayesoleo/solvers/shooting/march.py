@@ -30,14 +30,14 @@ from bayesoleo.solvers.shooting.march_step import (
 )
 from bayesoleo.solvers.shooting.march_switch import exchange, find_switch
 from bayesoleo.solvers.shooting.radau_step import Method, Workspace, copy_to
-from bayesoleo.solvers.shooting.signals import Signal
+from bayesoleo.solvers.shooting.signals import InputSignal
 
 #: More ways for a march to end than a step's. ``COARSE``: given steps miss the tolerance; ``FULL``:
 #: out of memory given.
 CHATTERS, COARSE, FULL = 5, 6, 7
 
 
-class Task(NamedTuple):
+class MarchTask(NamedTuple):
     """What one march does.
 
     Parameters
@@ -115,7 +115,7 @@ class System(NamedTuple):
         Of the dofs.
     method : Method
         Radau IIA.
-    signal : Signal
+    signal : InputSignal
         Inputs.
     p : ndarray, shape (np + ns,)
         Constants, then modes, which a march exchanges.
@@ -130,7 +130,7 @@ class System(NamedTuple):
     kernels: Addresses
     orders: NDArray[np.int64]
     method: Method
-    signal: Signal
+    signal: InputSignal
     p: Array
     modes: NDArray[np.int64]
     active: int
@@ -138,7 +138,7 @@ class System(NamedTuple):
 
 
 def march(
-    task: Task, start: Array, columns: Array, scale: Array, system: System, work: Workspace
+    task: MarchTask, start: Array, columns: Array, scale: Array, system: System, work: Workspace
 ) -> tuple[Path, int, int, int]:
     """Integrate one lane from ``start (D,)`` through ``task.nodes``.
 
@@ -153,7 +153,7 @@ def march(
     return path, *run(task, system, front, path, work)
 
 
-def _room(task: Task, front: Front) -> Path:
+def _room(task: MarchTask, front: Front) -> Path:
     n, kept = task.capacity, task.capacity if task.dense else 0
     s, d = front.stages.shape
     D, columns = front.columns.shape

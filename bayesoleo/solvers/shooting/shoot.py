@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Float
 from bayesoleo.solvers.orbit import Orbit
-from bayesoleo.solvers.shooting.initial_value import Dynamics, Trajectory, solve_initial_value
+from bayesoleo.solvers.shooting.initial_value import DenseTrajectory, Dynamics, solve_initial_value
 from bayesoleo.solvers.status import Status
 
 #: Tolerance of the first pass.
@@ -43,7 +43,7 @@ class Shot:
 
     Parameters
     ----------
-    trajectory : Trajectory
+    trajectory : DenseTrajectory
         One period from phase zero.
     status : Status
         How the iteration ended.
@@ -55,7 +55,7 @@ class Shot:
         Newton steps, how often one was halved, and points at which equations were evaluated.
     """
 
-    trajectory: Trajectory
+    trajectory: DenseTrajectory
     status: Status
     monodromy: Float[Array, "states states"]
     start_theta: Float[Array, "states active"]
@@ -244,7 +244,7 @@ class _Shooter:
             path = following
         return self.failed(path, Status.NO_CONVERGENCE if path.status.ok else path.status)
 
-    def adaptive(self, start: Array, tolerance: float) -> Trajectory:
+    def adaptive(self, start: Array, tolerance: float) -> DenseTrajectory:
         """One period in steps of its own, with the derivative of the time map."""
         return self.passed(
             solve_initial_value(
@@ -254,16 +254,16 @@ class _Shooter:
             )
         )  # fmt: skip
 
-    def passed(self, path: Trajectory) -> Trajectory:
+    def passed(self, path: DenseTrajectory) -> DenseTrajectory:
         self.evaluations += path.evaluations
         self.scale = path.scale if path.status.ok else self.scale
         return path
 
-    def residual(self, path: Trajectory) -> float:
+    def residual(self, path: DenseTrajectory) -> float:
         """How far the end is from the start, over the sizes of the states."""
         return float(np.max(np.abs(path.states[-1] - path.states[0]) / path.scale))
 
-    def correction(self, path: Trajectory) -> tuple[Array | None, float]:
+    def correction(self, path: DenseTrajectory) -> tuple[Array | None, float]:
         """Newton's step of the start, or ``None`` if the closure is singular, and its size."""
         closure = np.eye(path.scale.size) - path.derivatives[:, : path.scale.size]
         scaled = closure * path.scale / path.scale[:, None]
@@ -274,8 +274,8 @@ class _Shooter:
         return step * path.scale, float(np.max(np.abs(step)))
 
     def advance(
-        self, path: Trajectory, step: Array, ceiling: float, tolerance: float
-    ) -> Trajectory | None:
+        self, path: DenseTrajectory, step: Array, ceiling: float, tolerance: float
+    ) -> DenseTrajectory | None:
         """Take a Newton step, halved until the motion exists and its residual is low enough."""
         self.iterations += 1
         for _ in range(MAXIMUM_HALVINGS):
@@ -286,7 +286,7 @@ class _Shooter:
             self.halvings += 1
         return None
 
-    def finish(self, start: Array, near: Trajectory) -> Shot | None:
+    def finish(self, start: Array, near: DenseTrajectory) -> Shot | None:
         """Converge to round-off on the steps of a motion nearby; ``None`` if they do not do."""
         D, count = start.size, self.dynamics.active if self.sensitivities else 0
         self.scale = near.scale
@@ -311,7 +311,7 @@ class _Shooter:
             start, before = start + step, size
         return None
 
-    def shot(self, path: Trajectory) -> Shot:
+    def shot(self, path: DenseTrajectory) -> Shot:
         D = path.scale.size
         monodromy, by_parameter = path.derivatives[:, :D], path.derivatives[:, D:]
         start_theta = np.linalg.solve(np.eye(D) - monodromy, by_parameter)
@@ -320,7 +320,7 @@ class _Shooter:
             self.evaluations,
         )  # fmt: skip
 
-    def failed(self, path: Trajectory, status: Status) -> Shot:
+    def failed(self, path: DenseTrajectory, status: Status) -> Shot:
         D = path.states.shape[1]
         nothing = np.full((D, D), np.nan)
         return Shot(
@@ -329,7 +329,7 @@ class _Shooter:
         )  # fmt: skip
 
 
-def _moved(path: Trajectory, step: Array) -> Trajectory:
+def _moved(path: DenseTrajectory, step: Array) -> DenseTrajectory:
     """A trajectory from a start moved by a small step: what is left out is the step squared."""
     D = step.size
     tops = path.tops + (path.tops_by[:, :, :D] @ step).reshape(path.tops.shape)

@@ -10,7 +10,7 @@ from bayesoleo._types import Array
 from bayesoleo.solvers.schemes.elimination import jit
 
 
-class Signal(NamedTuple):
+class InputSignal(NamedTuple):
     """Rows of inputs, each with its derivatives as rows of their own.
 
     ``u(t) = sum_k cosine[:, k] cos(k w t) + sine[:, k] sin(k w t)`` plus, between ``knots[m]`` and
@@ -36,10 +36,10 @@ class Signal(NamedTuple):
     pieces: Array
 
 
-def periodic_signal(frequency: float, cosine: Array, sine: Array) -> Signal:
+def periodic_signal(frequency: float, cosine: Array, sine: Array) -> InputSignal:
     """A signal of harmonics only; ``cosine`` and ``sine`` are ``(nu, K)``."""
     count = cosine.shape[0]
-    return Signal(
+    return InputSignal(
         2 * np.pi * frequency,
         np.array(cosine, dtype=float, order="C"),
         np.array(sine, dtype=float, order="C"),
@@ -48,10 +48,10 @@ def periodic_signal(frequency: float, cosine: Array, sine: Array) -> Signal:
     )
 
 
-def piecewise_signal(knots: Array, pieces: Array) -> Signal:
+def piecewise_signal(knots: Array, pieces: Array) -> InputSignal:
     """A signal of cubics between knots only; ``pieces`` is ``(M, nu, 4)``."""
     none = np.zeros((pieces.shape[1], 0))
-    return Signal(
+    return InputSignal(
         0.0,
         none,
         none.copy(),
@@ -60,7 +60,7 @@ def piecewise_signal(knots: Array, pieces: Array) -> Signal:
     )
 
 
-def evaluate(signal: Signal, times: Array) -> Array:
+def evaluate(signal: InputSignal, times: Array) -> Array:
     """Rows at times ``(N,)`` in s, shape (nu, N)."""
     u = np.empty((signal.cosine.shape[0], times.size))
     rows_at(signal, 0.0, 1.0, np.ascontiguousarray(times, dtype=float), u)

@@ -56,7 +56,7 @@ class Integration:
     states: Callable[[Array], Array] | None = None
 
 
-class _TooLongError(Exception):
+class TooLongError(Exception):
     """The integrator asks for too many evaluations."""
 
 
@@ -110,7 +110,7 @@ def _radau(
         nonlocal left
         left -= 1
         if left < 0:
-            raise _TooLongError
+            raise TooLongError
         return rates(t, s)
 
     longest = duration / FEWEST_STEPS
@@ -121,7 +121,7 @@ def _radau(
                 jac=space.state_jacobian(p), dense_output=True,
             )  # fmt: skip
     except (
-        _TooLongError,
+        TooLongError,
         ValueError,
         np.linalg.LinAlgError,
     ):  # SciPy raises where a Jacobian is NaN

@@ -46,7 +46,7 @@ class Rates(NamedTuple):
     ok: Flags
 
 
-class Linearised(NamedTuple):
+class LinearisedRates(NamedTuple):
     """Time derivatives of states, with theirs: ``rates (L, D, N)``, ``by_state (L, D, D, N)``,
     ``by_parameter (L, D, na, N)`` and ``ok (L, N)``, false where they are not finite or singular.
     """
@@ -148,7 +148,7 @@ class StateSpace:
         z, _, ok = self.complete(t, s, p)
         return Rates(np.where(ok[:, None], z[:, self.state_rows() + 1], np.nan), ok)
 
-    def linearise(self, t: Array, s: Array, p: Array) -> Linearised:
+    def linearise(self, t: Array, s: Array, p: Array) -> LinearisedRates:
         """Time derivatives of states with their derivatives by states and active parameters.
 
         Takes the arguments of :meth:`complete`.
@@ -176,7 +176,7 @@ class StateSpace:
         ok = ok & np.isfinite(derivatives).all(axis=(1, 2))
         rates = np.where(ok[:, None], z[:, rows + 1], np.nan)
         derivatives = np.where(ok[:, None, None], derivatives, np.nan)
-        return Linearised(rates, derivatives[:, :, :D], derivatives[:, :, D:], ok)
+        return LinearisedRates(rates, derivatives[:, :, :D], derivatives[:, :, D:], ok)
 
     def admissible(self, t: Array, s: Array, p: Array) -> Flags:
         """Whether states lie in the admissible region, shape (L, N).
