@@ -9,13 +9,13 @@ from bayesoleo.assessment.assess import (
 )
 from bayesoleo.assessment.residual_tests import (
     autocorrelation,
+    autocorrelation_time,
     dependence,
+    intraclass_correlation,
     lack_of_fit,
-    memory,
     normality,
     outliers,
     runs_of_signs,
-    same_phase,
 )
 from bayesoleo.assessment.scores import Score, score_draws, score_normal
 from bayesoleo.assessment.series import Series, series_of_problem, series_of_tree
@@ -27,16 +27,16 @@ __all__ = [
     "assess",
     "assessment_text",
     "autocorrelation",
+    "autocorrelation_time",
     "correlograms",
     "dependence",
     "dependence_on",
+    "intraclass_correlation",
     "lack_of_fit",
-    "memory",
     "normality",
     "outliers",
     "outliers_of",
     "runs_of_signs",
-    "same_phase",
     "score_draws",
     "score_normal",
     "series_of_problem",

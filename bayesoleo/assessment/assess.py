@@ -41,8 +41,8 @@ _NUMBERS = {
     "kurtosis": "excess kurtosis",
     "normality": "test of normality, chi-square with two degrees of freedom",
     "normality_p": "its probability",
-    "memory": "samples that hold the information of one, of what does not repeat",
-    "same_phase": "correlation of the same phase in different periods",
+    "autocorrelation_time": "samples that hold the information of one, of what does not repeat",
+    "intraclass_correlation": "correlation of the same phase in different periods",
     "lack_of_fit": "mean square that repeats over that of its noise",
     "lack_of_fit_p": "its probability",
     "ratio_to_noise": "root of the lack of fit",
@@ -74,8 +74,9 @@ def assess(
     -------
     Shown
         The group ``assessment``. By ``(output, run)``: ``rms``, ``mean``; ``runs_z``, the test on
-        runs of signs; ``skewness``, ``kurtosis``, ``normality``; ``memory``, ``same_phase``;
-        ``lack_of_fit`` (pure error between periods), ``ratio_to_noise``; ``outliers``, each with
+        runs of signs; ``skewness``, ``kurtosis``, ``normality``; ``autocorrelation_time``,
+        ``intraclass_correlation``; ``lack_of_fit`` (pure error between periods),
+        ``ratio_to_noise``; ``outliers``, each with
         its probability ``_p`` where it has one. Of a result of ``close`` or ``trace`` also
         ``ratio_to_expected``, and ``lack_of_fit_p`` is then its probability. ``share`` and
         ``share_p`` ``(output, run, variable)``: the part of the residual's variance that a variable
@@ -117,21 +118,27 @@ def _numbers(series: Series) -> dict[str, float]:
         "kurtosis": kurtosis,
         "normality": normal.statistic,
         "normality_p": normal.p_value,
-        "memory": tests.memory(noise),
+        "autocorrelation_time": tests.autocorrelation_time(noise),
         "outliers": float(places.size),
         "outlier_limit": limit,
     }
     missing = dict.fromkeys(
-        ("same_phase", "lack_of_fit", "lack_of_fit_p", "ratio_to_noise", "ratio_to_expected"),
+        (
+            "intraclass_correlation",
+            "lack_of_fit",
+            "lack_of_fit_p",
+            "ratio_to_noise",
+            "ratio_to_expected",
+        ),
         np.nan,
     )
     missing |= _judged(series)
     if average is None:
         return found | missing
     size = average.repeating, average.sigma, average.samples, average.number
-    fit = tests.lack_of_fit(*size, series.input_noise, tests.memory(noise, 2))
+    fit = tests.lack_of_fit(*size, series.input_noise, tests.autocorrelation_time(noise, 2))
     own = {
-        "same_phase": tests.same_phase(*size),
+        "intraclass_correlation": tests.intraclass_correlation(*size),
         "lack_of_fit": fit.statistic,
         "lack_of_fit_p": fit.p_value,
         "ratio_to_noise": float(np.sqrt(fit.statistic)),
@@ -236,7 +243,7 @@ def dependence_on(series: Series, name: str) -> tests.Dependence:
         Where nothing repeats, noise and the model's error cannot be told apart; noise is then
         taken as white.
     """
-    effective = tests.memory(series.noise()) if series.periodic else 1.0
+    effective = tests.autocorrelation_time(series.noise()) if series.periodic else 1.0
     # Bins of time shorter than a period would show the dependence on phase.
     whole = name == schema.TIME and series.periodic
     bins = max(2, series.residual.size // series.period) if whole else tests.BINS
@@ -297,7 +304,7 @@ def correlograms(series: Series) -> tuple[Array, Array]:
 
 def assessment_text(data: xr.Dataset) -> str:
     """One line a series; a star marks what chance alone hardly gives."""
-    head = ["output", "run", "rms", "unit", "runs z", "skew", "kurt.", "memory", "same phase"]
+    head = ["output", "run", "rms", "unit", "runs z", "skew", "kurt.", "corr. time", "intraclass"]
     head += ["over noise", "over expected", "outliers", "depends on"]
     rows = []
     for output in data[schema.OUTPUT].values:
@@ -330,6 +337,7 @@ def _cells(one: xr.Dataset, series: int) -> list[str]:
     if sure.size:
         k = int(sure[np.argmax(share[sure])])
         best = f"{one['variable'].values[k]} ({100 * share[k]:.2g} %)"
+    intraclass = number["intraclass_correlation"]
     ratio, expected = number["ratio_to_noise"], number["ratio_to_expected"]
     return [
         f"{number['rms']:.3g}",
@@ -337,8 +345,8 @@ def _cells(one: xr.Dataset, series: int) -> list[str]:
         marked(f"{number['runs_z']:.1f}", number["runs_p"]),
         f"{number['skewness']:.2f}",
         marked(f"{number['kurtosis']:.2f}", number["normality_p"]),
-        f"{number['memory']:.1f}",
-        f"{number['same_phase']:.2f}" if np.isfinite(number["same_phase"]) else "–",
+        f"{number['autocorrelation_time']:.1f}",
+        f"{intraclass:.2f}" if np.isfinite(intraclass) else "–",
         marked(f"{ratio:.2f}", number["lack_of_fit_p"]) if np.isfinite(ratio) else "–",
         f"{expected:.2f}" if np.isfinite(expected) else "–",
         f"{number['outliers']:.0f}",

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo._types import Array
-from bayesoleo.assessment.residual_tests import memory
+from bayesoleo.assessment.residual_tests import autocorrelation_time
 from bayesoleo.assessment.series import Series
 
 #: What is found, in words.
@@ -58,11 +58,11 @@ def between_means(chosen: Sequence[Series]) -> dict[str, float]:
 def _runs_differ(chosen: Sequence[Series], means: Array) -> float:
     """Probability of means so far apart, each with an error of its own.
 
-    Errors follow from the memory of the noise, which a short record knows badly. Periods are
-    replicates, so that the scatter of their means corrects all errors by a common factor.
+    Errors follow from the autocorrelation time of the noise, which a short record knows badly.
+    Periods are replicates; the scatter of their means corrects all errors by a common factor.
     """
     noise = [one.noise() for one in chosen]
-    effective = np.array([e.size / memory(e) for e in noise])
+    effective = np.array([e.size / autocorrelation_time(e) for e in noise])
     weight = effective / np.maximum([float(np.var(e)) for e in noise], _TINY)
     centre = float(np.sum(weight * means) / weight.sum())
     chi_square = float(np.sum(weight * (means - centre) ** 2))

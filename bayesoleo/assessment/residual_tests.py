@@ -2,8 +2,8 @@
 chance.
 
 Samples follow each other faster than the model's error or the noise changes, so that thousands of
-them may hold the information of dozens. Where a test's distribution depends on it, the memory of
-the residual is measured and taken into account.
+them may hold the information of dozens. Where a test's distribution depends on it, the
+autocorrelation time of the residual is measured and taken into account.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def autocorrelation(values: Array, lags: int) -> Array:
     return cast(Array, sums / overlap / max(sums[0] / values.size, np.finfo(float).tiny))
 
 
-def memory(values: Array, power: int = 1) -> float:
+def autocorrelation_time(values: Array, power: int = 1) -> float:
     """Samples that hold the information of one: the integrated autocorrelation time, at least one.
 
     Summed over a window of five times itself (Sokal 1997).
@@ -130,7 +130,7 @@ def normality(residual: Array) -> tuple[float, float, Outcome]:
     return skewness, kurtosis, Outcome(statistic, float(stats.chi2.sf(statistic, 2)))
 
 
-def same_phase(repeating: float, sigma: float, samples: int, number: int) -> float:
+def intraclass_correlation(repeating: float, sigma: float, samples: int, number: int) -> float:
     """Correlation of residuals of the same phase in different periods.
 
     The intraclass correlation: the part of the variance that repeats. Where a model's error repeats
@@ -161,12 +161,13 @@ def lack_of_fit(
     Parameters
     ----------
     repeating, sigma, samples, number
-        As in :func:`same_phase`.
+        As in :func:`intraclass_correlation`.
     input_noise : float, optional
         Noise of the inputs in the average; it repeats, and is not the model's.
     effective : float, optional
-        Samples of the noise that tell of its variance what one does, ``memory(noise, 2)``: of
-        coloured noise some harmonics hold most, so that fewer count.
+        Samples of the noise that tell of its variance what one does,
+        ``autocorrelation_time(noise, 2)``: of coloured noise some
+        harmonics hold most, so that fewer count.
 
     Returns
     -------
@@ -224,7 +225,7 @@ class Dependence:
     share : float
         Part of the residual's variance that the variable explains, beyond what chance does.
     outcome : Outcome
-        F-test of the bins, samples counted by their memory.
+        F-test of the bins, samples counted by their autocorrelation time.
     """
 
     centres: Float[Array, " bins"]
@@ -241,7 +242,7 @@ def dependence(residual: Array, variable: Array, effective: float, bins: int = B
     ----------
     residual, variable : ndarray, shape (n,)
     effective : float
-        Samples that hold the information of one, see :func:`memory`.
+        Samples that hold the information of one, see :func:`autocorrelation_time`.
     bins : int, optional
         At most; each holds the information of ten samples or more.
     """

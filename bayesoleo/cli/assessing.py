@@ -65,9 +65,9 @@ def assess(
     """Test the residuals of a result: signs, normality, phase, variables, outliers, lack of fit.
 
     One line for each output and run. A star marks what chance alone hardly gives. "over noise" is
-    what repeats from period to period over the noise of that average, "same phase" the correlation
-    of residuals of one phase in different periods, "memory" the number of samples that hold the
-    information of one.
+    what repeats from period to period over the noise of that average, "intraclass" the intraclass
+    correlation of one phase in different periods, "corr. time" the autocorrelation time of what
+    does not repeat, in samples.
 
     \b
     Examples:

@@ -356,7 +356,7 @@ class ErrorModel(ABC):
     def start(self, residuals: Sequence[Array]) -> Array:
         """Likely coordinates, shape (m,), given residuals (s, n) of each run."""
 
-    def spread(self) -> Array:
+    def scales(self) -> Array:
         """Rough standard deviations of the coordinates, shape (m,): a scale for Newton's method."""
         outputs = len(self.frame.outputs)
         sd = np.full(len(self.quantities), _LOG_VARIANCE_SD)

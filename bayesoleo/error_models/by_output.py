@@ -114,7 +114,7 @@ class ByOutput(ErrorModel):
         return np.asarray(sum(parts))
 
     @abstractmethod
-    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+    def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
         """The part that is not white, of unit variance, shape (W, n); length (W,)."""
 
     def draw(
@@ -124,7 +124,7 @@ class ByOutput(ErrorModel):
         for b, sd in enumerate(np.sqrt(self.variance(natural, run)).T):
             _, share, length = (natural[:, k] for k in self._places(b))
             out[:, b] *= np.sqrt(1 - share)[:, None]
-            out[:, b] += (sd * np.sqrt(share))[:, None] * self.draw_memory(length, samples, rng)
+            out[:, b] += (sd * np.sqrt(share))[:, None] * self.draw_coloured(length, samples, rng)
         return out
 
     def start(self, residuals: Sequence[Array]) -> Array:
@@ -148,7 +148,7 @@ class ByOutput(ErrorModel):
             eta[self._places(b)] = climb(height, guesses)
         return cast(Array, self._direct(eta[None], 1)[0])
 
-    def spread(self) -> Array:
-        s, sd = len(self.frame.outputs), super().spread()
+    def scales(self) -> Array:
+        s, sd = len(self.frame.outputs), super().scales()
         sd[s : 2 * s], sd[2 * s :] = self._SHARE_SD, self._LENGTH_SD
         return sd

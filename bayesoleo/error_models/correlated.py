@@ -1,4 +1,4 @@
-r"""Errors that remember: white noise and an Ornstein-Uhlenbeck process, in time O(n).
+r"""Correlated errors: white noise and an Ornstein-Uhlenbeck process, in time O(n).
 
 .. math::
 
@@ -183,7 +183,7 @@ class CorrelatedErrors(ByOutput):
         _whiten(columns, *self._steps[run], eta, white, np.empty(columns.shape[1]))
         return np.asarray(white @ white.T)
 
-    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+    def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
         lag = np.diff(samples.time)[:, None] / length
         decay = np.exp(-lag)
         new = rng.standard_normal((samples.time.size, len(length)))
@@ -203,5 +203,5 @@ def _kinds(steps: Array) -> tuple[np.ndarray, Array]:
 def covariance(time: Sequence[float] | Array, v: float, share: float, tau: float) -> Array:
     """The covariance itself, shape (n, n), for whoever wants to see it."""
     t = np.asarray(time, dtype=float)
-    memory = np.exp(-np.abs(t[:, None] - t) / tau)
-    return cast(Array, v * ((1 - share) * np.eye(t.size) + share * memory))
+    kernel = np.exp(-np.abs(t[:, None] - t) / tau)
+    return cast(Array, v * ((1 - share) * np.eye(t.size) + share * kernel))

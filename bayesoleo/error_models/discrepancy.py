@@ -251,7 +251,7 @@ class DiscrepancyErrors(ByOutput):
         left = columns @ columns.T - projected.T @ np.linalg.solve(inner, projected)
         return np.asarray(left / noise * np.exp(-eta[0]))
 
-    def draw_memory(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+    def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
         table = basis(samples.phase)
         root = np.sqrt(spectrum(length))
         return np.asarray((root * rng.standard_normal(root.shape)) @ table.T)

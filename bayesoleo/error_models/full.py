@@ -192,8 +192,8 @@ class FullErrors(ErrorModel):
         start = np.concatenate([log_mean_squares(residuals), natural])
         return cast(Array, self.coordinates(start[None])[0])
 
-    def spread(self) -> Array:
-        sd = super().spread()
+    def scales(self) -> Array:
+        sd = super().scales()
         sd[len(self.frame.outputs) :] = 1.0 / np.sqrt(self.frame.counts[:, 0].sum())
         return sd
 

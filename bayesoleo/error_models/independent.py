@@ -301,7 +301,7 @@ class PerRunErrors(ErrorModel):
         scatter = np.log(np.maximum(own.std(axis=0), 0.1))
         return np.concatenate([own.mean(axis=0), scatter, own.ravel()])
 
-    def spread(self) -> Array:
+    def scales(self) -> Array:
         runs = len(self.frame.runs)
         outputs = len(self.frame.outputs)
         return np.concatenate(

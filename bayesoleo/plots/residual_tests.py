@@ -12,9 +12,9 @@ from scipy import stats
 
 from bayesoleo.assessment import (
     Series,
+    autocorrelation_time,
     correlograms,
     dependence_on,
-    memory,
     normality,
     outliers_of,
     runs_of_signs,
@@ -171,7 +171,9 @@ def _correlation(axes: Axes, series: Series) -> None:
         if series.periodic
         else "lag in eighths of the record"
     )
-    _titled(axes, "autocorrelation", f"memory {memory(series.noise()):.1f} samples", unit)
+    _titled(
+        axes, "autocorrelation", f"time {autocorrelation_time(series.noise()):.1f} samples", unit
+    )
 
 
 def _against(axes: Axes, series: Series, name: str, scale: Scale) -> None:

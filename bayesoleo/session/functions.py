@@ -37,7 +37,7 @@ class Call:
         self.function, self.arguments = function, tuple(arguments)
 
     def __call__(self, inputs: Mapping[str, Array], theta: Array) -> ArrayLike:
-        values = {
+        values: dict[str, Callable[[Any], Any]] = {
             "column": lambda name: inputs[name],
             "unknown": lambda index: theta[index],
             "constant": lambda value: value,
@@ -48,7 +48,7 @@ class Call:
 
     def __getstate__(self) -> bytes:
         # A lambda has no name to be found by.
-        state: bytes = cloudpickle.dumps(self.__dict__)  # type: ignore[no-untyped-call]
+        state: bytes = cloudpickle.dumps(self.__dict__)
         return state
 
     def __setstate__(self, state: bytes) -> None:

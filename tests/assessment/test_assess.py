@@ -41,7 +41,7 @@ def test_right_model_leaves_noise(right):
     assert (found["share_p"].min() * found["share_p"].size) > 0.01
     np.testing.assert_allclose(found["rms"], 0.5, rtol=0.1)
     np.testing.assert_allclose(found["ratio_to_noise"], 1.0, atol=0.25)
-    assert abs(found["same_phase"]).max() < 0.1
+    assert abs(found["intraclass_correlation"]).max() < 0.1
     assert "*" not in "".join(str(found).splitlines()[1:-1])
     head, first = (line.split() for line in str(found).splitlines()[:2])
     assert first[head.index("unit")] == "N"
@@ -51,7 +51,7 @@ def test_missing_friction_shows_in_every_test(wrong):
     found = assess(*wrong)
     assert (found["runs_p"] < 1e-6).all()
     assert (found["lack_of_fit_p"] < 1e-12).all()
-    assert (found["same_phase"] > 0.5).all()
+    assert (found["intraclass_correlation"] > 0.5).all()
     share = found["share"].isel(output=0)
     # friction is a function of velocity, and as such of phase, but not of time
     assert (share.sel(variable="rate of displacement") > 0.8).all()
@@ -63,7 +63,7 @@ def test_correlogram_respects_phase(wrong):
     found = assess(*wrong)
     one = found.data.isel(output=0, run=0)
     lag = {key: one[key].sel(lag=1.0).item() for key in ("correlogram", "noise_correlogram")}
-    assert lag["correlogram"] == pytest.approx(float(one["same_phase"]), abs=0.05)
+    assert lag["correlogram"] == pytest.approx(float(one["intraclass_correlation"]), abs=0.05)
     assert abs(lag["noise_correlogram"]) < 0.2  # the average over 8 periods takes an eighth away
     assert one["correlogram"].sel(lag=0.0) == 1.0
 
@@ -146,7 +146,7 @@ def stored(problem, point):
 def test_stored_result_is_assessed_alike(wrong):
     direct = assess(*wrong)
     found = assess(stored(*wrong))
-    for key in ("rms", "runs_z", "normality", "same_phase"):
+    for key in ("rms", "runs_z", "normality", "intraclass_correlation"):
         np.testing.assert_allclose(found[key], direct[key], rtol=1e-9)
     assert "force" not in found["variable"].values  # its noise is the residual's
     assert "predicted force" in found["variable"].values

@@ -8,13 +8,13 @@ from scipy import stats
 
 from bayesoleo.assessment import (
     autocorrelation,
+    autocorrelation_time,
     dependence,
+    intraclass_correlation,
     lack_of_fit,
-    memory,
     normality,
     outliers,
     runs_of_signs,
-    same_phase,
 )
 from bayesoleo.data import periodic_average
 
@@ -72,17 +72,19 @@ def test_dependence_on_nothing_is_rarely_found():
     for _ in range(300):
         noise = coloured(rng, 2000, 0.6)
         time = np.arange(2000.0)
-        found.append(dependence(noise, time, memory(noise)).outcome.p_value)
+        found.append(dependence(noise, time, autocorrelation_time(noise)).outcome.p_value)
     # the memory is estimated, so that the law holds nearly
     assert np.mean(np.array(found) < 0.05) < 0.12
     assert stats.kstest(found, "uniform").statistic < 0.15
 
 
-def test_memory_of_an_autoregression():
+def test_autocorrelation_time_of_an_autoregression():
     noise = coloured(np.random.default_rng(3), 40_000, 0.9)
     # (1 + a) / (1 - a), of which 40 000 samples know a tenth
-    assert memory(noise) == pytest.approx(19.0, rel=0.15)
-    assert memory(np.random.default_rng(3).standard_normal(5000)) == pytest.approx(1.0, abs=0.1)
+    assert autocorrelation_time(noise) == pytest.approx(19.0, rel=0.15)
+    assert autocorrelation_time(np.random.default_rng(3).standard_normal(5000)) == pytest.approx(
+        1.0, abs=0.1
+    )
 
 
 def test_autocorrelation_of_an_autoregression():
@@ -113,7 +115,7 @@ def test_correlation_of_the_same_phase_is_the_part_that_repeats(error):
     _, average = record(np.random.default_rng(7), error, 1.0, periods=40)
     size = average.repeating, average.sigma, average.samples, average.number
     expected = 0.5 * error**2 / (0.5 * error**2 + 1)
-    assert same_phase(*size) == pytest.approx(expected, abs=0.02)
+    assert intraclass_correlation(*size) == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.statistical

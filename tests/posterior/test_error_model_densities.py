@@ -168,7 +168,7 @@ def test_coordinates_are_the_inverse_of_units(word):
     model = error_model(word, Campaign(outputs=("force", "pressure", "stroke")))
     eta = np.random.default_rng(0).normal(0, 0.7, (6, len(model.names)))
     np.testing.assert_allclose(model.coordinates(model.natural(eta)), eta, atol=1e-10)
-    assert len(set(model.names)) == len(model.names) == len(model.spread())
+    assert len(set(model.names)) == len(model.names) == len(model.scales())
 
 
 @pytest.mark.parametrize("word", ["full", "correlated", "discrepancy"])

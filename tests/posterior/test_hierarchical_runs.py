@@ -48,7 +48,7 @@ def test_the_density_is_likelihood_times_hierarchical_prior():
     # What the coordinates stretch: each level, the mean given the spread, and the spread.
     population = density.unknowns.populations[0]
     stretch = population.spread_of(population.coordinate_of(spread))[1]
-    centres = population.told(slope[None])
+    centres = population.conditional_centres(slope[None])
     stretch = stretch + np.log(population.mean_given(spread, centres)[1])
     for k in range(RUNS):
         stretch = stretch + np.log(population.run_given(k, mean, spread, centres)[1])

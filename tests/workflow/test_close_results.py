@@ -230,6 +230,7 @@ def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
     sampled = workflow.sample(campaign, MODEL, SETTINGS, out=tmp_path / "sample")
     more = {schema.POSTERIOR, schema.PRIOR, schema.SAMPLE_STATS, schema.LOG_LIKELIHOOD}
     more |= {schema.LOG_PRIOR, schema.PREDICTION, schema.PERIOD_PREDICTIVE, schema.COMPARISON}
+    more |= {schema.OBSERVED_DATA, schema.POSTERIOR_PREDICTIVE}
     assert set(sampled.children) == set(point.children) | more
     xr.testing.assert_identical(
         sampled[schema.POINT].to_dataset(), point[schema.POINT].to_dataset()

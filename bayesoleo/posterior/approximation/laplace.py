@@ -18,7 +18,7 @@ from bayesoleo.solvers.status import Status
 TOLERANCE = 1e-3
 #: Longest Newton step, in standard deviations; a quadratic model is not trusted further.
 RADIUS = 3.0
-#: Most Newton steps: where errors with memory take over from independent ones the mode lies tens of
+#: Most Newton steps: where correlated errors take over from independent ones the mode lies tens of
 #: standard deviations away, along a valley that bends.
 ITERATIONS = 200
 
@@ -82,7 +82,7 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
     size = len(block)
     covariance = np.zeros((len(phi), len(phi)))
     covariance[:size, :size] = np.linalg.inv(precision)
-    covariance[size:, size:] = np.diag(errors.spread() ** 2)
+    covariance[size:, size:] = np.diag(errors.scales() ** 2)
     return covariance
 
 

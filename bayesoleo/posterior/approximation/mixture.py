@@ -167,25 +167,25 @@ class Mixture:
         fitted = self
         # Each component keeps so many pseudo-draws of its former shape: it stays positive definite
         # when few draws reach it.
-        memory = 2.0 * (self.dimension + 1)
+        prior_draws = 2.0 * (self.dimension + 1)
         for _ in range(rounds):
             log_parts = fitted.log_components(phi)
             share = np.exp(log_parts - logsumexp(log_parts, axis=1)[:, None])
             degrees = np.asarray(self.degrees)
             pull = share * (degrees + self.dimension) / (degrees + fitted.distances(phi))
-            fitted = self._updated(phi, share, pull, memory, floor)
+            fitted = self._updated(phi, share, pull, prior_draws, floor)
         return fitted
 
     def _updated(
-        self, phi: Array, share: Array, pull: Array, memory: float, floor: float
+        self, phi: Array, share: Array, pull: Array, prior_draws: float, floor: float
     ) -> Mixture:
         centres, covariances = np.empty_like(self.centres), np.empty_like(self.covariances)
         mass = share.sum(axis=0)
         for k in range(len(centres)):
-            pulled = pull[:, k].sum() + memory
-            centres[k] = (pull[:, k] @ phi + memory * self.centres[k]) / pulled
+            pulled = pull[:, k].sum() + prior_draws
+            centres[k] = (pull[:, k] @ phi + prior_draws * self.centres[k]) / pulled
             away, moved = phi - centres[k], self.centres[k] - centres[k]
-            scatter = (pull[:, k, None] * away).T @ away + memory * np.outer(moved, moved)
-            covariances[k] = (scatter + memory * self.covariances[k]) / (mass[k] + memory)
+            scatter = (pull[:, k, None] * away).T @ away + prior_draws * np.outer(moved, moved)
+            covariances[k] = (scatter + prior_draws * self.covariances[k]) / (mass[k] + prior_draws)
         weights = np.maximum(mass / mass.sum(), floor)
         return Mixture(centres, covariances, np.log(weights / weights.sum()), self.degrees)

@@ -93,7 +93,7 @@ class Population:
     slopes: Array
     common: Array
 
-    def told(self, shared: Array) -> Array:
+    def conditional_centres(self, shared: Array) -> Array:
         """Centres, shape (W, N), given coordinates of the shared unknowns, shape (W, k)."""
         centres = np.repeat(self.centres[None], len(shared), axis=0)
         for k, place in enumerate(self.common):
@@ -142,34 +142,34 @@ class Population:
         slope = self.transform.derivative(np.array([self.middle]))[0]
         return float(self.prior.sd / abs(slope))
 
-    def mean_given(self, spread: Array, told: Array) -> tuple[Array, Array]:
+    def mean_given(self, spread: Array, centres: Array) -> tuple[Array, Array]:
         """Mean of ``mu`` given spreads (W,) and centres (W, N), and its standard deviation."""
         precision = np.full(spread.shape, self.scale**-2.0)
         weighted = precision * self.middle
-        for centre, sd in zip(told.T, self.sds, strict=True):
+        for centre, sd in zip(centres.T, self.sds, strict=True):
             weight = 1.0 / (sd * sd + spread * spread)
             precision += weight
             weighted += weight * centre
         return weighted / precision, 1.0 / np.sqrt(precision)
 
-    def run_given(self, k: int, mean: Array, spread: Array, told: Array) -> tuple[Array, Array]:
+    def run_given(self, k: int, mean: Array, spread: Array, centres: Array) -> tuple[Array, Array]:
         """Mean of run ``k``'s value given ``mu`` and spreads (W,), and its standard deviation."""
         own, common = self.sds[k] * self.sds[k], spread * spread
         total = own + common
-        middle = (common * told[:, k] + own * mean) / total
+        middle = (common * centres[:, k] + own * mean) / total
         return middle, self.sds[k] * spread / np.sqrt(total)
 
     def values(
         self, z: Array, zeta: Array, w: Array, shared: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Runs' values (W, N), mean, spread and log Jacobian (W,) from coordinates."""
-        told = self.told(shared)
+        centres = self.conditional_centres(shared)
         spread, stretch = self.spread_of(w)
-        middle, width = self.mean_given(spread, told)
+        middle, width = self.mean_given(spread, centres)
         mean, jacobian = middle + width * zeta, stretch + np.log(width)
         u = np.empty(z.shape)
         for k in range(z.shape[1]):
-            middle, width = self.run_given(k, mean, spread, told)
+            middle, width = self.run_given(k, mean, spread, centres)
             u[:, k] = middle + width * z[:, k]
             jacobian = jacobian + np.log(width)
         return u, mean, spread, jacobian
@@ -178,11 +178,11 @@ class Population:
         self, u: Array, mean: Array, spread: Array, shared: Array
     ) -> tuple[Array, Array, Array]:
         """``z (W, N)``, ``zeta (W,)`` and ``w (W,)`` of values, mean and spread."""
-        told = self.told(shared)
-        middle, width = self.mean_given(spread, told)
+        centres = self.conditional_centres(shared)
+        middle, width = self.mean_given(spread, centres)
         zeta, z = (mean - middle) / width, np.empty(u.shape)
         for k in range(u.shape[1]):
-            middle, width = self.run_given(k, mean, spread, told)
+            middle, width = self.run_given(k, mean, spread, centres)
             z[:, k] = (u[:, k] - middle) / width
         return z, zeta, self.coordinate_of(spread)
 

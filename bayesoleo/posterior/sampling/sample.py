@@ -21,10 +21,10 @@ from bayesoleo.posterior.sampling.diagnostics import autocorrelation_time, neste
 from bayesoleo.posterior.sampling.diagnostics import (
     effective_size as effective_size_of,
 )
+from bayesoleo.posterior.sampling.distributed import DistributedDensity
 from bayesoleo.posterior.sampling.ensembles import Ensembles, MoveWeights, default_walkers
 from bayesoleo.posterior.sampling.samples import Samples
 from bayesoleo.posterior.sampling.segment import Segment
-from bayesoleo.posterior.sampling.spread import SpreadDensity
 from bayesoleo.posterior.sampling.stopping import Quality, Schedule
 
 #: Points from which other modes are looked for, and for a first look.
@@ -136,7 +136,7 @@ def sample(
     place = None if out is None else Path(out)
     with open_store(place, print_of_run) as store, connected(scheduler) as client:
         if client is not None:
-            group = replace(group, log_density=SpreadDensity(log_density, client))
+            group = replace(group, log_density=DistributedDensity(log_density, client))
         bar = _Bar(schedule.effective_size, progress)
         try:
             if not store.segments:

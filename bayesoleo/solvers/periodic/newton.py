@@ -11,7 +11,14 @@ from numba import carray  # type: ignore[attr-defined] # not in its __all__
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.compiled import pointer
-from bayesoleo.solvers.periodic.arrangement import Line, Options, Pieces, Sizes, Sweep, Work
+from bayesoleo.solvers.periodic.arrangement import (
+    LinearStart,
+    Options,
+    Sizes,
+    Sweep,
+    SweepKernels,
+    Work,
+)
 from bayesoleo.solvers.periodic.measures import unit
 from bayesoleo.solvers.periodic.recursion import (
     CONVERGED,
@@ -53,8 +60,8 @@ WITHOUT_SIGN = np.int64(2**63 - 1)
 
 @jit
 def solve_lanes(
-    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options, p: Array, x: Array,
-    line: Line, status: Integers, iterations: Integers,
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, p: Array,
+    x: Array, line: LinearStart, status: Integers, iterations: Integers,
 ) -> None:  # fmt: skip
     """Newton's method for every lane of ``x (L, n, w)``, in place; see ``solve``."""
     now = work.now
@@ -88,7 +95,7 @@ def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
 
 
 @jit
-def _extrapolate(line: Line, lane: int, now: Array) -> None:
+def _extrapolate(line: LinearStart, lane: int, now: Array) -> None:
     """``now = base + slopes change``, two slopes at a time."""
     size, count = now.size, line.change.shape[1]
     to, base = carray(pointer(now, 0), (size,)), carray(pointer(line.base, 0), (size,))
@@ -108,7 +115,7 @@ def _extrapolate(line: Line, lane: int, now: Array) -> None:
 
 @jit
 def _iterate(
-    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options
 ) -> tuple[int, int]:
     """Newton's method from ``work.now``; returns how it ended and the number of steps."""
     outcome, iteration = evaluate(pieces, sizes, sweep, work), 0
@@ -145,7 +152,7 @@ def _iterate(
 
 @jit
 def _chords(
-    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
 ) -> tuple[int, float]:
     """Take the step, and further ones with the same derivatives and closure.
 
@@ -182,7 +189,7 @@ def _chord_suffices(size: float, last: float) -> bool:
 
 @jit
 def _advance(
-    pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
 ) -> tuple[int, float, float]:
     """Take the step, halved while it is inadmissible or does not reduce the residual; returns how
     that ended, the fraction taken and the residual's size after it."""
@@ -206,7 +213,7 @@ def _advance(
 
 
 @jit
-def _step(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
+def _step(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
     """The Newton step at all positions, from the recursion of the last evaluation."""
     outcome = CONVERGED if initial else close(pieces, sizes, work)
     if outcome == CONVERGED:

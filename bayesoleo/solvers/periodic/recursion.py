@@ -13,7 +13,7 @@ from numba import carray  # type: ignore[attr-defined] # not in its __all__
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.compiled import BLOCK, after, call_kernel, caller, pointer
-from bayesoleo.solvers.periodic.arrangement import Pieces, Sizes, Sweep, Work
+from bayesoleo.solvers.periodic.arrangement import Sizes, Sweep, SweepKernels, Work
 from bayesoleo.solvers.periodic.measures import total
 from bayesoleo.solvers.schemes.closure import LARGEST_GROWTH, close_balanced
 from bayesoleo.solvers.schemes.closure import close as solve_closure
@@ -72,7 +72,7 @@ def move(now: Array, dx: Array) -> None:
 
 
 @jit
-def evaluate(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work) -> int:
+def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> int:
     """Equations at the present unknowns, and the recursion that solves them linearised."""
     steps, stages = sizes.block, sizes.stages
     reach = steps + (sizes.front + 1) * WIDTH
@@ -109,7 +109,7 @@ def evaluate(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work) -> int:
 
 
 @jit
-def evaluate_again(pieces: Pieces, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
+def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
     """Equations alone at the present unknowns, solved with the last derivatives; whether the
     unknowns are admissible."""
     steps, stages = sizes.block, sizes.stages
@@ -172,7 +172,7 @@ def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out:
 
 
 @jit
-def close(pieces: Pieces, sizes: Sizes, work: Work) -> int:
+def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
     """Invert the closure of the period, from the recursion's matrices alone."""
     inverse, closure, products = work.inverse, work.closure, work.products
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
@@ -196,7 +196,7 @@ def _set_identity(matrix: Array) -> None:
 
 
 @jit
-def start_chunks(pieces: Pieces, sizes: Sizes, work: Work, initial: bool) -> None:
+def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) -> None:
     """First state of every chunk: that of the period from its closure, or zero."""
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
     inverse, start = pointer(work.inverse, 0), pointer(work.start, 0)

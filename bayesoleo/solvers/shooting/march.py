@@ -171,7 +171,7 @@ def _room(task: MarchTask, front: Front) -> Path:
 
 @jit
 def _walk(
-    task: Task, system: System, front: Front, path: Path, work: Workspace
+    task: MarchTask, system: System, front: Front, path: Path, work: Workspace
 ) -> tuple[int, int, int]:
     """Step after step to the last node: number of steps, outcome, points."""
     t, end, s = task.nodes[0], task.nodes[-1], system.method.c.size
@@ -227,7 +227,7 @@ def _walk(
 
 
 @inner
-def _aim(task: Task, length: float, node: int, t: float, shortest: float) -> tuple[int, float]:
+def _aim(task: MarchTask, length: float, node: int, t: float, shortest: float) -> tuple[int, float]:
     """Number of the node ahead and time at which the next step is to end."""
     if not task.adaptive:
         while task.nodes[node] <= t + shortest:

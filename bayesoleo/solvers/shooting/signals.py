@@ -68,7 +68,7 @@ def evaluate(signal: InputSignal, times: Array) -> Array:
 
 
 @jit
-def rows_at(signal: Signal, start: float, step: float, positions: Array, u: Array) -> None:
+def rows_at(signal: InputSignal, start: float, step: float, positions: Array, u: Array) -> None:
     """Fill ``u (nu, N)`` with the rows at ``start + step * positions``."""
     for i in range(positions.size):
         t = start + step * positions[i]
@@ -79,7 +79,7 @@ def rows_at(signal: Signal, start: float, step: float, positions: Array, u: Arra
 
 
 @jit
-def _add_harmonics(signal: Signal, t: float, u: Array, i: int) -> None:
+def _add_harmonics(signal: InputSignal, t: float, u: Array, i: int) -> None:
     """Cosines and sines of all harmonics by rotation: round-off grows with the order only."""
     count, harmonics = signal.cosine.shape
     if harmonics == 0:
@@ -93,7 +93,7 @@ def _add_harmonics(signal: Signal, t: float, u: Array, i: int) -> None:
 
 
 @jit
-def _add_piece(signal: Signal, t: float, u: Array, i: int) -> None:
+def _add_piece(signal: InputSignal, t: float, u: Array, i: int) -> None:
     pieces = signal.pieces.shape[0]
     m = int(np.searchsorted(signal.knots, t, side="right")) - 1
     m = min(max(m, 0), pieces - 1)

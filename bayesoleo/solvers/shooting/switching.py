@@ -22,7 +22,7 @@ from bayesoleo.solvers.shooting.radau_step import (
     solve_stages,
     stretch,
 )
-from bayesoleo.solvers.shooting.signals import Signal, rows_at
+from bayesoleo.solvers.shooting.signals import InputSignal, rows_at
 
 #: A switching function beyond zero by less than this, over its largest value, has not switched:
 #: with analytic pieces the difference is of that size.
@@ -32,7 +32,7 @@ SLACK = 1e-13
 @inner
 def sigma_at(
     switches: int, k: int, t: float, state: Array, top: Array, h: float, position: float,
-    method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+    method: Method, orders: Integers, signal: InputSignal, p: Array, work: Workspace,
 ) -> float:  # fmt: skip
     """Switching function ``k`` on the step's polynomial."""
     interpolate(state, top, h, position, method, orders, work.z1)
@@ -44,7 +44,7 @@ def sigma_at(
 @inner
 def first_switch(
     switches: int, t: float, state: Array, top: Array, h: float, modes: Integers, largest: Array,
-    method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+    method: Method, orders: Integers, signal: InputSignal, p: Array, work: Workspace,
 ) -> tuple[float, int]:  # fmt: skip
     """Position (in the solved step) and number of the first switch, or -1 for none.
 
@@ -89,7 +89,7 @@ def first_switch(
 @inner
 def _root(
     switches: int, k: int, sign: float, low: float, high: float, t: float, state: Array, top: Array,
-    h: float, method: Method, orders: Integers, signal: Signal, p: Array, work: Workspace,
+    h: float, method: Method, orders: Integers, signal: InputSignal, p: Array, work: Workspace,
 ) -> float:  # fmt: skip
     """Zero of a switching function between two positions, by regula falsi (Illinois)."""
     below = sign * sigma_at(switches, k, t, state, top, h, low, method, orders, signal, p, work)
@@ -121,7 +121,7 @@ def _root(
 def step_to_switch(
     jacobian: int, switches: int, k: int, position: float, t: float, state: Array, top: Array,
     h: float, scale: Array, enough: float, largest: Array, method: Method, orders: Integers,
-    signal: Signal, p: Array, work: Workspace,
+    signal: InputSignal, p: Array, work: Workspace,
 ) -> float:  # fmt: skip
     """Solve the step again so that it ends at switch ``k``; returns its length, or -1."""
     guess = np.empty_like(top)
@@ -146,7 +146,7 @@ def step_to_switch(
 @inner
 def slope_of_switch(
     switches: int, k: int, t: float, state: Array, top: Array, h: float, method: Method,
-    orders: Integers, signal: Signal, p: Array, work: Workspace,
+    orders: Integers, signal: InputSignal, p: Array, work: Workspace,
 ) -> float:  # fmt: skip
     """Time derivative of a switching function at the end of a step, along its polynomial."""
     ahead = sigma_at(switches, k, t, state, top, h, 1.0 + 1e-4, method, orders, signal, p, work)

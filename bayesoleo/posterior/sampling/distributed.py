@@ -34,7 +34,7 @@ class _Rows:
         return values, by_run, failures, getattr(self.log_density, "branch_jumps", 0) - jumps
 
 
-class SpreadDensity:
+class DistributedDensity:
     """Sends rows to workers and puts together what they return.
 
     Parameters
