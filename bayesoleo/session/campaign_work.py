@@ -106,11 +106,8 @@ class CampaignWork:
         given = {"jobs": self.settings.jobs, "scheme": self.settings.scheme, **options}
         return predict(tree, reduced, **given)
 
-    def explain(
-        self, out: Any, say: Say, fit: Fit, candidates: object
-    ) -> tuple[CampaignSearch, xr.DataTree]:
-        """The closed loop without its posterior."""
-        del fit, candidates  # the loop begins with an estimate of its own, on all kinds of runs
+    def explain(self, out: Any, say: Say) -> tuple[CampaignSearch, xr.DataTree]:
+        """The closed loop without its posterior; it begins with an estimate of its own."""
         output, stages = Output.checked(out), Stages(say)
         with output.alone():
             loop, questions = search(

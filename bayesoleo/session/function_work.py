@@ -225,18 +225,6 @@ class FunctionWork:
             )  # fmt: skip
         return {name: table[name] for name in self.inputs}
 
-    def explain(
-        self, out: Any, say: Say, fit: FunctionFit, candidates: object
-    ) -> tuple[Any, xr.DataTree]:
-        """Terms of the user's scored and added while one is significant."""
-        from bayesoleo.session.terms import search_terms
-
-        if out is not None:
-            raise InputError(
-                "the search of a function keeps nothing", key="out", hint="leave it out"
-            )
-        return search_terms(self, fit, candidates, say)
-
 
 def _prediction_text(data: xr.Dataset, place: str, most: int = 12) -> str:
     keys = (place, "mean", "sd", "low", "high")

@@ -47,9 +47,7 @@ class Call:
         return self.function(*(values[kind](which) for kind, which in self.arguments))
 
     def __getstate__(self) -> bytes:
-        # A lambda has no name to be found by.
-        state: bytes = cloudpickle.dumps(self.__dict__)
-        return state
+        return bytes(cloudpickle.dumps(self.__dict__))  # a lambda has no name to be found by
 
     def __setstate__(self, state: bytes) -> None:
         self.__dict__.update(cloudpickle.loads(state))

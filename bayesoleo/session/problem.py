@@ -168,8 +168,7 @@ class Problem(Showing):
 def _of_campaign(data: Any, model: Model, settings: Settings, progress: bool) -> CampaignWork:
     if isinstance(data, Campaign):
         data = data.reduced
-    known = str | os.PathLike[str] | measured.Campaign | ReducedCampaign
-    if not isinstance(data, known):
+    if not isinstance(data, str | os.PathLike | measured.Campaign | ReducedCampaign):
         raise InputError(
             "a model is fitted to a campaign", key="data", value=type(data).__name__,
             hint='write bo.load_campaign("folder")',

@@ -33,7 +33,7 @@ from bayesoleo.session.campaign_work import CampaignSearch, CampaignWork
 from bayesoleo.session.changes import SAMPLING, SEARCHING, changed
 from bayesoleo.session.function_work import FunctionWork
 from bayesoleo.session.shown import Result, Showing, html, kept, number, result
-from bayesoleo.session.terms import TermSearch
+from bayesoleo.session.terms import TermSearch, search_terms
 from bayesoleo.storage import read_tree, write_text_atomic, write_tree
 from bayesoleo.workflow import reduce
 
@@ -320,14 +320,20 @@ class Fit(Stored):
         >>> found = fit.explain(max_effects=2)  # doctest: +SKIP
         """
         work = self._computing()
-        if candidates is not None and isinstance(work, CampaignWork):
+        if isinstance(work, CampaignWork) and candidates is not None:
             raise InputError(
                 "named terms are for functions", key="candidates", value=list(candidates),
                 hint="write effects=(bayesoleo.effects.force_effect(…),)",
             )  # fmt: skip
+        if isinstance(work, FunctionWork) and out is not None:
+            raise InputError("a search of terms keeps nothing", key="out", hint="leave it out")
         work = work.with_settings(changed(work.settings, settings, SEARCHING))
+        search: CampaignSearch | TermSearch
         with status_line(progress) as say:
-            search, tree = work.explain(out, say, self._found, candidates)
+            if isinstance(work, FunctionWork):
+                search, tree = search_terms(work, self._found, candidates, say)
+            else:
+                search, tree = work.explain(out, say)
         return Explanation(tree, search.work, search)
 
     def _text(self) -> str:
