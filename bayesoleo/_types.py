@@ -8,6 +8,7 @@ results against the shapes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,3 +29,6 @@ if TYPE_CHECKING:
     Flags = NDArray[np.bool_]
 else:  # shapes are checked of classes, which aliases with a dtype are not
     Array = ComplexArray = Integers = Flags = np.ndarray
+
+#: Called with a sentence on what is being done.
+ProgressCallback = Callable[[str], None]

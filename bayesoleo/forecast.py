@@ -18,13 +18,13 @@ from scipy import stats
 
 from bayesoleo import schema
 from bayesoleo._types import Array, Float
-from bayesoleo.assessment import Score, score_draws
+from bayesoleo.assessment import PredictiveScore, score_draws
 from bayesoleo.assessment.series import judged_errors
 from bayesoleo.data import ReducedCampaign
 from bayesoleo.data.local_average import local_means
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.runs.nuisance import uncertain_conditions
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 from bayesoleo.model import Model
 from bayesoleo.prediction.invented import without_invented
 from bayesoleo.prediction.predictor import Predictor
@@ -87,7 +87,7 @@ def predict(
     solver: str = COLLOCATION,
     steps: int = STEPS,
     jobs: int | None = None,
-) -> Shown:
+) -> LabelledResult:
     """Predict runs from a result and hold the prediction against what was measured.
 
     Parameters
@@ -113,7 +113,7 @@ def predict(
 
     Returns
     -------
-    Shown
+    LabelledResult
         By ``(output, run)``: ``rms``, ``bias``, ``expected_rms``, ``log_score``, ``coverage``,
         ``pit_distance``; ``repeating``, ``noise``, ``expected_error`` and the ratios to both, as in
         the search, and of a run that the result holds those of its verdict; ``failed(run)``, the
@@ -151,7 +151,7 @@ def predict(
     ]
     data = _dataset(used, records, found)
     data.attrs = {"level": level, "draws": draws, "model": used.name}
-    return Shown(data, forecast_text(data))
+    return LabelledResult(data, forecast_text(data))
 
 
 def draws_of(tree: xr.DataTree, number: int, rng: np.random.Generator) -> Known:
@@ -201,7 +201,7 @@ class _Run:
     spread: Array
     low: Array
     high: Array
-    scores: Sequence[Score]
+    scores: Sequence[PredictiveScore]
     errors: Sequence[Mapping[str, float]]
     failed: Mapping[str, int]
 

@@ -120,7 +120,7 @@ def each_done[T, R](
         As soon as it is there. What the function raises is raised.
     """
     if client is not None:
-        yield from Crew(client, function).each(items)
+        yield from WorkerPool(client, function).each(items)
         return
     jobs = available_cores() if jobs is None else jobs
     if jobs <= 1 or len(items) <= 1:
@@ -136,7 +136,7 @@ def each_done[T, R](
             pool.shutdown(cancel_futures=True)
 
 
-class Crew:
+class WorkerPool:
     """The workers of a cluster, all given one function.
 
     Parameters

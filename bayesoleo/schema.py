@@ -34,7 +34,7 @@ PERIOD_PREDICTIVE: Final = "period_predictive"
 RESIDUAL: Final = "residual"
 PREDICTION: Final = "prediction"
 DISCOVERY: Final = "discovery"
-UNNAMED: Final = "unnamed"
+NONPARAMETRIC: Final = "nonparametric"
 SAMPLING_DISTRIBUTION: Final = "sampling_distribution"
 INDIFFERENCE: Final = "indifference"
 PROFILE: Final = "profile"
@@ -60,7 +60,7 @@ GROUPS: Final = (
     RESIDUAL,
     PREDICTION,
     DISCOVERY,
-    UNNAMED,
+    NONPARAMETRIC,
     SAMPLING_DISTRIBUTION,
     INDIFFERENCE,
     PROFILE,

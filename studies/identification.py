@@ -103,7 +103,9 @@ def run(campaign: Campaign) -> dict[str, Any]:
     except bayesoleo.errors.BayesoleoError as error:
         return asdict(campaign) | {"failed": str(error).splitlines()[0]}
     assembly = Assembly(system(SYSTEM), DRIVE)
-    loop = close_loop(assembly, assign(reduced.records), NUMERICS, max_effects=2, unnamed=False)
+    loop = close_loop(
+        assembly, assign(reduced.records), NUMERICS, max_effects=2, nonparametric=False
+    )
     accepted = [entry.accepted for entry in loop.rounds if entry.accepted]
     ranking = loop.rounds[0].ranking
     own = [k for k, item in enumerate(ranking) if item.effect == campaign.effect]

@@ -24,10 +24,10 @@ from scipy import optimize, stats
 from bayesoleo.effects import Effect, force_effect
 from bayesoleo.model import driven_by
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.rounds import LEVEL
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.fitting import Assembly, Numerics, assign
 from bayesoleo.tracing.fitting.assembly import Option
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.scales import scales_of
 from bayesoleo.tracing.scoring.score import Score, score_all
 from bayesoleo.tracing.scoring.significance import effective_tests, without_twins
@@ -37,13 +37,13 @@ NUMERICS = Numerics(jobs=1, backend="numpy")
 SEED = 0
 #: What the catalogue has no name for.
 STRANGERS = (
-    force_effect("ripple", "unnamed", "ripple*sin(900*position)", {"ripple": "force"}),
+    force_effect("ripple", "nonparametric", "ripple*sin(900*position)", {"ripple": "force"}),
     force_effect(
-        "late_drag", "unnamed", "late_drag*velocity**3/(1 + (40*velocity)**4)",
+        "late_drag", "nonparametric", "late_drag*velocity**3/(1 + (40*velocity)**4)",
         {"late_drag": "force/(position/s)**3"},
     ),
     force_effect(
-        "inner_wall", "unnamed", "inner_wall*exp(-((position - 0.11)/0.006)**2)",
+        "inner_wall", "nonparametric", "inner_wall*exp(-((position - 0.11)/0.006)**2)",
         {"inner_wall": "force"},
     ),
 )  # fmt: skip
@@ -116,7 +116,7 @@ def _limit(score: Score, direction: NDArray[np.float64]) -> float:
 def _local_level() -> float:
     """Level of one test among so many."""
     tests = effective_tests(score_all(base().base(), _options(None), jobs=1)[0], 0)
-    return float(-np.expm1(np.log1p(-LEVEL) / tests))
+    return float(-np.expm1(np.log1p(-SearchPolicy().significance) / tests))
 
 
 def _options(catalogue: Sequence[Effect] | None) -> list[Option]:

@@ -306,12 +306,12 @@ def with_process(fitted, held_out) -> Found:
 def with_close(task, state: State) -> Found:
     """The closed loop, without sampling."""
     from bayesoleo.workflow.closing import run_loop
-    from bayesoleo.workflow.output import Output
+    from bayesoleo.workflow.output import ResultFolder
     from bayesoleo.workflow.stages import Stages
 
     start = time.process_time()
     stages = Stages()
-    loop = run_loop(task, 4, stages, Output(None))
+    loop = run_loop(task, 4, stages, ResultFolder(None))
     assert not stages.failed, stages.failed
     left = [(run, run.residual) for run in residuals(loop.final)[1]]
     fit, texts = loop.final.fit, []

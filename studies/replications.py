@@ -14,7 +14,7 @@ import numpy as np
 
 import bayesoleo
 from bayesoleo.data import dataset_folder
-from bayesoleo.estimation import FunctionProblem, Shown, sampling_distribution
+from bayesoleo.estimation import FunctionProblem, LabelledResult, sampling_distribution
 from bayesoleo.model import Normal, driven_by
 from bayesoleo.tracing.fitting.fit import Numerics, fit_model
 
@@ -32,13 +32,13 @@ class Timed:
 
     Parameters
     ----------
-    found : Shown
+    found : LabelledResult
         The group ``sampling_distribution``.
     seconds, cpu_seconds : float
         Of wall and of all threads.
     """
 
-    found: Shown
+    found: LabelledResult
     seconds: float
     cpu_seconds: float
 

@@ -10,7 +10,7 @@ import pytest
 
 from bayesoleo import machines, parallel
 from bayesoleo.errors import InputError, ResultsError
-from bayesoleo.machines import Crew, connected, each_done
+from bayesoleo.machines import WorkerPool, connected, each_done
 from bayesoleo.storage.slots import Slots
 
 
@@ -107,9 +107,9 @@ def test_every_task_begins_with_a_fresh_copy(client):
 
 @pytest.mark.slow
 def test_a_kept_function_is_made_once_a_worker(client):
-    crew = Crew(client, Counting(), keep=True)
-    assert crew.size == 2
-    found = dict(crew.each(range(20)))
+    pool = WorkerPool(client, Counting(), keep=True)
+    assert pool.size == 2
+    found = dict(pool.each(range(20)))
     calls = [int(piece["calls"][0]) for piece in found.values()]
     assert max(calls) > 1
     assert len({int(piece["process"][0]) for piece in found.values()}) <= 2

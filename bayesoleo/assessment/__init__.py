@@ -17,12 +17,12 @@ from bayesoleo.assessment.residual_tests import (
     outliers,
     runs_of_signs,
 )
-from bayesoleo.assessment.scores import Score, score_draws, score_normal
+from bayesoleo.assessment.scores import PredictiveScore, score_draws, score_normal
 from bayesoleo.assessment.series import Series, series_of_problem, series_of_tree
-from bayesoleo.assessment.whereabouts import whereabouts
+from bayesoleo.assessment.whereabouts import residual_breakdown
 
 __all__ = [
-    "Score",
+    "PredictiveScore",
     "Series",
     "assess",
     "assessment_text",
@@ -36,10 +36,10 @@ __all__ = [
     "normality",
     "outliers",
     "outliers_of",
+    "residual_breakdown",
     "runs_of_signs",
     "score_draws",
     "score_normal",
     "series_of_problem",
     "series_of_tree",
-    "whereabouts",
 ]

@@ -22,7 +22,7 @@ from bayesoleo.assessment.series import Series, series_of_problem, series_of_tre
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 
 #: Outliers listed of each series, the farthest.
 LISTED = 5
@@ -58,7 +58,7 @@ def assess(
     point: PointEstimate | ArrayLike | None = None,
     *,
     stage: str | None = None,
-) -> Shown:
+) -> LabelledResult:
     """Test the residuals of an estimate.
 
     Parameters
@@ -72,7 +72,7 @@ def assess(
 
     Returns
     -------
-    Shown
+    LabelledResult
         The group ``assessment``. By ``(output, run)``: ``rms``, ``mean``; ``runs_z``, the test on
         runs of signs; ``skewness``, ``kurtosis``, ``normality``; ``autocorrelation_time``,
         ``intraclass_correlation``; ``lack_of_fit`` (pure error between periods),
@@ -100,7 +100,7 @@ def assess(
     else:
         series = series_of_problem(subject, point)
     data = _dataset(series)
-    return Shown(data, assessment_text(data))
+    return LabelledResult(data, assessment_text(data))
 
 
 def _numbers(series: Series) -> dict[str, float]:

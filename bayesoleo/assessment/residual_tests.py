@@ -20,7 +20,7 @@ from bayesoleo.autocovariance import lagged_products
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ResidualTest:
     """A test's statistic and the probability of one as extreme if nothing is wrong."""
 
     statistic: float
@@ -29,10 +29,10 @@ class Outcome:
 
 #: Bins of a variable at most.
 BINS = 24
-NOTHING = Outcome(float("nan"), float("nan"))
+NOTHING = ResidualTest(float("nan"), float("nan"))
 
 
-def runs_of_signs(residual: Array) -> Outcome:
+def runs_of_signs(residual: Array) -> ResidualTest:
     """Test on runs of signs (Bard 1974, section 7.9; Wald and Wolfowitz 1940).
 
     Parameters
@@ -42,7 +42,7 @@ def runs_of_signs(residual: Array) -> Outcome:
 
     Returns
     -------
-    Outcome
+    ResidualTest
         Standard normal where signs come in random order; negative where they cluster, as they do
         where the model misses something. Two-sided.
     """
@@ -53,14 +53,14 @@ def runs_of_signs(residual: Array) -> Outcome:
         return NOTHING
     if min(above, below) == 0:  # as many of each were to be expected, and one run came
         z = -np.sqrt(signs.size - 1)
-        return Outcome(float(z), float(2 * stats.norm.sf(-z)))
+        return ResidualTest(float(z), float(2 * stats.norm.sf(-z)))
     runs = 1 + int((np.diff(signs) != 0).sum())
     mean = 1 + 2 * above * below / signs.size
     variance = (mean - 1) * (mean - 2) / (signs.size - 1)
     if variance <= 0:
         return NOTHING
     z = (runs - mean) / np.sqrt(variance)
-    return Outcome(float(z), float(2 * stats.norm.sf(abs(z))))
+    return ResidualTest(float(z), float(2 * stats.norm.sf(abs(z))))
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
@@ -102,7 +102,7 @@ def autocorrelation_time(values: Array, power: int = 1) -> float:
     return float(max(1.0 + 2.0 * np.sum(rho[1 : end + 2] ** power), 1.0))
 
 
-def normality(residual: Array) -> tuple[float, float, Outcome]:
+def normality(residual: Array) -> tuple[float, float, ResidualTest]:
     """Skewness, excess kurtosis, and whether they may be those of a normal process.
 
     The test of Lobato and Velasco (2004): that of Jarque and Bera with variances of the moments
@@ -115,7 +115,7 @@ def normality(residual: Array) -> tuple[float, float, Outcome]:
     Returns
     -------
     skewness, kurtosis : float
-    Outcome
+    ResidualTest
         Chi-square with two degrees of freedom.
     """
     n = residual.size
@@ -127,7 +127,7 @@ def normality(residual: Array) -> tuple[float, float, Outcome]:
     third = 1 + 2 * float(np.sum(rho[1:] ** 3))
     fourth = 1 + 2 * float(np.sum(rho[1:] ** 4))
     statistic = n * (skewness**2 / (6 * max(third, 1e-3)) + kurtosis**2 / (24 * fourth))
-    return skewness, kurtosis, Outcome(statistic, float(stats.chi2.sf(statistic, 2)))
+    return skewness, kurtosis, ResidualTest(statistic, float(stats.chi2.sf(statistic, 2)))
 
 
 def intraclass_correlation(repeating: float, sigma: float, samples: int, number: int) -> float:
@@ -155,7 +155,7 @@ def lack_of_fit(
     number: int,
     input_noise: float = 0.0,
     effective: float = 1.0,
-) -> Outcome:
+) -> ResidualTest:
     """What repeats of a residual against the noise of that average: pure error between periods.
 
     Parameters
@@ -171,7 +171,7 @@ def lack_of_fit(
 
     Returns
     -------
-    Outcome
+    ResidualTest
         Ratio of mean squares, F-distributed with ``number`` and ``samples - number`` degrees of
         freedom, each over ``effective``; the root of it is the loop's ratio to the noise.
     """
@@ -180,7 +180,7 @@ def lack_of_fit(
         return NOTHING
     ratio = repeating**2 / noise
     free = number / effective, (samples - number) / effective
-    return Outcome(float(ratio), float(stats.f.sf(ratio, *free)))
+    return ResidualTest(float(ratio), float(stats.f.sf(ratio, *free)))
 
 
 def outliers(values: Array, level: float = 0.05) -> tuple[Array, NDArray[np.int64], float]:
@@ -224,7 +224,7 @@ class Dependence:
         samples.
     share : float
         Part of the residual's variance that the variable explains, beyond what chance does.
-    outcome : Outcome
+    outcome : ResidualTest
         F-test of the bins, samples counted by their autocorrelation time.
     """
 
@@ -232,7 +232,7 @@ class Dependence:
     means: Float[Array, " bins"]
     errors: Float[Array, " bins"]
     share: float
-    outcome: Outcome
+    outcome: ResidualTest
 
 
 def dependence(residual: Array, variable: Array, effective: float, bins: int = BINS) -> Dependence:
@@ -264,5 +264,9 @@ def dependence(residual: Array, variable: Array, effective: float, bins: int = B
     ratio = between / (count - 1) / max(scatter * max(effective, 1.0), np.finfo(float).tiny)
     share = max(0.0, 1 - (within / free) / (total / (free + count - 1)))
     return Dependence(
-        centres, means, errors, share, Outcome(ratio, float(stats.f.sf(ratio, count - 1, free)))
+        centres,
+        means,
+        errors,
+        share,
+        ResidualTest(ratio, float(stats.f.sf(ratio, count - 1, free))),
     )

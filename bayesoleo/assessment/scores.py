@@ -17,7 +17,7 @@ from bayesoleo.errors import InputError
 
 
 @dataclass(frozen=True)
-class Score:
+class PredictiveScore:
     """How well data were foreseen.
 
     Parameters
@@ -43,7 +43,7 @@ class Score:
 
 def score_normal(
     measured: ArrayLike, mean: ArrayLike, sd: ArrayLike, *, level: float = 0.95
-) -> Score:
+) -> PredictiveScore:
     """Score a normal prediction.
 
     Parameters
@@ -70,7 +70,7 @@ def score_normal(
 
 def score_draws(
     measured: ArrayLike, draws: ArrayLike, sd: ArrayLike, *, level: float = 0.95
-) -> Score:
+) -> PredictiveScore:
     """Score a prediction by draws, each with the noise of a sample about it.
 
     Parameters
@@ -115,10 +115,10 @@ def _aligned(measured: ArrayLike, mean: ArrayLike, sd: ArrayLike) -> tuple[Array
     return y, centre, spread
 
 
-def _score(log_density: Array, pit: Array, level: float) -> Score:
+def _score(log_density: Array, pit: Array, level: float) -> PredictiveScore:
     tail = (1 - level) / 2
     inside = (pit >= tail) & (pit <= 1 - tail)
-    return Score(
+    return PredictiveScore(
         log_score=float(np.mean(log_density)),
         pit=pit,
         coverage=float(inside.mean()),

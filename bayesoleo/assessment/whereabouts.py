@@ -23,7 +23,7 @@ BINS = 24
 RUN, GROUP, SIGN = "run", "group", "direction"
 
 
-def whereabouts(tree: xr.DataTree) -> xr.Dataset:
+def residual_breakdown(tree: xr.DataTree) -> xr.Dataset:
     """Share of the repeating error, beyond its noise, by harmonic and by coordinate.
 
     Parameters

@@ -38,7 +38,7 @@ def estimate_each(
     from bayesoleo.estimation import between_runs
     from bayesoleo.storage import provenance, write_tree
 
-    found = workflow.estimate_each(campaign, model, chosen, say=shell.teller(quiet))
+    found = workflow.estimate_each(campaign, model, chosen, callback=shell.teller(quiet))
     view, reason = None, ""
     try:
         view = between_runs(found)

@@ -71,12 +71,12 @@ def demo(
 
     shell.check_writable(out)
     chosen = options.settings(seed=seed, jobs=jobs, quick=not full)
-    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     with shell.stoppable(out):
-        say("simulating a shaker campaign of an oleo")
+        callback("simulating a shaker campaign of an oleo")
         campaign = _fresh_campaign(out, seed, demo_campaign)
         model = load_model(DEMO_SYSTEM)
-        _closed(campaign, model, chosen, out, say, progress)
+        _closed(campaign, model, chosen, out, callback, progress)
 
 
 def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
@@ -139,7 +139,7 @@ def close(
       bayesoleo close shaker --model model.py:model --out results --quick
       bayesoleo close shaker --model f16n2d1 --drive force --seed 7
       bayesoleo close shaker --model f16n2d2 --effects mine.py:drag
-      bayesoleo close shaker --model f16n2d2 --without humming_force,unnamed
+      bayesoleo close shaker --model f16n2d2 --without humming_force,nonparametric
     """
     from bayesoleo.modelfile import load_model
 
@@ -161,10 +161,10 @@ def close(
         error_model=error_model,
         between_runs=between_runs,
     )
-    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(folder):
-        _closed(campaign, declared, chosen, folder, say, progress)
+        _closed(campaign, declared, chosen, folder, callback, progress)
 
 
 def _closed(
@@ -172,14 +172,16 @@ def _closed(
     model: Model,
     chosen: Settings,
     folder: Path,
-    say: Callable[[str], None],
+    callback: Callable[[str], None],
     progress: bool,
 ) -> None:
     """Close the loop and print what came out, also where a late stage failed."""
     from bayesoleo import workflow
 
     try:
-        tree = workflow.close(campaign, model, chosen, out=folder, say=say, progress=progress)
+        tree = workflow.close(
+            campaign, model, chosen, out=folder, callback=callback, progress=progress
+        )
     except UnfinishedError as error:
         _print(error.tree, folder)
         raise
@@ -218,7 +220,7 @@ def check(
         shell.print_json(tables.plain(plan))
         return
     console = shell.console()
-    sentences = plan.pop("findings")
+    sentences = plan.pop("data_warnings")
     plan.pop("start")
     tables.print_mapping(plan, console)
     for sentence in sentences:

@@ -194,7 +194,7 @@ Without = Annotated[
         metavar="EFFECT,…",
         show_default=False,
         rich_help_panel=RUNNING,
-        help="Effects to leave out of the search; 'unnamed' leaves out functions without a name.",
+        help="Effects to leave out of the search; 'nonparametric' leaves out smooth functions.",
     ),
 ]
 

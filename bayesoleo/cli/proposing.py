@@ -93,8 +93,10 @@ def propose(
     )  # fmt: skip
     limits = dict(_limit(text) for text in limit or [])
     names = tuple(part.strip() for part in rivals.split(",") if part.strip())
-    declared, say = load_model(model), shell.teller(quiet)
-    tree = workflow.propose(campaign, declared, chosen, rivals=names, limits=limits, say=say)
+    declared, callback = load_model(model), shell.teller(quiet)
+    tree = workflow.propose(
+        campaign, declared, chosen, rivals=names, limits=limits, callback=callback
+    )
     summary = json.loads(tree.attrs[schema.SUMMARY])
     entries = summary["proposals"]
     if figure is not None:

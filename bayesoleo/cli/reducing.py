@@ -53,7 +53,7 @@ def reduce(
       bayesoleo reduce shaker --json > runs.json
     """
     from bayesoleo import workflow
-    from bayesoleo.data import findings, frequency_findings
+    from bayesoleo.data import data_warnings, frequency_warnings
 
     if out is not None:
         shell.check_writable(out.parent)
@@ -63,12 +63,12 @@ def reduce(
     if as_json:
         units = found.campaign.units
         facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
-        facts["findings"] = findings(found.records, units)
+        facts["data_warnings"] = data_warnings(found.records, units)
         shell.print_json(tables.plain(facts))
     else:
         _print_records(found, shell.console())
-        told = frequency_findings(found.records)
-        for sentence in findings(found.records, found.campaign.units):
+        told = frequency_warnings(found.records)
+        for sentence in data_warnings(found.records, found.campaign.units):
             if sentence not in told:
                 shell.complain(f"warning: {sentence}")
 

@@ -178,12 +178,12 @@ def teller(quiet: bool) -> Callable[[str], None]:
     if quiet:
         return lambda _: None
 
-    def say(text: str) -> None:
+    def callback(text: str) -> None:
         from tqdm import tqdm
 
         tqdm.write(text, file=sys.stderr)
 
-    return say
+    return callback
 
 
 def campaign_name(campaign: Path) -> str:

@@ -74,7 +74,7 @@ def estimate(
         by_run.estimate_each(campaign, declared, chosen, out, quiet, as_json)
         return
     with shell.stoppable(out):
-        tree = workflow.estimate(campaign, declared, chosen, out=out, say=shell.teller(quiet))
+        tree = workflow.estimate(campaign, declared, chosen, out=out, callback=shell.teller(quiet))
     quantities = _error_quantities(tree)
     if as_json:
         facts = {"parameters": _point(tree), "status": _status(tree)}
@@ -121,7 +121,7 @@ def _status(tree: xr.DataTree) -> dict[str, Any]:
 def _how_it_went(status: dict[str, Any]) -> list[str]:
     """How the estimate ended, which trials failed on the way, and how fine the mesh was."""
     from bayesoleo.solvers.status import counted
-    from bayesoleo.tracing.fitting.fit import LARGEST_SHIFT
+    from bayesoleo.tracing.policy import SearchPolicy
 
     lines = [status["status_message"]]
     failures = counted(json.loads(status["failures"]))
@@ -129,7 +129,7 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
         lines.append(f"trials that failed: {failures}")
     if "steps" in status:
         mesh = f"{status['scheme']} with {status['steps']} steps in a period"
-        if status["mesh_shift"] <= LARGEST_SHIFT:
+        if status["mesh_shift"] <= SearchPolicy().mesh_shift:
             mesh += (
                 f": half as long, they would move no parameter by more than"
                 f" {status['mesh_shift']:.2g} sd"
@@ -196,10 +196,12 @@ def sample(
         error_model=error_model,
         between_runs=between_runs,
     )
-    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(folder):
-        tree = workflow.sample(campaign, declared, chosen, out=folder, say=say, progress=progress)
+        tree = workflow.sample(
+            campaign, declared, chosen, out=folder, callback=callback, progress=progress
+        )
     console = shell.console()
     summary = Posterior(tree).summary()
     console.print(str(summary), markup=False, soft_wrap=True)
@@ -253,10 +255,12 @@ def trace(
         without=without,
         nuisance=nuisance,
     )
-    say, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(out):
-        tree = workflow.trace(campaign, declared, chosen, out=out, say=say, progress=progress)
+        tree = workflow.trace(
+            campaign, declared, chosen, out=out, callback=callback, progress=progress
+        )
     summary = json.loads(tree.attrs[schema.SUMMARY])
     console = shell.console()
     first = summary["rounds"][0]

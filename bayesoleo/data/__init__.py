@@ -9,12 +9,12 @@ from bayesoleo.data.declaration import Channel as Channel
 from bayesoleo.data.drift import Drift as Drift
 from bayesoleo.data.drift import drift as drift
 from bayesoleo.data.drift import record_drifts as record_drifts
-from bayesoleo.data.findings import findings as findings
-from bayesoleo.data.findings import frequency_findings as frequency_findings
+from bayesoleo.data.findings import data_warnings as data_warnings
+from bayesoleo.data.findings import frequency_warnings as frequency_warnings
 from bayesoleo.data.findings import motions_per_period as motions_per_period
 from bayesoleo.data.findings import periods_per_motion as periods_per_motion
 from bayesoleo.data.harmonics import significant_harmonics as significant_harmonics
-from bayesoleo.data.lines import Line as Line
+from bayesoleo.data.lines import SpectralLine as SpectralLine
 from bayesoleo.data.lines import foreign_line as foreign_line
 from bayesoleo.data.mapping import on_grid as on_grid
 from bayesoleo.data.period import Frequency as Frequency

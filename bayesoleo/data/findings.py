@@ -82,7 +82,7 @@ def periods_per_motion(record: Record) -> tuple[int, str]:
     return 1, ""
 
 
-def findings(records: Sequence[Record], units: Mapping[str, str] | None = None) -> list[str]:
+def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = None) -> list[str]:
     """Sentences about records that are usable but deserve a look.
 
     Parameters
@@ -149,7 +149,7 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
     return found
 
 
-def frequency_findings(records: Sequence[Record]) -> list[str]:
+def frequency_warnings(records: Sequence[Record]) -> list[str]:
     """Those about what repeats and when, without which everything else that is found is doubtful.
 
     Parameters

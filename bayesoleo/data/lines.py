@@ -29,7 +29,7 @@ _BESIDE, _FEWEST = 50, 3
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """A line between the harmonics.
 
     Parameters
@@ -55,7 +55,7 @@ class Line:
 
 def foreign_line(
     values: Array, time_step: float, frequency: float, channel: str = ""
-) -> Line | None:
+) -> SpectralLine | None:
     """The highest line between the harmonics of a periodic signal.
 
     Parameters
@@ -71,7 +71,7 @@ def foreign_line(
 
     Returns
     -------
-    Line or None
+    SpectralLine or None
         None where the record is too short for a line to stand out.
     """
     average = periodic_average(values, time_step, frequency)
@@ -92,10 +92,12 @@ def foreign_line(
     amplitude = 2.0 * float(np.sqrt(power[k])) / left.size
     # A median scatters as a mean of half as many would: the ratio has nearly an F distribution.
     p = float(-np.expm1(lines.size * np.log1p(-stats.f.sf(ratio[best], 2, _BESIDE))))
-    return Line(channel, k / (left.size * time_step), amplitude, max(average.sigma, 1e-300), p)
+    return SpectralLine(
+        channel, k / (left.size * time_step), amplitude, max(average.sigma, 1e-300), p
+    )
 
 
-def foreign_lines(record: Record) -> tuple[Line, ...]:
+def foreign_lines(record: Record) -> tuple[SpectralLine, ...]:
     """Channels of a periodic run with a line that is higher than chance makes it, and matters."""
     if not record.periodic:
         return ()

@@ -226,19 +226,19 @@ def _gauss_newton(values: Array, step: float) -> tuple[float, float, int]:
     for limit in LADDER:
         # The last rung stops at a thousandth of the standard deviation, the others before it.
         tolerance = 0.3 if limit < highest else 1e-3
-        state, taken = _descend(_State(values, step, highest, limit), values, tolerance)
+        state, taken = _descend(_FrequencyFit(values, step, highest, limit), values, tolerance)
         step, steps = state.step, steps + taken
         if limit >= highest:
             break
     return state.step, state.sd, steps
 
 
-def _descend(state: _State, values: Array, tolerance: float) -> tuple[_State, int]:
+def _descend(state: _FrequencyFit, values: Array, tolerance: float) -> tuple[_FrequencyFit, int]:
     taken = 0
     while taken < 30 and abs(state.newton) > max(tolerance * state.sd, 1e-14 * state.step):
         change = state.newton
         for _ in range(6):
-            trial = _State(values, state.step + change, state.highest, state.limit)
+            trial = _FrequencyFit(values, state.step + change, state.highest, state.limit)
             # The step that is left has to shrink. The sum of squares is no measure of it: the
             # harmonics that are only noise take part in that, and move its minimum.
             if abs(trial.newton) < abs(state.newton):
@@ -250,7 +250,7 @@ def _descend(state: _State, values: Array, tolerance: float) -> tuple[_State, in
     return state, taken
 
 
-class _State:
+class _FrequencyFit:
     """Least squares on harmonics at one frequency: next step, standard deviation.
 
     The derivative of the signal with respect to frequency is time times its rate of change, of the

@@ -12,8 +12,8 @@ A catalogue effect, and one of your own:
 
 from bayesoleo.effects.catalogue import candidates, catalogue, describe, find_effect
 from bayesoleo.effects.effect import FAMILIES, Candidate, Effect
-from bayesoleo.effects.force_effect import State, force_effect
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
+from bayesoleo.effects.force_effect import InternalState, force_effect
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
 
 __all__ = [
     "FAMILIES",
@@ -21,9 +21,9 @@ __all__ = [
     "Candidate",
     "Constant",
     "Effect",
+    "InternalState",
     "Scales",
-    "Shape",
-    "State",
+    "ShapeParameter",
     "candidates",
     "catalogue",
     "describe",

@@ -21,7 +21,7 @@ from bayesoleo.effects import (
     thermal,
 )
 from bayesoleo.effects.effect import Candidate, Effect
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model
 
@@ -138,5 +138,5 @@ def describe(effect: Effect) -> dict[str, Any]:
     }
 
 
-def _entry(item: Amplitude | Shape | Constant, latex: str, kind: str) -> dict[str, Any]:
+def _entry(item: Amplitude | ShapeParameter | Constant, latex: str, kind: str) -> dict[str, Any]:
     return {"unit": item.unit, "latex": latex, "description": item.description, "kind": kind}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from bayesoleo.effects.parts import Amplitude, Shape
+from bayesoleo.effects.parts import Amplitude, ShapeParameter
 from bayesoleo.effects.units import parse_unit, unit_of, unit_text
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model.expressions import FUNCTIONS, derivative_symbol, parse, symbol
@@ -60,7 +60,7 @@ def check_unit(
     expression: str,
     used: Iterable[str],
     amplitudes: Sequence[Amplitude],
-    shapes: Sequence[Shape],
+    shapes: Sequence[ShapeParameter],
     states: Mapping[str, Any],
     id_: str,
 ) -> None:

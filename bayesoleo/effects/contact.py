@@ -9,9 +9,9 @@ from __future__ import annotations
 from bayesoleo.effects.effect import Effect
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import range_grid
-from bayesoleo.effects.parts import Amplitude, Shape
+from bayesoleo.effects.parts import Amplitude, ShapeParameter
 
-_DEPTH = Shape(
+_DEPTH = ShapeParameter(
     "depth",
     "position",
     "h",
@@ -61,7 +61,9 @@ PLAY = force_effect(
         )
     },
     shapes=(
-        Shape("gap", "position", "g", "half the gap about mid-stroke", range_grid(1 / 64, 1 / 4)),
+        ShapeParameter(
+            "gap", "position", "g", "half the gap about mid-stroke", range_grid(1 / 64, 1 / 4)
+        ),
     ),
     formula=r"- k_g \operatorname{clip}(q - q_\mathrm{mid}, -g, g)",
     title="Play: no stiffness in a gap about mid-stroke",
@@ -74,7 +76,7 @@ PRELOAD = force_effect(
     "preload*2/pi*atan((position - (lowest_position + highest_position)/2)/width)",
     {"preload": Amplitude("preload", "force", "F_p", "force that a preloaded spring holds", 1)},
     shapes=(
-        Shape(
+        ShapeParameter(
             "width",
             "position",
             "w",

@@ -14,7 +14,7 @@ import sympy as sp
 from bayesoleo.effects.effect import Effect, Names
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import values, velocity_grid
-from bayesoleo.effects.parts import Amplitude, Shape
+from bayesoleo.effects.parts import Amplitude, ShapeParameter
 from bayesoleo.effects.places import damping_terms, force_places, is_quantity, moving_places
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import symbol
@@ -59,7 +59,9 @@ POWER_LAW = force_effect(
         )
     },
     shapes=(
-        Shape("exponent", "", "a", "exponent of the velocity", values(0.25, 0.5, 1.0, 1.5, 2.5)),
+        ShapeParameter(
+            "exponent", "", "a", "exponent of the velocity", values(0.25, 0.5, 1.0, 1.5, 2.5)
+        ),
     ),
     formula=r"F_a |\dot q / v_\mathrm{max}|^a \operatorname{sign} \dot q",
     title="Power-law damping",
@@ -202,7 +204,7 @@ CAVITATING = force_effect(
         )
     },
     shapes=(
-        Shape(
+        ShapeParameter(
             "onset",
             "position/s",
             r"v_\mathrm{cav}",

@@ -16,7 +16,7 @@ import numpy as np
 import sympy as sp
 
 from bayesoleo.effects.checks import check_grid
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape, always
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter, always
 from bayesoleo.effects.units import target_units
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import LogNormal, Model, Parameter
@@ -35,7 +35,7 @@ FAMILIES = (
     "sensor",
     "run-to-run",
     "clock",
-    "unnamed",
+    "nonparametric",
 )
 
 #: Source of effects that differ from run to run.
@@ -111,7 +111,7 @@ class Effect:
     change : callable (model, target, names) -> Model
         Extends the model, to which the new parameters have been added already; ``names`` maps the
         effect's own names of them to their symbols.
-    shapes : tuple of Shape
+    shapes : tuple of ShapeParameter
         Usually none or one, at most two.
     constants : tuple of Constant
         Fixed numbers with a unit.
@@ -147,7 +147,7 @@ class Effect:
     amplitudes: tuple[Amplitude, ...]
     places: Callable[[Model], Sequence[str]]
     change: Callable[[Model, str, Names], Model]
-    shapes: tuple[Shape, ...] = ()
+    shapes: tuple[ShapeParameter, ...] = ()
     constants: tuple[Constant, ...] = ()
     source: str = ""
     applies_to: str = "every model"
@@ -176,7 +176,7 @@ class Effect:
         return (not self.kind or scales.kinds == {self.kind}) and self.shown(scales)
 
     @property
-    def _parts(self) -> tuple[Amplitude | Shape | Constant, ...]:
+    def _parts(self) -> tuple[Amplitude | ShapeParameter | Constant, ...]:
         return (*self.amplitudes, *self.shapes, *self.constants)
 
     @property

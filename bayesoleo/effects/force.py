@@ -10,7 +10,7 @@ import sympy as sp
 from bayesoleo.effects.effect import BY_RUN, Effect, Names
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import Scan
-from bayesoleo.effects.parts import Amplitude, Scales, Shape
+from bayesoleo.effects.parts import Amplitude, Scales, ShapeParameter
 from bayesoleo.effects.places import (
     acceleration,
     balance_terms,
@@ -173,7 +173,7 @@ def _humming(model: Model, target: str, names: Names) -> Model:
 
 def _heard(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
     """The frequency of the line; any where nothing hums, for whoever extends a model by hand."""
-    return (scales.hum or 1.0 / scales.shortest_period,)
+    return (scales.dominant_frequency or 1.0 / scales.shortest_period,)
 
 
 _HEARD = Scan(_heard, "that of the highest line")
@@ -189,13 +189,13 @@ HUMMING = Effect(
     ),
     places=_locked,
     change=_humming,
-    shapes=(Shape("frequency", "Hz", "f_h", "frequency of a hum", _HEARD),),
+    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", _HEARD),),
     source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
     applies_to="balances of forces of driven models, in transient runs with a line that no input"
     " has",
     driven=True,
     kind="transient",
-    shown=lambda scales: scales.hum is not None,
+    shown=lambda scales: scales.dominant_frequency is not None,
 )
 
 GRAVITY_ERROR = Effect(

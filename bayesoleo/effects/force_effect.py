@@ -11,7 +11,7 @@ import sympy as sp
 from bayesoleo.effects.checks import check_names, check_null, check_states, check_unit
 from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.grids import coordinate_of, velocity_grid
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
 from bayesoleo.effects.places import (
     acceleration,
     force_places,
@@ -33,7 +33,7 @@ _NEED_VELOCITY = {"velocity", "acceleration", "direction", "largest_velocity"}
 
 
 @dataclass(frozen=True)
-class State:
+class InternalState:
     """A new first-order dof that an effect brings with it, such as the memory of friction.
 
     Parameters
@@ -59,8 +59,8 @@ def force_effect(
     *,
     formula: str = "",
     title: str = "",
-    shapes: tuple[Shape, ...] = (),
-    states: Mapping[str, State] | None = None,
+    shapes: tuple[ShapeParameter, ...] = (),
+    states: Mapping[str, InternalState] | None = None,
     requires: tuple[str, ...] = (),
     source: str = "",
     applies_to: str = "",
@@ -87,9 +87,9 @@ def force_effect(
         stand for the units of the place: ``{"k3": "force/position**3"}``.
     formula, title : str, optional
         LaTeX and a few words; made from the expression and the id where they are left out.
-    shapes : tuple of Shape
+    shapes : tuple of ShapeParameter
         Parameters that the null leaves undefined, with their scan grids.
-    states : mapping of str to State
+    states : mapping of str to InternalState
         New first-order dofs.
     requires : tuple of str
         Names that a model must declare for the effect to apply.
@@ -167,7 +167,7 @@ _MOTION_CONSTANTS = (
 )
 
 #: Velocity over which the sign of a dry friction force changes, where the model states no slope.
-_SMOOTHING = Shape(
+_SMOOTHING = ShapeParameter(
     "smoothing",
     "position/s",
     "v_0",
@@ -220,7 +220,7 @@ def _pressure(model: Model) -> sp.Symbol | None:
 
 
 def _adding_term(
-    effect: str, expression: str, states: Mapping[str, State]
+    effect: str, expression: str, states: Mapping[str, InternalState]
 ) -> Callable[[Model, str, Names], Model]:
     """The change that adds the states and the force."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bayesoleo.effects.force_effect import force_effect
 from bayesoleo.effects.grids import velocity_grid
-from bayesoleo.effects.parts import Amplitude, Shape
+from bayesoleo.effects.parts import Amplitude, ShapeParameter
 
 ARMSTRONG = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), 1083-1138"
 
@@ -19,7 +19,7 @@ COULOMB = force_effect(
     "coulomb_friction*2/pi*atan(velocity/transition)",
     {"coulomb_friction": Amplitude("coulomb_friction", "force", "F_c", "Coulomb friction")},
     shapes=(
-        Shape(
+        ShapeParameter(
             "transition",
             "position/s",
             "v_0",
@@ -56,7 +56,7 @@ STRIBECK = force_effect(
         )
     },
     shapes=(
-        Shape(
+        ShapeParameter(
             "decay",
             "position/s",
             "v_s",

@@ -6,11 +6,11 @@ the null leaves their equations regular.
 
 from __future__ import annotations
 
-from bayesoleo.effects.force_effect import State, force_effect
+from bayesoleo.effects.force_effect import InternalState, force_effect
 from bayesoleo.effects.grids import range_grid, velocity_once
-from bayesoleo.effects.parts import Amplitude, Shape
+from bayesoleo.effects.parts import Amplitude, ShapeParameter
 
-_STIFFNESS = Shape(
+_STIFFNESS = ShapeParameter(
     "rate",
     "1/position",
     r"\rho",
@@ -25,7 +25,7 @@ DAHL = force_effect(
     {"dahl_friction": Amplitude("dahl_friction", "force", "F_D", "sliding friction", 1)},
     shapes=(_STIFFNESS,),
     states={
-        "memory": State(
+        "memory": InternalState(
             "dot(memory) - rate*(velocity - abs(velocity)*memory)",
             description="friction over sliding friction",
         )
@@ -43,7 +43,7 @@ BOUC_WEN = force_effect(
     {"bouc_wen_friction": Amplitude("bouc_wen_friction", "force", "F_B", "yield force", 1)},
     shapes=(_STIFFNESS,),
     states={
-        "memory": State(
+        "memory": InternalState(
             "dot(memory) - rate*(velocity - (abs(velocity)*memory + velocity*abs(memory))/2)",
             description="hysteretic force over yield force",
         )
@@ -60,7 +60,7 @@ LUGRE = force_effect(
     {"lugre_friction": Amplitude("lugre_friction", "force", "F_L", "sliding friction", 1)},
     shapes=(
         _STIFFNESS,
-        Shape(
+        ShapeParameter(
             "decay",
             "position/s",
             "v_s",
@@ -69,7 +69,7 @@ LUGRE = force_effect(
         ),
     ),
     states={
-        "memory": State(
+        "memory": InternalState(
             "dot(memory) - rate*(velocity - abs(velocity)*memory"
             "/(1 + exp(-(velocity/decay)**2)/2))",
             description="friction over sliding friction",

@@ -40,7 +40,7 @@ class Scales:
     longest_period: float
     output_range: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     kinds: frozenset[str] = frozenset({"periodic"})
-    hum: float | None = None
+    dominant_frequency: float | None = None
     conditions: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -82,7 +82,7 @@ def always(_: Model | Scales) -> bool:
 
 
 @dataclass(frozen=True)
-class Shape:
+class ShapeParameter:
     """A new parameter that the null leaves undefined: a velocity, a length, a time constant.
 
     ``grid`` gives the values to scan; ``needed`` says whether a model needs this shape at all.

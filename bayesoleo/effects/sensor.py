@@ -13,7 +13,7 @@ import sympy as sp
 
 from bayesoleo.effects.effect import Effect, Names
 from bayesoleo.effects.grids import Scan, geometric
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
 from bayesoleo.effects.places import substitute
 from bayesoleo.model import Model, possible_drives
 from bayesoleo.model.expressions import (
@@ -263,7 +263,9 @@ def _saturation(side: str) -> Effect:
         change=saturate,
         source=f"{VOCABULARY}, 4.7: measuring interval",
         shapes=(
-            Shape("depth", "channel", "h", f"distance from the {word} value measured", _DEPTH),
+            ShapeParameter(
+                "depth", "channel", "h", f"distance from the {word} value measured", _DEPTH
+            ),
         ),
         constants=(
             Constant("extreme", "channel", f"{word} value measured", _extreme(1 if upper else 0)),

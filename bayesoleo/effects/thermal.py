@@ -18,7 +18,7 @@ import sympy as sp
 from bayesoleo.effects.effect import Effect, Names, free_name
 from bayesoleo.effects.gas import as_gas_spring, has_gas, of_gas, volume_ratio_rate
 from bayesoleo.effects.grids import Scan, geometric, period_grid, values
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, Shape
+from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
 from bayesoleo.effects.places import is_quantity
 from bayesoleo.model import Dof, Model
 from bayesoleo.model.expressions import derivative_symbol, symbol
@@ -119,8 +119,10 @@ HEAT_EXCHANGE = Effect(
     places=_polytropic,
     change=of_gas(_exchange_heat),
     shapes=(
-        Shape("conduction", "W/K", "G", "heat conduction to the ambient", _CONDUCTION),
-        Shape("swept", "", "s", "part of the conducting wall that the piston sweeps", _SWEPT),
+        ShapeParameter("conduction", "W/K", "G", "heat conduction to the ambient", _CONDUCTION),
+        ShapeParameter(
+            "swept", "", "s", "part of the conducting wall that the piston sweeps", _SWEPT
+        ),
     ),
     constants=(
         Constant(
@@ -187,7 +189,7 @@ def _warm_oil(model: Model, target: str, names: Names) -> Model:
     return model.with_dof(dof, described, equation).with_definition(target, loss)
 
 
-_STORAGE_TIME = Shape(
+_STORAGE_TIME = ShapeParameter(
     "time_constant", "s", r"\tau", "resistance times heat capacity", period_grid(1 / 8, 4.0)
 )
 

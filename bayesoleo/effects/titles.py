@@ -10,7 +10,7 @@ from bayesoleo.effects.catalogue import catalogue
 
 #: Words with which a title begins as a sentence writes them.
 PROPER = frozenset({"Coulomb", "Hertzian", "Dahl", "Bouc-Wen", "LuGre", "Stribeck"})
-_UNNAMED = "Unnamed: "
+_NONPARAMETRIC = "Nonparametric: "
 
 
 @cache
@@ -34,7 +34,7 @@ def in_sentence(title: str) -> str:
     >>> in_sentence("Coulomb friction")
     'Coulomb friction'
     """
-    text = title.removeprefix(_UNNAMED).split(":")[0]
+    text = title.removeprefix(_NONPARAMETRIC).split(":")[0]
     text = " ".join(re.sub(r"\([^)]*\)", "", text).split()) or title
     first = text.split()[0]
     kept = first in PROPER or first[1:] != first[1:].lower() or (len(first) == 1 and first != "A")

@@ -29,7 +29,7 @@ from bayesoleo.effects.units import target_units
 from bayesoleo.model import Coordinate, Model
 from bayesoleo.model.expressions import bspline, symbol
 
-FAMILY = "unnamed"
+FAMILY = "nonparametric"
 #: How the description of a coefficient begins, by which it is known in a model.
 COEFFICIENT = "coefficient of a spline"
 #: Part of the range by which splines reach beyond it, lest the motion turn on their edge.
@@ -40,7 +40,7 @@ DIGITS = 10
 
 @dataclass(frozen=True)
 class Axis:
-    """A quantity that an unnamed effect follows.
+    """A quantity that a nonparametric effect follows.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def tensor(bases: Sequence[Array]) -> Array:
 
 
 @dataclass(frozen=True)
-class UnnamedEffect(Effect):
+class NonparametricEffect(Effect):
     """An effect that remembers of which function it is made."""
 
     spline: Spline | None = None
@@ -148,14 +148,14 @@ class Spline:
         found: Array = self.weights.T @ tensor(parts)
         return found
 
-    def effect(self) -> UnnamedEffect:
+    def effect(self) -> NonparametricEffect:
         """The effect, to be estimated like any other."""
         size = self.weights.shape[1]
         unit = "force"
-        return UnnamedEffect(
+        return NonparametricEffect(
             id=self.id,
             family=FAMILY,
-            title=f"Unnamed: a smooth function of {self.quantities}",
+            title=f"Nonparametric: a smooth function of {self.quantities}",
             formula=r"\sum_k a_k B_k(" + ", ".join(map(_latex, self.axes)) + ")",
             amplitudes=tuple(
                 Amplitude(f"{self.id}_{k}", unit, f"a_{{{k}}}", f"{COEFFICIENT}, {self.id}")
@@ -186,8 +186,8 @@ class Spline:
 
 
 def balance_places(model: Model) -> dict[str, Coordinate]:
-    """Where an unnamed effect can act: as a force does, in the equation of any other dof, and in a
-    law whose inputs are no motion."""
+    """Where a nonparametric effect can act: as a force does, in the equation of any other dof, and
+    in a law whose inputs are no motion."""
     places = force_places(model)
     alone = not places and not model.dofs
     for item in model.coordinates():
@@ -197,7 +197,7 @@ def balance_places(model: Model) -> dict[str, Coordinate]:
 
 
 def balance_unit_at(model: Model, target: str) -> str:
-    """Unit of an unnamed effect at a target."""
+    """Unit of a nonparametric effect at a target."""
     return target_units(model, target).resolve("force")
 
 

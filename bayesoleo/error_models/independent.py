@@ -26,7 +26,7 @@ from bayesoleo.error_models.base import (
     log_mean_squares,
     normal_blocks,
 )
-from bayesoleo.error_models.linearise import Linearised
+from bayesoleo.error_models.linearise import LinearisedResidual
 from bayesoleo.errors import InputError
 from bayesoleo.model.priors import LogNormal
 
@@ -188,7 +188,7 @@ class ProfiledIndependentErrors(ProfiledErrorModel):
         return log_likelihood(moments, covariance, counts)
 
     def rows(self, evaluation: Residuals, unit: Array, covariance: Array) -> tuple[Array, Array]:
-        return Linearised.of(evaluation, unit).whitened(covariance)
+        return LinearisedResidual.of(evaluation, unit).whitened(covariance)
 
     def weighted(self, residual: Sequence[Array], covariance: Array) -> tuple[Array, ...]:
         return tuple(e / v for e, v in zip(residual, covariance, strict=True))

@@ -25,7 +25,7 @@ _TAKES_PART = 1e-3
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedResidual:
     """Least-squares equations of one linearisation, in scaled unknowns.
 
     Parameters
@@ -37,7 +37,7 @@ class Linearised:
     factors: tuple[Array, ...]
 
     @classmethod
-    def of(cls, evaluation: Residuals, scale: Array) -> Linearised:
+    def of(cls, evaluation: Residuals, scale: Array) -> LinearisedResidual:
         """Compress an evaluation whose unknowns are measured in ``scale``, shape (l,)."""
         return cls(
             tuple(

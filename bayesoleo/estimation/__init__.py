@@ -27,10 +27,10 @@ from bayesoleo.estimation.runs.identifiability import data_against_prior
 from bayesoleo.estimation.runs.nuisance import Nuisance, declared_nuisance
 from bayesoleo.estimation.runs.per_run import estimate_each
 from bayesoleo.estimation.sensitivity.analyse import global_sensitivity, local_sensitivity, sobol
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.estimation.trajectories.multiple_shooting import (
+    EstimatedTrajectory,
     ShootingEstimate,
-    Trajectory,
     multiple_shooting,
 )
 from bayesoleo.estimation.uncertainty.axes import principal_axes
@@ -49,10 +49,12 @@ __all__ = [
     "METHODS",
     "OBJECTIVES",
     "CampaignProblem",
+    "EstimatedTrajectory",
     "Evaluation",
     "FunctionProblem",
     "Hierarchy",
     "Iteration",
+    "LabelledResult",
     "Misfit",
     "Modes",
     "Nuisance",
@@ -61,9 +63,7 @@ __all__ = [
     "Problem",
     "Replications",
     "ShootingEstimate",
-    "Shown",
     "Step",
-    "Trajectory",
     "as_text",
     "between_runs",
     "data_against_prior",

@@ -9,7 +9,7 @@ import xarray as xr
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Shown:
+class LabelledResult:
     """Labelled arrays with the words that a person reads first.
 
     Parameters

@@ -15,7 +15,7 @@ from bayesoleo.plots.forest import point_against_posterior
 from bayesoleo.plots.histories import history
 from bayesoleo.plots.pairs import pairs
 from bayesoleo.plots.period_search import period_search
-from bayesoleo.plots.places import whereabouts
+from bayesoleo.plots.places import residual_breakdown
 from bayesoleo.plots.predictions import predictive
 from bayesoleo.plots.prior_sensitivities import prior_sensitivity
 from bayesoleo.plots.proposals import proposal
@@ -29,7 +29,7 @@ from bayesoleo.plots.sensitivities import sensitivity
 from bayesoleo.plots.traces import trace
 from bayesoleo.plots.trajectories import trajectory
 from bayesoleo.plots.units import Scale, engineering, format_unit, format_value
-from bayesoleo.plots.unnamed_shapes import unnamed_shape
+from bayesoleo.plots.unnamed_shapes import nonparametric_shape
 
 __all__ = [
     "Scale",
@@ -45,6 +45,7 @@ __all__ = [
     "format_value",
     "history",
     "indifference",
+    "nonparametric_shape",
     "pairs",
     "period_search",
     "point_against_posterior",
@@ -55,11 +56,10 @@ __all__ = [
     "ranking",
     "records",
     "residual",
+    "residual_breakdown",
     "residual_tests",
     "sampling_distribution",
     "sensitivity",
     "trace",
     "trajectory",
-    "unnamed_shape",
-    "whereabouts",
 ]

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.sensitivities import table
@@ -16,12 +16,14 @@ from bayesoleo.plots.sensitivities import table
 HIGH = 2.1
 
 
-def assessment(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
+def assessment(
+    found: LabelledResult | xr.Dataset | xr.DataTree, output: str | None = None
+) -> Figure:
     """Correlograms, the lack of fit and the dependence of one output's residuals.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         The group ``assessment``.
     output : str, optional
         By default the first.

@@ -8,7 +8,7 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.units import engineering
@@ -18,12 +18,12 @@ HIGH, GAP, TOP, BOTTOM, LEFT = 1.6, 0.7, 0.75, 0.55, 0.85
 MOST = 12
 
 
-def forecast(found: Shown | xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
+def forecast(found: LabelledResult | xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
     """Band and measurement of each run, with the probability integral transform beside it.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         Of :func:`bayesoleo.forecast.predict`.
     output : str, optional
         By default the first.

@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from bayesoleo import schema
 from bayesoleo.assessment.whereabouts import ORDERS
-from bayesoleo.assessment.whereabouts import whereabouts as found_in
+from bayesoleo.assessment.whereabouts import residual_breakdown as found_in
 from bayesoleo.plots import style
 
 TOP, BOTTOM, GAP, ROW = 0.75, 0.62, 0.75, 2.3
@@ -17,7 +17,7 @@ TOP, BOTTOM, GAP, ROW = 0.75, 0.62, 0.75, 2.3
 SHOWN = 7
 
 
-def whereabouts(tree: xr.DataTree) -> Figure:
+def residual_breakdown(tree: xr.DataTree) -> Figure:
     """Share of the repeating error by harmonic, and what of it a function of a coordinate explains.
 
     Parameters

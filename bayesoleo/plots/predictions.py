@@ -102,7 +102,9 @@ def _shown(data: xr.Dataset) -> list[str]:
     return [str(name) for name in data.data_vars if schema.average_sd(str(name)) in data]
 
 
-def _row(tree: xr.DataTree, data: xr.Dataset, output: str, run: reading.Run, level: float) -> _Row:
+def _row(
+    tree: xr.DataTree, data: xr.Dataset, output: str, run: reading.RunView, level: float
+) -> _Row:
     about = data[schema.expected(output)] - data[schema.at_estimate(output)]
     draws = about.transpose(schema.CHAIN, schema.DRAW, schema.PHASE).values
     draws = draws.reshape(-1, draws.shape[-1])

@@ -12,14 +12,14 @@ import xarray as xr
 from bayesoleo import schema
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 
 BINS = 120
 """Points shown over one period."""
 
 
 @dataclass(frozen=True)
-class Run:
+class RunView:
     """What is said about a run in the title of its panel."""
 
     index: int
@@ -37,7 +37,7 @@ class Run:
         return f"{self.frequency:.3g} Hz" if np.isfinite(self.frequency) else ""
 
 
-def dataset(found: Shown | xr.Dataset | xr.DataTree) -> xr.Dataset:
+def dataset(found: LabelledResult | xr.Dataset | xr.DataTree) -> xr.Dataset:
     """The labelled arrays of a result, as the function that found it returns it, bare or a group.
 
     Raises
@@ -45,7 +45,7 @@ def dataset(found: Shown | xr.Dataset | xr.DataTree) -> xr.Dataset:
     InputError
         If it is neither.
     """
-    data = found.data if isinstance(found, Shown) else found
+    data = found.data if isinstance(found, LabelledResult) else found
     if isinstance(data, xr.DataTree):
         return data.to_dataset()
     if not isinstance(data, xr.Dataset):
@@ -93,7 +93,7 @@ def channels(tree: xr.DataTree) -> list[str]:
     return sorted(own, key=lambda name: name in outputs(tree))
 
 
-def runs(tree: xr.DataTree) -> list[Run]:
+def runs(tree: xr.DataTree) -> list[RunView]:
     """The runs, in the order of the tree."""
     data, constant = group(tree, schema.RECORDS), group(tree, schema.CONSTANT_DATA)
     if data is None:
@@ -110,7 +110,7 @@ def runs(tree: xr.DataTree) -> list[Run]:
         periodic = np.isfinite(data[schema.PHASE].values).any(axis=1)
     duration = np.nanmax(time, axis=1) - np.nanmin(time, axis=1)
     return [
-        Run(
+        RunView(
             i,
             str(labels[i]),
             roles[i],
@@ -127,7 +127,7 @@ def unit(data: xr.DataArray) -> str:
     return str(data.attrs.get(schema.UNITS, ""))
 
 
-def abscissa(tree: xr.DataTree, run: Run) -> Array:
+def abscissa(tree: xr.DataTree, run: RunView) -> Array:
     """Phase modulo 1 of every sample; of a transient the fraction of its duration; NaN padded."""
     data = tree[schema.RECORDS].to_dataset()
     if run.periodic:

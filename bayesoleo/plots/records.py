@@ -52,7 +52,7 @@ def _channel(
     box: tuple[float, float, float, float],
     tree: xr.DataTree,
     name: str,
-    run: reading.Run,
+    run: reading.RunView,
     last: bool,
 ) -> None:
     """One channel of one run; all runs of a channel share its scale."""
@@ -97,7 +97,7 @@ def _head(figure: Figure, tree: xr.DataTree, name: str, x: float, height: float)
     )
 
 
-def _row_label(figure: Figure, run: reading.Run, y: float) -> None:
+def _row_label(figure: Figure, run: reading.RunView, y: float) -> None:
     """Label, role and frequency of a run at the left of its row."""
     held_out = run.role == schema.HOLD_OUT
     colour = style.AFTER if held_out else style.FAINT

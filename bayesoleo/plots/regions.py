@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy import interpolate, stats
 
 from bayesoleo import schema
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 
@@ -19,12 +19,12 @@ SIDE, GAP, LEFT, TOP, BOTTOM, COLUMNS = 2.6, 0.75, 0.85, 0.6, 0.55, 3
 MOST = 12
 
 
-def indifference(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
+def indifference(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     """Contours of the objective and the ellipses of its second-order expansion, plane by plane.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         The group ``indifference``.
 
     Returns
@@ -56,12 +56,12 @@ def indifference(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
     return figure
 
 
-def profile(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
+def profile(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     """Fall of the profiled objective along each parameter, with the parabola of linearisation.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         From :func:`bayesoleo.estimation.profile`.
 
     Returns

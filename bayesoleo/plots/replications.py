@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from bayesoleo import schema
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 from bayesoleo.plots.regions import MOST, panel_grid
@@ -18,12 +18,12 @@ BINS = 41
 WIDTHS = 4.5
 
 
-def sampling_distribution(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
+def sampling_distribution(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     """Histograms of the estimates about the truth, in standard deviations of the bound.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         The group ``sampling_distribution``.
 
     Returns

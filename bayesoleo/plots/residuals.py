@@ -67,7 +67,7 @@ def residual(tree: xr.DataTree, output: str, against: Against = "phase") -> Figu
 
 
 def _curve(
-    tree: xr.DataTree, data: xr.Dataset, name: str, run: reading.Run, against: Against
+    tree: xr.DataTree, data: xr.Dataset, name: str, run: reading.RunView, against: Against
 ) -> tuple[Array, Array]:
     """What is drawn of one run, in SI."""
     mean = schema.mean(name)
@@ -114,7 +114,7 @@ def _x_scale(data: xr.Dataset, against: Against) -> Scale:
     return engineering(reading.unit(data[against]), style.magnitude(data[against].values))
 
 
-def _noise(axes: Axes, data: xr.Dataset, output: str, run: reading.Run, scale: Scale) -> None:
+def _noise(axes: Axes, data: xr.Dataset, output: str, run: reading.RunView, scale: Scale) -> None:
     """The band of the standard error, and zero."""
     axes.axhline(0.0, color=style.FAINT, lw=0.6, zorder=0)
     name = schema.noise(output)

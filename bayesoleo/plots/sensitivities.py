@@ -9,7 +9,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from bayesoleo import schema
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.plots import style
 from bayesoleo.plots.reading import dataset
 
@@ -18,12 +18,12 @@ MOST = 40
 _SHADES = LinearSegmentedColormap.from_list("share", ["#ffffff", style.SIMILAR, style.AFTER])
 
 
-def sensitivity(found: Shown | xr.Dataset | xr.DataTree) -> Figure:
+def sensitivity(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     """Sobol indices, or local changes in per cent, feature by parameter.
 
     Parameters
     ----------
-    found : Shown, xarray.Dataset or xarray.DataTree
+    found : LabelledResult, xarray.Dataset or xarray.DataTree
         From :func:`~bayesoleo.estimation.global_sensitivity`, ``sobol`` or
         ``local_sensitivity``.
 

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
 
 from bayesoleo import schema
-from bayesoleo.plots.reading import Run
+from bayesoleo.plots.reading import RunView
 
 # Okabe and Ito (2008): before is vermilion, after is blue, wherever they are shown.
 BEFORE = "#d55e00"
@@ -74,12 +74,12 @@ def dress(axes: Axes, ticks: int = 4) -> None:
         axis.set_major_formatter(formatter)
 
 
-def panels(runs: Sequence[Run], *, free_x: bool = False) -> Panels:
+def panels(runs: Sequence[RunView], *, free_x: bool = False) -> Panels:
     """Small multiples, one for each run, with the run's label, role and frequency on top.
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of RunView
         Those shown.
     free_x : bool
         Whether every panel has its own horizontal axis, which takes room for its numbers.
@@ -109,7 +109,7 @@ def panels(runs: Sequence[Run], *, free_x: bool = False) -> Panels:
     return Panels(figure, axes, columns)
 
 
-def title(axes: Axes, run: Run) -> None:
+def title(axes: Axes, run: RunView) -> None:
     """Label on the left, frequency on the right; hold-out runs are marked by weight and word."""
     held_out = run.role == schema.HOLD_OUT
     text = " · ".join(part for part in ("hold-out" if held_out else "", run.remark) if part)
@@ -157,7 +157,7 @@ def band(colour: str, text: str) -> Patch:
     return Patch(facecolor=colour, edgecolor="none", label=text)
 
 
-def omitted(runs: Sequence[Run]) -> tuple[list[Run], str]:
+def omitted(runs: Sequence[RunView]) -> tuple[list[RunView], str]:
     """The runs shown, and what is said where some are not."""
     remark = f"first {MOST_PANELS} of {len(runs)} runs" if len(runs) > MOST_PANELS else ""
     return list(runs[:MOST_PANELS]), remark
@@ -201,7 +201,7 @@ def cycles(axes: Axes) -> None:
     axes.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "¼", "½", "¾", "1"])
 
 
-def x_name(runs: Sequence[Run]) -> str:
+def x_name(runs: Sequence[RunView]) -> str:
     """What stands under panels over one period."""
     text = "phase in cycles"
     if all(run.periodic for run in runs):

@@ -9,7 +9,7 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from bayesoleo.estimation.trajectories.multiple_shooting import Trajectory
+from bayesoleo.estimation.trajectories.multiple_shooting import EstimatedTrajectory
 from bayesoleo.plots import style
 from bayesoleo.plots.units import engineering
 
@@ -17,7 +17,7 @@ HIGH, GAP, TOP, BOTTOM = 1.25, 0.22, 0.5, 0.5
 
 
 def trajectory(
-    found: Trajectory,
+    found: EstimatedTrajectory,
     *,
     units: Mapping[str, str] | None = None,
     truth: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
@@ -26,7 +26,7 @@ def trajectory(
 
     Parameters
     ----------
-    found : Trajectory
+    found : EstimatedTrajectory
         One of :attr:`bayesoleo.estimation.ShootingEstimate.trajectories`.
     units : mapping of str to str, optional
         SI unit of each state by its name.

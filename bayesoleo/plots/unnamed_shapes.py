@@ -18,13 +18,13 @@ HEIGHT = 3.6
 BAND = 1.96
 
 
-def unnamed_shape(found: xr.Dataset | xr.DataTree) -> Figure:
-    """An unnamed effect over the quantities that it follows.
+def nonparametric_shape(found: xr.Dataset | xr.DataTree) -> Figure:
+    """A nonparametric effect over the quantities that it follows.
 
     Parameters
     ----------
     found : xarray.Dataset or xarray.DataTree
-        The group ``unnamed`` of a result, or the result.
+        The group ``nonparametric`` of a result, or the result.
 
     Returns
     -------
@@ -32,8 +32,8 @@ def unnamed_shape(found: xr.Dataset | xr.DataTree) -> Figure:
         Of one quantity the function and its 95 % band; of two a map of the function and one of its
         standard deviation.
     """
-    if isinstance(found, xr.DataTree) and schema.UNNAMED in found.children:
-        found = found[schema.UNNAMED].to_dataset()
+    if isinstance(found, xr.DataTree) and schema.NONPARAMETRIC in found.children:
+        found = found[schema.NONPARAMETRIC].to_dataset()
     data = dataset(found)
     figure = style.blank(style.WIDTH, HEIGHT)
     names = [str(name) for name in data["quantity"].values]
@@ -50,9 +50,9 @@ def unnamed_shape(found: xr.Dataset | xr.DataTree) -> Figure:
         axes = figure.add_axes((0.09, 0.17, 0.89, 0.75))
         _curve(axes, places[0], value * scale.factor, sd * scale.factor)
         axes.set_xlabel(labels[0], fontsize=style.TEXT)
-        axes.set_ylabel(scale.label("unnamed effect"), fontsize=style.TEXT)
+        axes.set_ylabel(scale.label("nonparametric effect"), fontsize=style.TEXT)
         return figure
-    panels = ((0.09, value, "unnamed effect"), (0.58, sd, "standard deviation"))
+    panels = ((0.09, value, "nonparametric effect"), (0.58, sd, "standard deviation"))
     for left, shown, what in panels:
         axes = figure.add_axes((left, 0.17, 0.33, 0.72))
         _map(figure, axes, places, shown * scale.factor, scale.label(what))

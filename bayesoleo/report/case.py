@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, whereabouts
+from bayesoleo.assessment.whereabouts import GROUP, ORDERS, RUN, residual_breakdown
 from bayesoleo.effects.titles import called, listed
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.errors import InputError
@@ -87,7 +87,7 @@ def _errors(entry: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], str, str]
 
 def _where(tree: xr.DataTree) -> str:
     try:
-        data = whereabouts(tree)
+        data = residual_breakdown(tree)
     except (InputError, KeyError):
         return ""
     texts = []

@@ -130,7 +130,7 @@ def _rounds(
             "failed": tables.failed(entry, titles),
             "figures": [
                 *drawing.of("the ranking", partial(sections.ranking_figure, tree, number)),
-                *drawing.of("the curve", partial(sections.unnamed_figure, tree, entry)),
+                *drawing.of("the curve", partial(sections.nonparametric_figure, tree, entry)),
             ],
         }
 
@@ -155,7 +155,9 @@ def _proposals(
         }
 
 
-def _figures(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, list[sections.Shown]]:
+def _figures(
+    tree: xr.DataTree, drawing: sections.Drawing
+) -> dict[str, list[sections.CaptionedFigure]]:
     makers = {
         "data": ("the data", sections.data_figures),
         "fit": ("the fit", sections.fit_figures),

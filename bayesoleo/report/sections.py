@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import plots, schema
-from bayesoleo.assessment.whereabouts import whereabouts
+from bayesoleo.assessment.whereabouts import residual_breakdown
 from bayesoleo.effects.titles import called, listed
 from bayesoleo.errors import InputError
 from bayesoleo.plots import reading
@@ -22,7 +22,7 @@ from bayesoleo.report.yardstick import FLOOR, words
 
 
 @dataclass(frozen=True)
-class Shown:
+class CaptionedFigure:
     """A figure on the page."""
 
     image: Image
@@ -41,7 +41,7 @@ class Drawing:
 
     failed: list[str] = field(default_factory=list)
 
-    def of(self, what: str, draw: Callable[[], list[Shown]]) -> list[Shown]:
+    def of(self, what: str, draw: Callable[[], list[CaptionedFigure]]) -> list[CaptionedFigure]:
         """The figures of one kind; none where one of them fails."""
         try:
             return draw()
@@ -56,7 +56,7 @@ Draw = Callable[[], Figure]
 LOOPS: tuple[Against, ...] = ("velocity", "stroke")
 
 
-def data_figures(tree: xr.DataTree) -> list[Shown]:
+def data_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The records."""
     caption = (
         "The records as measured, averaged over the periods of each run. All runs of a channel "
@@ -65,7 +65,7 @@ def data_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
 
 
-def fit_figures(tree: xr.DataTree) -> list[Shown]:
+def fit_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """Measurement and prediction of each output."""
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
@@ -75,10 +75,10 @@ def fit_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn(entries)
 
 
-def whereabouts_figure(tree: xr.DataTree) -> list[Shown]:
+def whereabouts_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
     """Where the error lives that repeats; nothing without a periodic run that has any."""
     try:
-        excess = whereabouts(tree)["excess"].values
+        excess = residual_breakdown(tree)["excess"].values
     except (InputError, KeyError):
         return []
     if not (excess > FLOOR**2 - 1).any():
@@ -89,10 +89,10 @@ def whereabouts_figure(tree: xr.DataTree) -> list[Shown]:
         "runs - of run and group, a constant for each. Constants point to conditions and sensors, "
         "a function of velocity to friction and damping, of position to stiffness and gas."
     )
-    return _drawn([(lambda: plots.whereabouts(tree), caption)])
+    return _drawn([(lambda: plots.residual_breakdown(tree), caption)])
 
 
-def residual_figures(tree: xr.DataTree) -> list[Shown]:
+def residual_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The residual of each output against phase, velocity and stroke."""
     if schema.RESIDUAL not in tree.children:
         return []
@@ -126,7 +126,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
                 )
 
 
-def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
+def ranking_figure(tree: xr.DataTree, number: int) -> list[CaptionedFigure]:
     """The candidates of one round."""
     caption = (
         f"Candidates of round {number + 1}: the share of the excess error that each would "
@@ -138,7 +138,7 @@ def ranking_figure(tree: xr.DataTree, number: int) -> list[Shown]:
     return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
 
 
-def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
+def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
     """Where on the rig's range the rivals of one round would be told apart."""
     group = reading.group(tree, schema.PROPOSAL)
     if group is None or proposal_table(entry) is None:
@@ -155,20 +155,20 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
     return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 
 
-def unnamed_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Shown]:
+def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
     """The shape of an effect without a name, in the round that added it."""
-    if schema.UNNAMED not in tree.children:
+    if schema.NONPARAMETRIC not in tree.children:
         return []
-    if entry["accepted"] != tree[schema.UNNAMED].attrs["effect"]:
+    if entry["accepted"] != tree[schema.NONPARAMETRIC].attrs["effect"]:
         return []
     caption = (
         "The effect that has no name: what it adds to the balance, beside all that the model's own "
         "terms do, with its 95 % band. Beyond the range shown nothing is known of it."
     )
-    return _drawn([(lambda: plots.unnamed_shape(tree), caption)])
+    return _drawn([(lambda: plots.nonparametric_shape(tree), caption)])
 
 
-def error_figure(tree: xr.DataTree) -> list[Shown]:
+def error_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The error of each run."""
     of = words(reading.summary(tree)).replace("its noise", "the noise of its average")
     caption = (
@@ -177,7 +177,7 @@ def error_figure(tree: xr.DataTree) -> list[Shown]:
     return _drawn([(lambda: plots.error(tree), caption)])
 
 
-def posterior_figures(tree: xr.DataTree) -> list[Shown]:
+def posterior_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """Pairs, and the point against the posterior."""
     if schema.POSTERIOR not in tree.children:
         return []
@@ -195,7 +195,7 @@ def posterior_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn(entries)
 
 
-def predictive_figures(tree: xr.DataTree) -> list[Shown]:
+def predictive_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The posterior prediction of each output."""
     if schema.PERIOD_PREDICTIVE not in tree.children:
         return []
@@ -212,7 +212,7 @@ def predictive_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn(entries)
 
 
-def trace_figures(tree: xr.DataTree) -> list[Shown]:
+def trace_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The chains."""
     if schema.POSTERIOR not in tree.children:
         return []
@@ -220,5 +220,5 @@ def trace_figures(tree: xr.DataTree) -> list[Shown]:
     return _drawn([(lambda: plots.trace(tree), caption)])
 
 
-def _drawn(entries: list[tuple[Draw, str]]) -> list[Shown]:
-    return [Shown(encode_figure(draw()), caption) for draw, caption in entries]
+def _drawn(entries: list[tuple[Draw, str]]) -> list[CaptionedFigure]:
+    return [CaptionedFigure(encode_figure(draw()), caption) for draw, caption in entries]

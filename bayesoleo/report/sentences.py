@@ -13,8 +13,7 @@ from bayesoleo.plots.rankings import chosen, format_p, name
 from bayesoleo.plots.units import Scale
 from bayesoleo.report.tables import error_scale, format_short
 from bayesoleo.report.yardstick import ratio, too_large, too_small, words
-from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
-from bayesoleo.tracing.deciding.rounds import LEVEL
+from bayesoleo.tracing.policy import SearchPolicy
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -154,10 +153,13 @@ def _unexplained(summary: Mapping[str, Any]) -> str:
     if only_too_small(summary):
         return ""
     last = summary["rounds"][-1]
+    policy = SearchPolicy(**summary.get("policy", {}))
     open_ = [
         c
         for c in last["candidates"]
-        if c["p_value"] is not None and c["p_value"] < LEVEL and c["gain"] >= LEAST_SHARE
+        if c["p_value"] is not None
+        and c["p_value"] < policy.significance
+        and c["gain"] >= policy.least_share
     ]
     if not last["candidates"]:
         return ""

@@ -11,7 +11,7 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 from bayesoleo.forecast import predict
 from bayesoleo.plots.units import format_unit
 from bayesoleo.systems import equations
@@ -21,7 +21,7 @@ from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.outcome.result import fitted_groups, point_group
 from bayesoleo.workflow.closing import search, written
 from bayesoleo.workflow.estimating import estimated
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import finish
 from bayesoleo.workflow.sampling import draw, drawn_groups
 from bayesoleo.workflow.settings import Settings
@@ -72,9 +72,9 @@ class CampaignWork:
         """What the check of the command line says."""
         return checked(self.task)
 
-    def fit(self, method: str, say: Say) -> tuple[Fit, xr.DataTree]:
+    def fit(self, method: str, callback: Say) -> tuple[Fit, xr.DataTree]:
         """The estimate, and its tree."""
-        stages = Stages(say)
+        stages = Stages(callback)
         fit, more = estimated(self.task, stages, method)
         tree = self.tree(fit, more)
         stages.finish(tree, None)
@@ -100,15 +100,15 @@ class CampaignWork:
         found = finish(self.task, groups, fit)
         return stages.finish(found, None)
 
-    def predict(self, tree: xr.DataTree, data: Source | None, **options: Any) -> Shown:
+    def predict(self, tree: xr.DataTree, data: Source | None, **options: Any) -> LabelledResult:
         """Runs of this or another campaign, foreseen by a result."""
         reduced = self.task.reduced if data is None else reduce(data, jobs=self.settings.jobs)
         given = {"jobs": self.settings.jobs, "scheme": self.settings.scheme, **options}
         return predict(tree, reduced, **given)
 
-    def explain(self, out: Any, say: Say) -> tuple[CampaignSearch, xr.DataTree]:
+    def explain(self, out: Any, callback: Say) -> tuple[CampaignSearch, xr.DataTree]:
         """The closed loop without its posterior; it begins with an estimate of its own."""
-        output, stages = Output.checked(out), Stages(say)
+        output, stages = ResultFolder.checked(out), Stages(callback)
         with output.alone():
             loop, questions = search(
                 self.task, self.settings.max_effects, stages, output, resume=True
@@ -149,7 +149,7 @@ class CampaignSearch:
         """The whole result, with the posterior of the extended model."""
         task, stages = replace(self.before.task, settings=settings), Stages()
         drawn = draw(task, self.loop.final.fit, out, silent, progress)
-        return written(task, self.loop, drawn, Output(None), stages, self.questions)
+        return written(task, self.loop, drawn, ResultFolder(None), stages, self.questions)
 
 
 def check_text(facts: Mapping[str, Any]) -> str:
@@ -163,7 +163,7 @@ def check_text(facts: Mapping[str, Any]) -> str:
             ]
             head = ["output", "run", "solution", "correlation", "predicted over measured"]
             lines += ["at the nominal values:", columns(head, rows)] if rows else []
-        elif key == "findings":
+        elif key == "data_warnings":
             lines += [f"note: {text}" for text in value]
         elif key != "format":
             text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)

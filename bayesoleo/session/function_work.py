@@ -16,7 +16,7 @@ from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, PointEstimate, estimate, polish, to_dataset
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 from bayesoleo.model import Parameter
 from bayesoleo.posterior import LogDensity, compare, to_datasets
 from bayesoleo.session.functions import (
@@ -123,10 +123,10 @@ class FunctionWork:
             "rms of measured": float(np.sqrt(np.mean(y**2))),
         }
 
-    def fit(self, method: str, say: Say) -> tuple[FunctionFit, xr.DataTree]:
+    def fit(self, method: str, callback: Say) -> tuple[FunctionFit, xr.DataTree]:
         """The estimate, and its tree."""
         problem = self.statement
-        say(f"{method.upper()}, {len(problem.names)} unknowns")
+        callback(f"{method.upper()}, {len(problem.names)} unknowns")
         mbe = estimate(problem, method)
         fit = FunctionFit(problem, mbe, polish(problem, mbe))
         return fit, self.tree(fit, {})
@@ -184,7 +184,7 @@ class FunctionWork:
 
     def predict(
         self, tree: xr.DataTree, data: Any, *, level: float = 0.95, noise: bool = True
-    ) -> Shown:
+    ) -> LabelledResult:
         """The function with its interval at other inputs."""
         table = self.inputs if data is None else self._inputs_of(data)
         size = next(iter(table.values())).size
@@ -206,7 +206,7 @@ class FunctionWork:
             {key: (schema.SAMPLE, column) for key, column in {**table, **columns_}.items()},
             attrs={"place": place, "output": self.output, "level": level, "noise": int(noise)},
         )
-        return Shown(data_set, _prediction_text(data_set, place))
+        return LabelledResult(data_set, _prediction_text(data_set, place))
 
     def _inputs_of(self, data: Any) -> dict[str, Array]:
         if not hasattr(data, "keys"):

@@ -42,9 +42,9 @@ class Check(Showing):
         self.facts = facts
 
     @property
-    def findings(self) -> list[str]:
+    def data_warnings(self) -> list[str]:
         """Sentences about records and start that deserve a look."""
-        return list(self.facts.get("findings", []))
+        return list(self.facts.get("data_warnings", []))
 
     def _text(self) -> str:
         return check_text(self.facts)
@@ -133,7 +133,7 @@ class Problem(Showing):
 
         Examples
         --------
-        >>> problem.check().findings  # doctest: +SKIP
+        >>> problem.check().data_warnings  # doctest: +SKIP
         """
         return Check(self._work.check())
 
@@ -157,8 +157,8 @@ class Problem(Showing):
         --------
         >>> fit = problem.fit(method="MBE")  # doctest: +SKIP
         """
-        with status_line(progress) as say:
-            found, tree = self._work.fit(method.lower(), say)
+        with status_line(progress) as callback:
+            found, tree = self._work.fit(method.lower(), callback)
         return Fit(tree, self._work, found)
 
     def _text(self) -> str:

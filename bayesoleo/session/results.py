@@ -21,7 +21,7 @@ from bayesoleo import plots, schema
 from bayesoleo.assessment import assess
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation import indifference, profile, sampling_distribution
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 from bayesoleo.forecast import predict
 from bayesoleo.plots.units import format_unit
 from bayesoleo.posterior import compare, comparison_text
@@ -188,8 +188,8 @@ class Fit(Stored):
         >>> fit.profile(["stiffness"]).plot()  # doctest: +SKIP
         """
         problem = self._computing().problem(self._found)
-        with status_line(progress) as say:
-            found = profile(problem, self._found.point, names, progress=say, **options)
+        with status_line(progress) as callback:
+            found = profile(problem, self._found.point, names, progress=callback, **options)
         return result(found, schema.PROFILE)
 
     @kept
@@ -211,8 +211,8 @@ class Fit(Stored):
         >>> fit.indifference([("damping", "stiffness")]).plot()  # doctest: +SKIP
         """
         problem = self._computing().problem(self._found)
-        with status_line(progress) as say:
-            found = indifference(problem, self._found.point, pairs, progress=say, **options)
+        with status_line(progress) as callback:
+            found = indifference(problem, self._found.point, pairs, progress=callback, **options)
         return result(found, schema.INDIFFERENCE)
 
     @kept
@@ -329,11 +329,11 @@ class Fit(Stored):
             raise InputError("a search of terms keeps nothing", key="out", hint="leave it out")
         work = work.with_settings(changed(work.settings, settings, SEARCHING))
         search: CampaignSearch | TermSearch
-        with status_line(progress) as say:
+        with status_line(progress) as callback:
             if isinstance(work, FunctionWork):
-                search, tree = search_terms(work, self._found, candidates, say)
+                search, tree = search_terms(work, self._found, candidates, callback)
             else:
-                search, tree = work.explain(out, say)
+                search, tree = work.explain(out, callback)
         return Explanation(tree, search.work, search)
 
     def _text(self) -> str:
@@ -380,7 +380,7 @@ class Posterior(Stored):
         units = [str(item.attrs.get(schema.UNITS, "")) for item in drawn.values()]
         data[schema.UNIT] = (schema.PARAMETER, units)
         data.attrs["warning"] = str(about.get("warning", ""))
-        shown = Shown(data, _summary_text(data))
+        shown = LabelledResult(data, _summary_text(data))
         return replace(result(shown, "point_against_posterior"), source=self.tree)
 
     def plot(self, parameters: list[str] | None = None) -> Figure:
@@ -410,7 +410,7 @@ class Posterior(Stored):
         """
         groups = {name: self.tree[name].to_dataset() for name in self.tree.children}
         data = compare({**groups, **{item.kind: item.data for item in others}})
-        shown = Shown(data, comparison_text(data))
+        shown = LabelledResult(data, comparison_text(data))
         return replace(result(shown, "point_against_posterior"), source=self.tree)
 
     def _text(self) -> str:

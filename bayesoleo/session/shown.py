@@ -17,7 +17,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from bayesoleo import plots
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.session import figures
 from bayesoleo.storage.digest import digest
 
@@ -72,7 +72,7 @@ def _image(figure: Figure) -> str:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result(Shown):
+class Result(LabelledResult):
     """Labelled numbers with a table and a figure.
 
     Parameters
@@ -100,7 +100,7 @@ class Result(Shown):
         return html(self.text, self.plot)
 
 
-def result(shown: Shown, kind: str) -> Result:
+def result(shown: LabelledResult, kind: str) -> Result:
     """What a function of the package returns, with its figure."""
     return Result(shown.data, shown.text, kind)
 

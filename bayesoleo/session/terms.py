@@ -109,7 +109,7 @@ class TermSearch:
 
 
 def search_terms(
-    work: FunctionWork, fit: FunctionFit, candidates: object, say: Callable[[str], None]
+    work: FunctionWork, fit: FunctionFit, candidates: object, callback: Callable[[str], None]
 ) -> tuple[TermSearch, xr.DataTree]:
     """Add the most significant term, estimate again, and go on until none is significant.
 
@@ -124,7 +124,7 @@ def search_terms(
     left = terms
     tree = work.tree(fit, {})
     while left:
-        say(f"round {len(rounds) + 1}: score {len(left)} terms")
+        callback(f"round {len(rounds) + 1}: score {len(left)} terms")
         scores = sorted(_scores(work, fit, left, len(terms)), key=lambda item: item.p_value)
         rounds.append(scores)
         best = scores[0] if scores else None
@@ -132,7 +132,7 @@ def search_terms(
         if best is None or best.p_value > SIGNIFICANT or full:
             break
         work = _extended(work, best)
-        fit, tree = work.fit("mbe", say)
+        fit, tree = work.fit("mbe", callback)
         left = [term for term in left if term.name != best.term.name]
     last = rounds[-1] if left else []
     open_ = bool(last) and last[0].p_value <= SIGNIFICANT

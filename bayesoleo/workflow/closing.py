@@ -8,18 +8,19 @@ from functools import partial
 
 import xarray as xr
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects import catalogue
 from bayesoleo.effects.titles import catalogue_titles, with_titles
 from bayesoleo.model import Model
 from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop, loop_of
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.experiments.questions import Question, questions_of
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import Drawn, report_what_is_there, result_tree, write_result
 from bayesoleo.workflow.sampling import draw
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.stages import POSTERIOR, PROPOSALS, REPORT, SEARCH, Stages, reason_of
-from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
+from bayesoleo.workflow.task import Source, Task, prepare, silent
 
 #: What stands in the place of the search's last round while it goes on.
 NOT_YET = "the search had not finished when this was written"
@@ -33,16 +34,16 @@ def trace(
     settings: Settings = Settings(),
     *,
     out: str | os.PathLike[str] | None = None,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Hold a fitted model's residual against the noise and rank what might be missing; add nothing.
 
     Parameters are those of :func:`close`, and so are its errors.
     """
-    output = Output.checked(out)
+    output = ResultFolder.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
-    stages = Stages(say)
+    stages = Stages(callback)
     loop, questions = search(task, 0, stages, output)
     return written(task, loop, None, output, stages, questions)
 
@@ -53,7 +54,7 @@ def close(
     settings: Settings = Settings(),
     *,
     out: str | os.PathLike[str] | None = None,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
@@ -73,7 +74,7 @@ def close(
     out : path-like, optional
         Folder for ``results.nc``, ``report.html``, ``summary.json`` and ``checkpoints``, from which
         a run that was stopped goes on. It is tried before anything is computed.
-    say : callable
+    callback : callable
         Told what is being done.
     progress : bool
         Whether to show bars.
@@ -91,17 +92,17 @@ def close(
         If a stage after the first estimate failed. It carries the tree of what is known, whose
         summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
-    output = Output.checked(out)
+    output = ResultFolder.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
     with output.alone():
-        stages = Stages(say)
+        stages = Stages(callback)
         loop, questions = search(task, settings.max_effects, stages, output, resume=True)
         if not settings.quick:
             _write_found(task, loop, output, stages, questions)
-        say("sample the posterior")
+        callback("sample the posterior")
         fit, place = loop.final.fit, output.checkpoints
         drawn = stages.attempt(
-            POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
+            POSTERIOR, lambda: draw(task, fit, place, callback, progress), lambda: None
         )
         return written(task, loop, drawn, output, stages, questions)
 
@@ -114,7 +115,7 @@ def no_questions() -> tuple[Question, ...]:
 def _write_found(
     task: Task,
     loop: ClosedLoop,
-    output: Output,
+    output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question],
 ) -> None:
@@ -123,14 +124,14 @@ def _write_found(
     try:
         write_result(task, loop, None, output, so_far, questions)
     except Exception as error:
-        stages.say(f"what is known so far could not be written: {reason_of(error)}")
+        stages.callback(f"what is known so far could not be written: {reason_of(error)}")
 
 
 def written(
     task: Task,
     loop: ClosedLoop,
     drawn: Drawn | None,
-    output: Output,
+    output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question],
 ) -> xr.DataTree:
@@ -149,16 +150,16 @@ def written(
 
 
 def search(
-    task: Task, max_effects: int, stages: Stages, output: Output, *, resume: bool = False
+    task: Task, max_effects: int, stages: Stages, output: ResultFolder, *, resume: bool = False
 ) -> tuple[ClosedLoop, tuple[Question, ...]]:
     """The loop of :func:`run_loop`, and the runs that would tell apart what it could not."""
     loop = run_loop(task, max_effects, stages, output, resume=resume)
-    ask = partial(what_next, task, loop, stages.say)
+    ask = partial(what_next, task, loop, stages.callback)
     return loop, stages.attempt(PROPOSALS, ask, no_questions)
 
 
 def run_loop(
-    task: Task, max_effects: int, stages: Stages, output: Output, *, resume: bool = False
+    task: Task, max_effects: int, stages: Stages, output: ResultFolder, *, resume: bool = False
 ) -> ClosedLoop:
     """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
 
@@ -170,7 +171,7 @@ def run_loop(
     stages : Stages
         A search that fails after the first estimate is a failed stage: the loop is then what was
         found before.
-    output : Output
+    output : ResultFolder
         Written to after the estimate and after each round.
     resume : bool
         Whether to keep how far the search has come, and to go on from there.
@@ -183,21 +184,21 @@ def run_loop(
     settings, titles = task.settings, dict(catalogue_titles())
     titles |= {effect.id: effect.title for effect in task.settings.effects or ()}
 
-    def say(text: str) -> None:
-        stages.say(with_titles(text, titles))
+    def callback(text: str) -> None:
+        stages.callback(with_titles(text, titles))
 
     for effect in settings.searched if settings.effects else ():
         base = task.assembly.model() if effect.on_channels else task.assembly.native
         if effect not in catalogue() and not effect.places(base):
-            stages.say(
+            stages.callback(
                 f"effect {effect.id} has no place in this model: it needs {effect.applies_to}"
             )
-    known = output.kept(task, say) if resume else None
+    known = output.kept(task, callback) if resume else None
     reached = [] if known is None else [known]
 
     def keep(progress: Progress) -> None:
         reached.append(progress)
-        write_so_far(task, progress, output, say, resume=resume)
+        write_so_far(task, progress, output, callback, resume=resume)
 
     try:
         return close_loop(
@@ -207,10 +208,10 @@ def run_loop(
             effects=settings.searched,
             seed=settings.seed,
             max_effects=max_effects,
-            unnamed=settings.unnamed,
+            nonparametric=settings.nonparametric,
             known=known,
             keep=keep,
-            say=say,
+            callback=callback,
         )
     except Exception as error:
         if not reached:
@@ -220,7 +221,14 @@ def run_loop(
         return loop_of(reached[-1].ended(f"the search broke off here: {reason}"), task.roles)
 
 
-def write_so_far(task: Task, progress: Progress, output: Output, say: Say, *, resume: bool) -> None:
+def write_so_far(
+    task: Task,
+    progress: Progress,
+    output: ResultFolder,
+    callback: ProgressCallback,
+    *,
+    resume: bool,
+) -> None:
     """Write what is known; failing at that must not end what goes on."""
     if output.folder is None:
         return
@@ -232,13 +240,13 @@ def write_so_far(task: Task, progress: Progress, output: Output, say: Say, *, re
         loop = loop_of(progress.ended(NOT_YET), task.roles)
         output.write(*result_tree(task, loop, None, output, stages))
     except Exception as error:
-        say(f"what is known so far could not be written: {reason_of(error)}")
+        callback(f"what is known so far could not be written: {reason_of(error)}")
 
 
 def what_next(
     task: Task,
     loop: ClosedLoop,
-    say: Say,
+    callback: ProgressCallback,
     *,
     rivals: Sequence[str] = (),
     limits: Mapping[str, tuple[float, float]] | None = None,
@@ -249,7 +257,7 @@ def what_next(
     ----------
     task : Task
     loop : ClosedLoop
-    say : callable
+    callback : callable
         Told what is being done.
     rivals : sequence of str, optional
         Effects of the last round to be told apart; by default those that each round leaves.
@@ -257,4 +265,4 @@ def what_next(
         Of the rig, SI, before those of the campaign.
     """
     rig = {**task.campaign.rig, **(limits or {})}
-    return questions_of(loop, rig, task.settings.numerics, effects=rivals, say=say)
+    return questions_of(loop, rig, task.settings.numerics, effects=rivals, callback=callback)

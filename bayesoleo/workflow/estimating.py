@@ -8,16 +8,17 @@ from dataclasses import replace
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import ProgressCallback
 from bayesoleo.estimation.runs.per_run import by_run_dataset
 from bayesoleo.model import Model
 from bayesoleo.tracing.fitting.fit import Fit, fit_model
 from bayesoleo.tracing.outcome.inference import at_mode, mode_group, mode_of
 from bayesoleo.tracing.outcome.result import point_group
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import finish, mark_unfinished
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.stages import POSTERIOR, Stages
-from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
+from bayesoleo.workflow.task import Source, Task, prepare, silent
 
 
 def estimate(
@@ -26,7 +27,7 @@ def estimate(
     settings: Settings = Settings(),
     *,
     out: str | os.PathLike[str] | None = None,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
 ) -> xr.DataTree:
     """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
 
@@ -36,7 +37,7 @@ def estimate(
         See :func:`close`.
     out : path-like, optional
         Folder for ``results.nc``; it is tried before anything is computed.
-    say : callable
+    callback : callable
         Told what is being done.
 
     Returns
@@ -51,7 +52,7 @@ def estimate(
     UnfinishedError
         If the mode under another error model was not found; it carries the estimate without it.
     """
-    output, stages = Output.checked(out), Stages(say)
+    output, stages = ResultFolder.checked(out), Stages(callback)
     task = prepare(campaign, model, settings)
     fit, more = estimated(task, stages)
     tree = finish(task, {schema.POINT: point_group(fit), **more}, fit)
@@ -64,19 +65,23 @@ def estimate(
 
 def estimated(task: Task, stages: Stages, method: str = "mbe") -> tuple[Fit, dict[str, xr.Dataset]]:
     """The estimate, at the mode under the error model that was chosen if that was found."""
-    settings, say = task.settings, stages.say
+    settings, callback = task.settings, stages.callback
     model, runs = task.assembly.model(), task.roles.fitted
-    fit = fit_model(model, runs, settings.numerics, method=method, progress=say)
+    fit = fit_model(model, runs, settings.numerics, method=method, progress=callback)
     plain: tuple[Fit, dict[str, xr.Dataset]] = (fit, {})
-    return stages.attempt(POSTERIOR, lambda: under_error_model(fit, settings, say), lambda: plain)
+    return stages.attempt(
+        POSTERIOR, lambda: under_error_model(fit, settings, callback), lambda: plain
+    )
 
 
-def under_error_model(fit: Fit, settings: Settings, say: Say) -> tuple[Fit, dict[str, xr.Dataset]]:
+def under_error_model(
+    fit: Fit, settings: Settings, callback: ProgressCallback
+) -> tuple[Fit, dict[str, xr.Dataset]]:
     """The estimate moved to the mode under the error model that was chosen, with what it found."""
     inference = settings.inference
     if inference.plain:
         return fit, {}
-    say(f"posterior mode, {inference.error_model} errors")
+    callback(f"posterior mode, {inference.error_model} errors")
     density = inference.density(fit, settings.jobs)
     mode = mode_of(density, fit.point.theta)
     group = mode_group(density, mode, inference.error_model)
@@ -88,7 +93,7 @@ def estimate_each(
     model: Model,
     settings: Settings = Settings(),
     *,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
 ) -> xr.Dataset:
     """Estimate a model's parameters from each run by itself, fitted and held-out runs alike.
 
@@ -96,7 +101,7 @@ def estimate_each(
     ----------
     campaign, model, settings
         See :func:`close`.
-    say : callable
+    callback : callable
         Told what is being done.
 
     Returns
@@ -113,7 +118,7 @@ def estimate_each(
     driven = driven.with_parameters(**shared)
     points, residuals = {}, {}
     for record in task.reduced.records:
-        say(f"run {record.label}")
+        callback(f"run {record.label}")
         fit = fit_model(driven, [record], settings.numerics)
         points[record.label] = fit.mbe
         residuals[record.label] = fit.problem.evaluate(fit.mbe.theta).residual

@@ -12,13 +12,14 @@ from typing import Any
 import xarray as xr
 
 from bayesoleo import schema
+from bayesoleo._types import ProgressCallback
 from bayesoleo.errors import InputError
 from bayesoleo.storage import check_writable, read_attributes, write_text_atomic, write_tree
 from bayesoleo.storage.digest import digest, package_digest
 from bayesoleo.storage.kept import keep_state, kept_state
 from bayesoleo.storage.lock import only_writer
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.workflow.task import Say, Task
+from bayesoleo.workflow.task import Task
 
 RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
 FILES = (RESULTS, REPORT, SUMMARY)
@@ -28,7 +29,7 @@ PUT_ASIDE = ".put-aside"
 
 
 @dataclass
-class Output:
+class ResultFolder:
     """Where a result goes.
 
     Parameters
@@ -41,7 +42,7 @@ class Output:
     _begun: bool = False
 
     @classmethod
-    def checked(cls, out: str | os.PathLike[str] | None) -> Output:
+    def checked(cls, out: str | os.PathLike[str] | None) -> ResultFolder:
         """A folder that was found to take files; nothing is made yet.
 
         Raises
@@ -118,17 +119,17 @@ class Output:
         if self.checkpoints is not None:
             keep_state(self.checkpoints / SEARCH, search_key(task), progress)
 
-    def kept(self, task: Task, say: Say) -> Progress | None:
+    def kept(self, task: Task, callback: ProgressCallback) -> Progress | None:
         """How far the same search came before."""
         if self.checkpoints is None:
             return None
         path = self.checkpoints / SEARCH
         found, reason = kept_state(path, search_key(task))
         if reason:
-            say(f"start anew: {path} cannot be gone on from, {reason}")
+            callback(f"start anew: {path} cannot be gone on from, {reason}")
         if not isinstance(found, Progress):
             return None
-        say(f"go on after round {len(found.rounds)}, which {path} holds")
+        callback(f"go on after round {len(found.rounds)}, which {path} holds")
         return found
 
 

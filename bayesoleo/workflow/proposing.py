@@ -6,14 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import xarray as xr
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.model import Model
 from bayesoleo.tracing.experiments.propose import check_periodic
 from bayesoleo.workflow.closing import run_loop, what_next
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.stages import Stages
-from bayesoleo.workflow.task import Say, Source, prepare, silent
+from bayesoleo.workflow.task import Source, prepare, silent
 
 
 def propose(
@@ -23,7 +24,7 @@ def propose(
     *,
     rivals: Sequence[str] = (),
     limits: Mapping[str, tuple[float, float]] | None = None,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
 ) -> xr.DataTree:
     """Rank the runs that a rig can do by how well they would tell candidate effects apart.
 
@@ -60,7 +61,7 @@ def propose(
     """
     task = prepare(campaign, model, settings)
     check_periodic(task.reduced.records)  # before anything is estimated for nothing
-    output, stages = Output(None), Stages(say)
+    output, stages = ResultFolder(None), Stages(callback)
     loop = run_loop(task, 0, stages, output)
-    found = what_next(task, loop, say, rivals=rivals, limits=limits)
+    found = what_next(task, loop, callback, rivals=rivals, limits=limits)
     return stages.finish(write_result(task, loop, None, output, stages, found), None)

@@ -9,7 +9,7 @@ from typing import Any
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo.data import findings
+from bayesoleo.data import data_warnings
 from bayesoleo.errors import BayesoleoError
 from bayesoleo.model.document import to_document
 from bayesoleo.posterior import LogDensity, Samples, compare
@@ -29,7 +29,7 @@ from bayesoleo.tracing.outcome.result import (
 )
 from bayesoleo.tracing.outcome.summary import summarise
 from bayesoleo.workflow import stages as stage_names
-from bayesoleo.workflow.output import REPORT, RESULTS, SUMMARY, Output
+from bayesoleo.workflow.output import REPORT, RESULTS, SUMMARY, ResultFolder
 from bayesoleo.workflow.stages import Stages
 from bayesoleo.workflow.task import Task
 
@@ -40,7 +40,7 @@ def write_result(
     task: Task,
     loop: ClosedLoop,
     drawn: Drawn | None,
-    output: Output,
+    output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question] = (),
 ) -> xr.DataTree:
@@ -52,7 +52,7 @@ def write_result(
     loop : ClosedLoop
     drawn : tuple of (Samples, LogDensity) or None
         The posterior of the final model, if it was sampled.
-    output : Output
+    output : ResultFolder
         The folder.
     stages : Stages
         What failed before; what fails here is added.
@@ -62,7 +62,7 @@ def write_result(
     tree, summary = result_tree(task, loop, drawn, output, stages, questions)
     if output.folder is None:
         return tree
-    stages.say("write results and report")
+    stages.callback("write results and report")
     output.write(tree, summary)
     page, failed = output.folder / REPORT, len(stages.failed)
     for figure in stages.attempt(
@@ -78,7 +78,7 @@ def write_result(
     return tree
 
 
-def report_what_is_there(output: Output, stages: Stages) -> xr.DataTree | None:
+def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | None:
     """The result as it was last written, with what failed since, and a report of it.
 
     None where nothing was written, or that cannot be read.
@@ -104,7 +104,7 @@ def result_tree(
     task: Task,
     loop: ClosedLoop,
     drawn: Drawn | None,
-    output: Output,
+    output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question] = (),
 ) -> tuple[xr.DataTree, dict[str, Any]]:
@@ -130,7 +130,10 @@ def result_tree(
         stage_names.PREDICTIONS, lambda: CurveFacts.of(loop.final), lambda: CurveFacts()
     )
     summary = summarise(loop, samples, {**task.about(), "files": files}, facts)
-    summary["notes"] = [*summary["notes"], *findings(task.reduced.records, task.campaign.units)]
+    summary["notes"] = [
+        *summary["notes"],
+        *data_warnings(task.reduced.records, task.campaign.units),
+    ]
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     summary[schema.UNFINISHED] = list(stages.failed)
     summary["headline"] = headline(summary)

@@ -11,7 +11,7 @@ from pathlib import Path
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.model import Model
 from bayesoleo.posterior import LogDensity, Samples, compare
 from bayesoleo.posterior import sample as draw_samples
@@ -20,11 +20,11 @@ from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.outcome.inference import mixture_at
 from bayesoleo.tracing.outcome.result import point_group, posterior_groups, predictive_groups
 from bayesoleo.workflow.estimating import estimated
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import finish, mark_unfinished
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.stages import POSTERIOR, PREDICTIONS, Stages
-from bayesoleo.workflow.task import Say, Source, Task, prepare, silent
+from bayesoleo.workflow.task import Source, Task, prepare, silent
 
 #: Starts drawn from the priors that look for other modes than the estimate before sampling.
 STARTS = 4
@@ -40,7 +40,7 @@ def sample(
     settings: Settings = Settings(),
     *,
     out: str | os.PathLike[str] | None = None,
-    say: Say = silent,
+    callback: ProgressCallback = silent,
     progress: bool = False,
 ) -> xr.DataTree:
     """Estimate, then sample the posterior from there with emcee.
@@ -48,7 +48,7 @@ def sample(
     Parameters are those of :func:`close`, and so are its errors; the tree has the groups of the
     records, the point and the posterior. The estimate is written before the posterior is sampled.
     """
-    output, stages = Output.checked(out), Stages(say)
+    output, stages = ResultFolder.checked(out), Stages(callback)
     task = prepare(campaign, model, settings)
     with output.alone():
         fit, groups = estimated(task, stages)
@@ -58,7 +58,7 @@ def sample(
         output.write(tree)
         place, seed = output.checkpoints, settings.seed
         drawn = stages.attempt(
-            POSTERIOR, lambda: draw(task, fit, place, say, progress), lambda: None
+            POSTERIOR, lambda: draw(task, fit, place, callback, progress), lambda: None
         )
         if drawn is not None:
             groups |= drawn_groups(fit, drawn, seed, groups, stages)
@@ -97,7 +97,11 @@ def drawn_groups(
 
 
 def draw(
-    task: Task, fit: Fit, checkpoints: Path | None, say: Say, progress: bool | float
+    task: Task,
+    fit: Fit,
+    checkpoints: Path | None,
+    callback: ProgressCallback,
+    progress: bool | float,
 ) -> tuple[Samples, LogDensity]:
     """Draws of the posterior, from the checkpoints if there are some."""
     settings = task.settings

@@ -13,6 +13,7 @@ from bayesoleo.prediction.solver import check_solver
 from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.outcome.inference import Inference
+from bayesoleo.tracing.policy import SearchPolicy
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Settings:
     effects : tuple of Effect, optional
         Instead of the catalogue.
     without : tuple of str
-        Ids of effects that are left out of the search, at all their places; ``unnamed`` leaves out
-        functions without a name.
+        Ids of effects that are left out of the search, at all their places; ``nonparametric``
+        leaves out functions without a name.
     command : str
         Kept in the result.
     nuisance : tuple of {"conditions", "offset", "gain"}
@@ -59,6 +60,8 @@ class Settings:
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated; see
         :mod:`bayesoleo.posterior.density.hierarchy`.
+    policy : SearchPolicy
+        The numbers by which the search for missing effects decides.
     """
 
     seed: int = 0
@@ -77,6 +80,7 @@ class Settings:
     scheduler: str | None = None
     without: tuple[str, ...] = ()
     solver: str = COLLOCATION
+    policy: SearchPolicy = SearchPolicy()
 
     def __post_init__(self) -> None:
         check_solver(self.solver, self.scheme)
@@ -97,7 +101,7 @@ class Settings:
         return tuple(effect for effect in self._offered if effect.id not in self.without)
 
     @property
-    def unnamed(self) -> bool:
+    def nonparametric(self) -> bool:
         """Whether a function without a name may be added."""
         return FAMILY not in self.without
 
@@ -110,5 +114,10 @@ class Settings:
     def numerics(self) -> Numerics:
         """How models are solved."""
         return Numerics(
-            self.scheme, self.steps, self.jobs, scheduler=self.scheduler, solver=self.solver
+            self.scheme,
+            self.steps,
+            self.jobs,
+            scheduler=self.scheduler,
+            solver=self.solver,
+            policy=self.policy,
         )

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import xarray as xr
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.errors import InputError, UnfinishedError
-from bayesoleo.workflow.task import Say, silent
+from bayesoleo.workflow.task import silent
 
 #: In the order in which they are done; those of the schema of the summary.
 SEARCH, PROPOSALS, POSTERIOR, PREDICTIONS, REPORT = (
@@ -29,11 +30,11 @@ class Stages:
 
     Parameters
     ----------
-    say : callable
+    callback : callable
         Told of each failure as it happens.
     """
 
-    say: Say = silent
+    callback: ProgressCallback = silent
     failed: list[dict[str, str]] = field(default_factory=list)
     first: Exception | None = None
 
@@ -49,7 +50,7 @@ class Stages:
 
     def fail(self, stage: str, reason: str, error: Exception | None = None) -> None:
         """Note that a stage did not finish."""
-        self.say(f"{stage} failed: {reason}")
+        self.callback(f"{stage} failed: {reason}")
         self.failed.append({"stage": stage, "reason": reason})
         self.first = self.first or error
 

@@ -27,7 +27,7 @@ ABOVE_NOISE = 3.0
 
 
 @dataclass(frozen=True)
-class Start:
+class StartCheck:
     """An output of one run at the nominal values.
 
     Parameters
@@ -55,7 +55,7 @@ def starts_of(
     scheme: str,
     jobs: int | None,
     solver: str = COLLOCATION,
-) -> list[Start]:
+) -> list[StartCheck]:
     """Predict runs at a model's nominal values and compare.
 
     Parameters
@@ -83,28 +83,28 @@ def starts_of(
         for b, output in enumerate(predictor.outputs):
             if samples is None or samples.status[0] != Status.CONVERGED:
                 said = status if samples is None else Status(int(samples.status[0]))
-                found.append(Start(record.label, output, said.message))
+                found.append(StartCheck(record.label, output, said.message))
             else:
                 found.append(_compared(record, output, samples.y[0, b]))
     return found
 
 
-def _compared(record: Record, output: str, predicted: np.ndarray) -> Start:
+def _compared(record: Record, output: str, predicted: np.ndarray) -> StartCheck:
     kept = slice(None) if record.kept is None else record.kept
     measured = record.samples[output][kept]
     moved, seen = predicted[kept] - predicted[kept].mean(), measured - measured.mean()
     size, noise = float(np.std(seen)), record.signal_noise.get(output, 0.0)
     message = Status.CONVERGED.message
     if size <= ABOVE_NOISE * noise or not np.isfinite(moved).all():
-        return Start(record.label, output, message)
+        return StartCheck(record.label, output, message)
     ratio = float(np.std(moved)) / size
     correlation = None
     if ratio > 0:
         correlation = float(moved @ seen / (np.linalg.norm(moved) * np.linalg.norm(seen)))
-    return Start(record.label, output, message, correlation, ratio)
+    return StartCheck(record.label, output, message, correlation, ratio)
 
 
-def about_start(starts: Sequence[Start], model: Model) -> list[str]:
+def about_start(starts: Sequence[StartCheck], model: Model) -> list[str]:
     """Sentences about what looks like a mistake, with its figures.
 
     Only what the runs show together is told: from a poor start a resonance may lie on the wrong
@@ -112,7 +112,7 @@ def about_start(starts: Sequence[Start], model: Model) -> list[str]:
 
     Parameters
     ----------
-    starts : sequence of Start
+    starts : sequence of StartCheck
     model : Model
     """
     failed = [f"run {item.run} ({item.status})" for item in _by_run(starts) if item.ratio is None]
@@ -130,12 +130,12 @@ def about_start(starts: Sequence[Start], model: Model) -> list[str]:
     return found
 
 
-def _by_run(starts: Sequence[Start]) -> list[Start]:
+def _by_run(starts: Sequence[StartCheck]) -> list[StartCheck]:
     """One entry for each run."""
     return list({item.run: item for item in starts}.values())
 
 
-def _about_output(output: str, starts: Sequence[Start], resonates: bool) -> list[str]:
+def _about_output(output: str, starts: Sequence[StartCheck], resonates: bool) -> list[str]:
     correlations = [item.correlation for item in starts if item.correlation is not None]
     ratios = np.array([item.ratio for item in starts], dtype=float)
     found = []
@@ -168,6 +168,6 @@ def _range(values: Sequence[float] | np.ndarray) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def as_plain(starts: Sequence[Start]) -> list[dict[str, Any]]:
+def as_plain(starts: Sequence[StartCheck]) -> list[dict[str, Any]]:
     """The same for programs."""
     return [asdict(item) for item in starts]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +14,8 @@ from bayesoleo import schema
 from bayesoleo.data import (
     Campaign,
     ReducedCampaign,
-    findings,
-    frequency_findings,
+    data_warnings,
+    frequency_warnings,
     load_campaign,
     reduce_campaign,
 )
@@ -34,7 +34,6 @@ from bayesoleo.units import parse_unit, same_quantity
 from bayesoleo.workflow.settings import Settings
 from bayesoleo.workflow.start_check import about_start, as_plain, starts_of
 
-Say = Callable[[str], None]
 Source = str | os.PathLike[str] | Campaign | ReducedCampaign
 
 
@@ -70,7 +69,7 @@ def reduce(
         return campaign
     loaded = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
     reduced = reduce_campaign(loaded, jobs=jobs, progress=progress)
-    for sentence in frequency_findings(reduced.records):
+    for sentence in frequency_warnings(reduced.records):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return reduced
 
@@ -285,8 +284,8 @@ def checked(task: Task) -> dict[str, Any]:
             for effect in settings.searched
         ),
         "start": as_plain(starts),
-        "findings": [
-            *findings(task.reduced.records, task.campaign.units),
+        "data_warnings": [
+            *data_warnings(task.reduced.records, task.campaign.units),
             *about_start(starts, driven),
         ],
     }

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo.assessment import whereabouts
+from bayesoleo.assessment import residual_breakdown
 from bayesoleo.assessment.whereabouts import ORDERS
 from bayesoleo.errors import InputError
 
@@ -53,7 +53,7 @@ def result(law, seed=0, transient=False):
 
 
 def shares(law, **options):
-    data = whereabouts(result(law, **options)).isel(stage=0, output=0)
+    data = residual_breakdown(result(law, **options)).isel(stage=0, output=0)
     share = data["share"].to_series().to_dict()
     return data["power"].values, share, float(data["excess"])
 
@@ -100,6 +100,6 @@ def test_noise_alone_has_no_excess():
 
 def test_transients_and_results_without_residuals_are_refused():
     with pytest.raises(InputError, match="no run is periodic"):
-        whereabouts(result(lambda q, v, c, r: q, transient=True))
+        residual_breakdown(result(lambda q, v, c, r: q, transient=True))
     with pytest.raises(InputError, match="no residual"):
-        whereabouts(xr.DataTree())
+        residual_breakdown(xr.DataTree())

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from bayesoleo.estimation import sampling_distribution
 from bayesoleo.estimation.uncertainty.redraw import data_source
-from bayesoleo.estimation.uncertainty.sampling_distribution import _Blocks, _Work
+from bayesoleo.estimation.uncertainty.sampling_distribution import _Blocks, _ReplicationTask
 from bayesoleo.machines import connected, each_done
 
 #: Replications of the campaign of 14 runs, one a task.
@@ -39,7 +39,7 @@ def campaign_work() -> Clocked:
     problem = oleo_case().density.problem
     theta = problem.start
     source = data_source(problem, theta, None, input_noise=True)
-    work = _Work(source, theta, "mbe", 0, 1e-5, 50)
+    work = _ReplicationTask(source, theta, "mbe", 0, 1e-5, 50)
     return Clocked(_Blocks(work, [range(k, k + 1) for k in range(TASKS)]))
 
 

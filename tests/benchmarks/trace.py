@@ -49,7 +49,7 @@ def round_of(reduced: ReducedCampaign, model: str) -> tuple[float, float, int]:
     numerics, roles = Numerics(), assign(reduced.records)
     state = fit_state(Assembly(system(model), study.DRIVE), roles, numerics)
     begin, worked = time.perf_counter(), time.process_time()
-    outcome = examine(state, roles, numerics, effects=None, seed=0, say=lambda _: None)
+    outcome = examine(state, roles, numerics, effects=None, seed=0, callback=lambda _: None)
     return time.perf_counter() - begin, time.process_time() - worked, len(outcome.ranking)
 
 

@@ -67,7 +67,7 @@ def test_half_the_frequency_is_warned_of(run, campaign, model):
     assert result.exit_code == 0, result.output
     assert "warning: run fast: the motion repeats 2 times" in result.stderr
     assert "write frequency = 2" in result.stderr
-    assert len(json.loads(run("reduce", campaign, "--json").stdout)["findings"]) == 1
+    assert len(json.loads(run("reduce", campaign, "--json").stdout)["data_warnings"]) == 1
     assert result.stderr.count("run fast") == 1
     # whoever goes on without looking at the records is told as well
     result = run("check", campaign, "--model", model)

@@ -170,16 +170,16 @@ def test_report_from_a_result(run, made_up, tmp_path):
 def test_close_hands_over_what_was_asked(run, campaign, model, made_up, monkeypatch):
     asked = {}
 
-    def close(path, declared, settings, *, out, say, progress):
+    def close(path, declared, settings, *, out, callback, progress):
         asked.update(path=path, name=declared.name, settings=settings, out=out, progress=progress)
-        say("working")
+        callback("working")
         return made_up.oleo_tree()
 
     monkeypatch.setattr(workflow, "close", close)
     result = run(
         *("close", campaign, "-m", model, "--seed", 3, "--jobs", 1, "--quick"),
         *("--drive", "displacement", "--steps", 64, "--max-effects", 1),
-        *("--without", "humming_force,unnamed"),
+        *("--without", "humming_force,nonparametric"),
     )
     assert result.exit_code == 0, result.output
     assert asked["path"] == campaign
@@ -192,8 +192,8 @@ def test_close_hands_over_what_was_asked(run, campaign, model, made_up, monkeypa
         1,
         1000,
     )
-    assert settings.without == ("humming_force", "unnamed")
-    assert not settings.unnamed
+    assert settings.without == ("humming_force", "nonparametric")
+    assert not settings.nonparametric
     assert "Stribeck friction" in result.stdout
     assert "working" in result.stderr
 

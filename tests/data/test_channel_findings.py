@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_campaigns import damper_campaign, spring_damper_force
 
-from bayesoleo.data import findings, foreign_line, repeating_rounding, step_of
+from bayesoleo.data import data_warnings, foreign_line, repeating_rounding, step_of
 from bayesoleo.data.lines import foreign_lines
 from bayesoleo.data.resolution import clipped, rounding_that_repeats
 
@@ -85,17 +85,17 @@ def test_rounding_that_repeats_follows_from_what_scatters(noise):
 def test_findings_name_what_is_wrong_with_a_channel(tmp_path):
     reduced = damper_campaign(tmp_path, spring_damper_force, periods=16)
     records, units = reduced.records, reduced.campaign.units
-    assert findings(records, units) == []
+    assert data_warnings(records, units) == []
     record = records[0]
     force, t = record.samples["force"], record.time
     cut = replace(record, samples={**record.samples, "force": np.minimum(force, 10.0)})
-    (text,) = findings([cut], units)
+    (text,) = data_warnings([cut], units)
     assert "force is cut off at its highest value, 10 N," in text
     coarse = replace(record, samples={**record.samples, "force": np.round(force / 2.0) * 2.0})
-    (text,) = findings([coarse], units)
+    (text,) = data_warnings([coarse], units)
     assert "force goes in steps of 2 N," in text
     hum = replace(record, samples={**record.samples, "force": force + np.sin(2 * np.pi * 17.3 * t)})
-    (text,) = findings([hum], units)
+    (text,) = data_warnings([hum], units)
     assert re.search(r"force has a line at 17\.3\d* Hz with the amplitude \S+ N, ", text)
 
 

@@ -9,8 +9,8 @@ from small_campaigns import damper_campaign
 
 from bayesoleo.data import (
     SimulatedRun,
+    data_warnings,
     drift,
-    findings,
     load_campaign,
     motions_per_period,
     on_grid,
@@ -105,19 +105,19 @@ def reduced(folder, build, frequency=FREQUENCY, force=signal, noise=0.1):
 
 
 def test_drift_is_told_with_its_size(tmp_path):
-    (sentence,) = findings(reduced(tmp_path, lambda rng: noisy(rng, mean=0.1)).records)
+    (sentence,) = data_warnings(reduced(tmp_path, lambda rng: noisy(rng, mean=0.1)).records)
     assert sentence.startswith("run only: displacement drifts, its mean moves by 0.")
     assert "cut the run with start or stop" in sentence
 
 
 def test_settled_record_gives_no_sentence(tmp_path):
-    assert findings(reduced(tmp_path, noisy).records) == []
+    assert data_warnings(reduced(tmp_path, noisy).records) == []
 
 
 def test_half_the_frequency_is_found_out(tmp_path):
     (record,) = reduced(tmp_path, noisy, frequency=FREQUENCY / 2).records
     assert motions_per_period(record) == 2
-    (sentence,) = findings([record])
+    (sentence,) = data_warnings([record])
     assert sentence.startswith("run only: the motion repeats 2 times in a declared period")
     assert sentence.endswith("write frequency = 2")
 
@@ -144,7 +144,7 @@ def test_twice_the_frequency_is_found_out_where_one_channel_does_repeat(tmp_path
     (record,) = reduced(tmp_path, noisy, 2 * FREQUENCY, even).records
     assert record.frequency == pytest.approx(2 * FREQUENCY, rel=1e-3)
     assert periods_per_motion(record) == (2, "displacement")
-    (sentence,) = findings([record])
+    (sentence,) = data_warnings([record])
     assert "displacement repeats after 2 declared periods only" in sentence
     assert sentence.endswith("write frequency = 2")
 
@@ -161,7 +161,7 @@ def test_a_channel_in_which_nothing_repeats_is_named(tmp_path):
     def wandering(rng):
         return np.cumsum(rng.standard_normal(TIME.size))
 
-    sentences = findings(reduced(tmp_path, wandering).records)
+    sentences = data_warnings(reduced(tmp_path, wandering).records)
     assert "run only: nothing in displacement repeats at 2 Hz above its noise" in sentences[0]
     assert not any("force" in sentence for sentence in sentences)
 
@@ -183,7 +183,7 @@ def test_a_start_that_dies_out_slowly_is_no_longer_period(tmp_path):
 
 def test_rounding_of_samples_without_noise_is_no_longer_period(tmp_path):
     """Rounding repeats in some longer period, as a wrong frequency would make a motion do."""
-    assert findings(damper_campaign(tmp_path).records) == []
+    assert data_warnings(damper_campaign(tmp_path).records) == []
 
 
 def test_parabola_ends_in_the_period():

@@ -33,7 +33,9 @@ def offered(scales) -> Callable[[Model], list[Candidate]]:
     def of(model: Model) -> list[Candidate]:
         found = candidates(model, scales)
         known = {(item.effect, item.target) for item in found}
-        transient = candidates(model, replace(scales, kinds=frozenset({"transient"}), hum=7.0))
+        transient = candidates(
+            model, replace(scales, kinds=frozenset({"transient"}), dominant_frequency=7.0)
+        )
         return found + [item for item in transient if (item.effect, item.target) not in known]
 
     return of

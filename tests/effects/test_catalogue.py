@@ -11,8 +11,8 @@ from bayesoleo.effects import (
     FAMILIES,
     Amplitude,
     Effect,
-    Shape,
-    State,
+    InternalState,
+    ShapeParameter,
     candidates,
     catalogue,
     describe,
@@ -129,11 +129,15 @@ def test_bad_effects_are_refused(arguments, message):
 
 def test_a_state_without_its_rate_is_refused():
     with pytest.raises(InputError, match=r"state 'w' has no rate.*dot\(w\)"):
-        force_effect("drag", "friction", "k*w", {"k": "force"}, states={"w": State("velocity - w")})
+        force_effect(
+            "drag", "friction", "k*w", {"k": "force"}, states={"w": InternalState("velocity - w")}
+        )
 
 
 def test_a_scan_that_is_not_positive_is_refused(scales):
-    shape = Shape("w", "position/s", "w", "width", lambda model, target, scales: (0.0, 1.0))
+    shape = ShapeParameter(
+        "w", "position/s", "w", "width", lambda model, target, scales: (0.0, 1.0)
+    )
     effect = force_effect("drag", "damping", "k*exp(-velocity/w)", {"k": "force"}, shapes=(shape,))
     with pytest.raises(InputError, match="scan of 'w' is not ascending and positive"):
         effect.extend(system("duffing"), "position", scales)

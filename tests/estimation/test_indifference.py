@@ -9,7 +9,7 @@ from scipy import stats
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate
 from bayesoleo.estimation.uncertainty.axes import as_product, in_words, principal_axes
-from bayesoleo.estimation.uncertainty.drop import Drop
+from bayesoleo.estimation.uncertainty.drop import LogLikelihoodRatio
 from bayesoleo.estimation.uncertainty.indifference import indifference
 from bayesoleo.estimation.uncertainty.profile import profile
 from bayesoleo.model.priors import Normal, Uniform
@@ -64,7 +64,7 @@ def test_small_regions_are_ellipses():
     departures = []
     for epsilon in (0.25, 0.0625):
         found = indifference(problem, point, epsilon=epsilon, exact=True)
-        fall = Drop(problem, point)
+        fall = LogLikelihoodRatio(problem, point)
         departures.append(np.abs(fall(found["ellipse"].values[0, 0]) / epsilon - 1).max())
         # a thousandth of the radius is two of the fall
         np.testing.assert_allclose(fall(found["contour"].values[0, 0]), epsilon, rtol=3e-3)
@@ -104,7 +104,7 @@ def test_region_of_a_product_is_a_bent_valley(product):
     contour = found["contour"].values[0, 0]
     assert np.isfinite(contour).all()  # the prior closes it
     area, pressure = contour.T
-    drop = Drop(problem, point)
+    drop = LogLikelihoodRatio(problem, point)
     np.testing.assert_allclose(drop(contour), found.data.attrs["epsilon"], rtol=5e-3)
     assert np.ptp(area * pressure) < 0.1 * min(np.ptp(area), np.ptp(pressure))
     open_ended = indifference(problem, point, kind="likelihood", points=24)

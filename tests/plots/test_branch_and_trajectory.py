@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo import plots
-from bayesoleo.estimation.trajectories.multiple_shooting import Trajectory
+from bayesoleo.estimation.trajectories.multiple_shooting import EstimatedTrajectory
 from bayesoleo.plots import style
 from bayesoleo.prediction.branch import follow_branch
 from bayesoleo.prediction.simulate import RunPlan, motion
@@ -44,7 +44,7 @@ def test_a_panel_for_each_state_and_samples_where_it_was_measured():
     time = np.linspace(2.0, 4.0, 21)
     states = np.stack([np.sin(time), np.cos(time)], axis=1)
     measured = np.linspace(0.0, 1.0, 11)[None]
-    found = Trajectory(
+    found = EstimatedTrajectory(
         "a", time, states, np.zeros(2), ("q",), 0.4 * measured, 0.6 * measured, 0.0, ("q", "dot(q)")
     )
     figure = plots.trajectory(found, units={"q": "m"}, truth={"q": (time, states[:, 0])})

@@ -50,14 +50,20 @@ def test_each_certainty_has_its_word():
     left = told(one, schema.LIKENESS, ratio=13.6)
     assert left.startswith("A likeness only: Coulomb friction (stroke) was added, and the error of")
     assert "force on the hold-out runs is 13.6 times" in left
-    none = told(["unnamed_stroke @ force"], schema.NO_CAUSE,
-                titles={"unnamed_stroke": "Unnamed: a smooth function of stroke"})  # fmt: skip
+    none = told(["nonparametric_stroke @ force"], schema.NO_CAUSE,
+                titles={
+                    "nonparametric_stroke": "Nonparametric: a smooth function of stroke"
+                })  # fmt: skip
     assert none.startswith("No cause is named: a smooth function of stroke (force) was added; ")
 
 
 def test_a_curve_that_leaves_an_error_names_no_cause_either():
-    text = told(["unnamed_stroke @ force"], schema.NO_CAUSE, ratio=6.0, verdict=schema.UNEXPLAINED)
-    assert text.startswith("No cause is named: unnamed stroke (force) was added, and the error of")
+    text = told(
+        ["nonparametric_stroke @ force"], schema.NO_CAUSE, ratio=6.0, verdict=schema.UNEXPLAINED
+    )
+    assert text.startswith(
+        "No cause is named: nonparametric stroke (force) was added, and the error of"
+    )
 
 
 def test_a_class_is_said_with_titles():

@@ -31,7 +31,7 @@ def test_an_effect_that_did_not_stay_is_said_to_have_gone(oleo):
     summary = json.loads(oleo.attrs["summary"])
     gone = "it was taken out again later"
     assert gone not in printed(summary)
-    summary["effects"] = ["unnamed_velocity"]
+    summary["effects"] = ["nonparametric_velocity"]
     assert gone in printed(summary)
 
 

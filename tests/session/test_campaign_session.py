@@ -57,7 +57,7 @@ def test_problem_says_what_would_be_fitted(problem: bo.Problem) -> None:
     check = problem.check()
     check_shown(check, "unknowns: damping, stiffness", "correlation", picture=False)
     assert check.facts == workflow.check(problem._work.task.reduced, damper(cubic=False))
-    assert isinstance(check.findings, list)
+    assert isinstance(check.data_warnings, list)
 
 
 def test_fit_is_that_of_the_command_line(problem: bo.Problem, fit: bo.Fit) -> None:

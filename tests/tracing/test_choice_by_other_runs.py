@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+from fitted_states import NUMERICS
 
 from bayesoleo.tracing.deciding import rounds
 
@@ -13,6 +14,7 @@ def estimated(worth, reached=True):
     candidate = SimpleNamespace(family="friction")
     return SimpleNamespace(
         worth=worth, reached=reached, inflation=1.0, unusual=False, share=0.9, size=1,
+        policy=NUMERICS.policy,
         score=SimpleNamespace(option=SimpleNamespace(candidate=candidate)),
     )  # fmt: skip
 
@@ -31,7 +33,7 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
     results = dict(zip("ab", map(estimated, worths), strict=True))
     ranking = [
         SimpleNamespace(
-            effect=name, score=result.score, refitted=True, p_value=1e-9, gain=0.9, imitates=False
+            effect=name, score=result.score, refitted=True, p_value=1e-9, gain=0.9, absorbs=False
         )
         for name, result in results.items()
     ]
@@ -42,6 +44,6 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
         return after, item.effect
 
     monkeypatch.setattr(rounds, "confirmed", confirmed)
-    item, after, _ = rounds._choose(None, None, ranking, refits, None, None, print)
+    item, after, _ = rounds._choose(None, None, ranking, refits, None, NUMERICS, print)
     assert item.effect == taken
     assert after is not None

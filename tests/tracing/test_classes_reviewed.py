@@ -14,19 +14,23 @@ from bayesoleo.effects import find_effect
 from bayesoleo.tracing.deciding import review
 from bayesoleo.tracing.deciding.beam import followed
 from bayesoleo.tracing.deciding.lookahead import leads_as_far
-from bayesoleo.tracing.deciding.loop import Search, close_loop, searched
+from bayesoleo.tracing.deciding.loop import SearchOptions, close_loop, searched
 from bayesoleo.tracing.deciding.progress import Progress
+from bayesoleo.tracing.deciding.ranking import Ranked, rank
 from bayesoleo.tracing.deciding.refit import refit
-from bayesoleo.tracing.deciding.rounds import Ranked, Round, rank
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.deciding.unnamed_round import (
     _several_in_one_balance,
     _stands_by_itself,
-    with_unnamed,
+    with_nonparametric,
 )
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.roles import assign
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.score import score_all
+
+POLICY = SearchPolicy()
 
 
 def accepted(effect, same):
@@ -129,7 +133,7 @@ def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
 
 def begun_with_two(begun, roles):
     """A search that went on from its first effect."""
-    search = Search(roles, NUMERICS, EFFECTS, 0, 2, False, lambda _: None, lambda _: None)
+    search = SearchOptions(roles, NUMERICS, EFFECTS, 0, 2, False, lambda _: None, lambda _: None)
     found = searched(begun, search)
     assert set(found.state.assembly.added) == {
         ("cubic_stiffness", "force"), ("coulomb_friction", "force")
@@ -152,7 +156,9 @@ def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
     monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
 
     def item(name, worth, left, at_noise):
-        estimate = SimpleNamespace(worth=worth, inflation=1.0, remaining=left, reached=at_noise)
+        estimate = SimpleNamespace(
+            worth=worth, inflation=1.0, remaining=left, reached=at_noise, policy=POLICY
+        )
         return replace(accepted(name, ()), refit=estimate)
 
     own = item("dahl_friction", 1000.0, remaining, False)
@@ -180,7 +186,7 @@ def test_first_effects_that_were_nearly_as_good_are_followed():
         return SimpleNamespace(rounds=(opening,), state=state)
 
     def names_of(progress):
-        return [item.effect for item in followed(progress)]
+        return [item.effect for item in followed(progress, POLICY)]
 
     assert names_of(search(True, added)) == ["nearer"], "at the noise only what is nearly tied"
     assert names_of(search(False, added[:1])) == ["nearer", "near"]
@@ -201,7 +207,7 @@ def test_no_function_is_looked_for_where_noise_alone_is_left():
     state = SimpleNamespace(at_floor=True, assembly=SimpleNamespace(steps=(step,)))
     last = Round(state, (), {}, None, None, "nothing is missing", 60.0)
     told: list[str] = []
-    assert with_unnamed(last, opening, None, None, say=told.append) is last
+    assert with_nonparametric(last, opening, None, NUMERICS, callback=told.append) is last
     assert not told
 
 
@@ -219,7 +225,7 @@ def test_what_takes_up_a_part_of_everything_stands_by_itself_only_at_the_noise(
 ):
     found = replace(accepted("found", ()), gain=gain, refit=SimpleNamespace(reached=reached))
     found.score.option.candidate.family = family
-    assert _stands_by_itself(Round(None, (found,), {}, found, None, "", 60.0)) is alone
+    assert _stands_by_itself(Round(None, (found,), {}, found, None, "", 60.0), POLICY) is alone
 
 
 @pytest.mark.parametrize(
@@ -236,7 +242,7 @@ def test_names_come_together_in_one_balance(steps, several):
         SimpleNamespace(effect=SimpleNamespace(family=family), target=target)
         for family, target in steps
     ]
-    assert _several_in_one_balance(made) is several
+    assert _several_in_one_balance(made, POLICY) is several
 
 
 @pytest.mark.parametrize(("gap", "replaced"), [(-4.0, True), (-8.0, False), (8.0, True)])
@@ -246,7 +252,9 @@ def test_a_cause_that_is_as_likely_stands_instead_of_what_varies_by_run(monkeypa
     def item(name, family, worth):
         found = accepted(name, ())
         found.score.option.candidate.family = family
-        estimate = SimpleNamespace(worth=worth, inflation=1.0, remaining=0.0, reached=True)
+        estimate = SimpleNamespace(
+            worth=worth, inflation=1.0, remaining=0.0, reached=True, policy=POLICY
+        )
         return replace(found, refit=estimate)
 
     by_run, cause = item("varies_by_run", "run-to-run", 100.0), item("drag", "damping", 100.0 + gap)

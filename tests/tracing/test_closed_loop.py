@@ -195,7 +195,7 @@ def test_what_the_hold_out_runs_contradict_is_not_added(tmp_path):
 
 
 def test_no_effect_to_look_for_is_no_failure(tmp_path):
-    loop = close(damper_campaign(tmp_path), damper(), effects=(), unnamed=False)
+    loop = close(damper_campaign(tmp_path), damper(), effects=(), nonparametric=False)
     assert loop.effects == ()
     assert loop.verdict == schema.UNEXPLAINED
     assert loop.rounds[0].ranking == ()

@@ -98,7 +98,7 @@ def test_a_stop_that_runs_held_out_do_not_reach(tmp_path, stiffness, found):
         assign(reduced.records),
         NUMERICS,
         effects=[find_effect("end_stop_upper")],
-        unnamed=False,
+        nonparametric=False,
     )
     assert loop.effects == found
     if found:
@@ -247,11 +247,11 @@ def test_errors_of_the_parameters_scatter_a_fall_as_much_as_is_said(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("imitates", "reached", "asked"),
+    ("absorbs", "reached", "asked"),
     [(False, False, True), (False, True, True), (True, True, True), (True, False, False)],
 )
 def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
-    monkeypatch, imitates, reached, asked
+    monkeypatch, absorbs, reached, asked
 ):
     """They share what is odd in it: a parameter of its own always repeats there."""
     refit = SimpleNamespace(
@@ -266,8 +266,8 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
     monkeypatch.setattr(confirmation, "in_halves", lambda _: "halves")
     falls = iter([Fall(9.0, 14.0, 20.0), Fall(500.0, 50.0, 500.0)])
     monkeypatch.setattr(confirmation, "fall_on_hold_out", lambda *_: next(falls))
-    item = SimpleNamespace(effect="varies_by_run", gain=0.5, imitates=imitates)
-    found, _ = confirmation.confirmed(None, item, refit, None, None, lambda _: None)
+    item = SimpleNamespace(effect="varies_by_run", gain=0.5, absorbs=absorbs)
+    found, _ = confirmation.confirmed(None, item, refit, None, NUMERICS, lambda _: None)
     assert (found is not None) == bool(seen) == asked
 
 

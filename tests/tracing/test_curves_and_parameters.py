@@ -59,7 +59,7 @@ def ripples(tmp_path_factory):
 
 
 def test_a_force_law_shares_its_springs_with_a_curve_of_the_stroke(ripples):
-    assert ripples.effects == ("unnamed_displacement",)
+    assert ripples.effects == ("nonparametric_displacement",)
     names, point = ripples.final.fit.problem.names, ripples.final.fit.point
     facts = CurveFacts.of(ripples.final)
     assert set(facts.shared) == {"stiffness", "cubic"}

@@ -56,7 +56,7 @@ def test_an_effect_and_a_model_in_files_of_a_few_lines(tmp_path):
         assign(reduced.records),
         NUMERICS,
         effects=[effect for effect in effects if effect.id in few],
-        unnamed=False,
+        nonparametric=False,
     )
     assert loop.effects == ("van_der_pol",)
     assert loop.final.worst_ratio < 1.15

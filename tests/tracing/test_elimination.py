@@ -43,7 +43,7 @@ def with_effects(reduced, *names):
         base = state.base()
         score = score_all(base, options(state, [name]), jobs=1)[0][0]
         assembly = score.option.assembly
-        assembly = assembly.with_parameters(new_parameters(assembly, score))
+        assembly = assembly.with_parameters(new_parameters(assembly, score, NUMERICS.policy))
         state = fit_state(assembly, roles, NUMERICS)
     return state, roles
 

@@ -202,7 +202,7 @@ def test_a_hum_in_transients_is_named_with_frequency_and_size(tmp_path):
     _, roles = shaken(tmp_path, lambda t, k: HUM * np.cos(2 * np.pi * OWN * t + 2.0 * k))
     assembly = Assembly(system("duffing"), starts=True)
     few = tuple(map(find_effect, ("humming_force", "coulomb_friction", "quintic_stiffness")))
-    loop = close_loop(assembly, roles, NUMERICS, effects=few, max_effects=1, unnamed=False)
+    loop = close_loop(assembly, roles, NUMERICS, effects=few, max_effects=1, nonparametric=False)
     assert loop.effects == ("humming_force",)
     point = loop.final.fit.point
     where = loop.final.fit.problem.names.index("humming_force_frequency")

@@ -13,12 +13,12 @@ from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_r
 from bayesoleo.tracing.deciding.loop import _warnings
 from bayesoleo.tracing.fitting.fit import (
     FEWEST_STEPS,
-    LARGEST_SHIFT,
     Numerics,
     first_steps,
     fit_model,
 )
 from bayesoleo.tracing.outcome.result import point_group
+from bayesoleo.tracing.policy import SearchPolicy
 
 MODEL = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.0, [3.0, 0.0, 0.5])}, periods=3.0)
@@ -55,10 +55,10 @@ def test_steps_are_halved_until_the_estimate_stays():
     for noise in (1e-2, 1e-3, 1e-4):
         found = fit(noise)
         assert found.point.status.ok
-        assert found.shift <= LARGEST_SHIFT
+        assert found.shift <= SearchPolicy().mesh_shift
         chosen[noise] = found.steps
         if found.steps > begin:
-            assert fit(noise, found.steps // 2).shift > LARGEST_SHIFT
+            assert fit(noise, found.steps // 2).shift > SearchPolicy().mesh_shift
     assert chosen[1e-2] < chosen[1e-3] < chosen[1e-4]
     assert fit(1e-4, scheme="radau3").steps < chosen[1e-4]
 
@@ -66,7 +66,7 @@ def test_steps_are_halved_until_the_estimate_stays():
 def test_given_steps_are_kept_and_their_shift_is_told():
     found = fit(1e-4, 64)
     assert found.steps == 64
-    assert found.shift > LARGEST_SHIFT
+    assert found.shift > SearchPolicy().mesh_shift
 
 
 def test_a_mesh_that_did_not_do_is_said_plainly(monkeypatch):
@@ -97,13 +97,13 @@ def test_an_error_between_the_points_of_all_steps_is_seen():
     made = simulate_run(model, plan, noise={"y": 1e-4}, rng=np.random.default_rng(8), steps=16384)
     seen = replace(record_of(model, plan), samples=dict(made.samples))
     found = fit_model(model, [seen], Numerics("radau3", 32, jobs=1, backend="numpy"))
-    assert found.shift > LARGEST_SHIFT
+    assert found.shift > SearchPolicy().mesh_shift
     assert found.motion_error > 1e-3
     assert found.doubts
     # Without steps given they are made short enough, or it is said that they are not.
     freely = fit_model(model, [seen], Numerics("radau3", None, jobs=1, backend="numpy"))
     assert freely.steps > 1000
-    assert freely.shift <= LARGEST_SHIFT or freely.doubts
+    assert freely.shift <= SearchPolicy().mesh_shift or freely.doubts
 
 
 def test_a_mesh_that_nobody_asks_about_is_not_looked_at():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+from fitted_states import NUMERICS
 
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding import unnamed_round
@@ -16,8 +17,10 @@ def test_a_curve_that_predicts_worse_does_not_stand_instead_of_names(monkeypatch
     """Of a transient's remainder little counts as noise, and the fitted runs decide by a hair."""
     before = SimpleNamespace(at_floor=False, assembly=SimpleNamespace(steps=()))
     outcome = Round(before, (), {}, None, None, "no name", 60.0)
-    score = SimpleNamespace(option=SimpleNamespace(key=("unnamed_x", "force")))
-    score.option.candidate = SimpleNamespace(effect="unnamed_x", target="force", family=FAMILY)
+    score = SimpleNamespace(option=SimpleNamespace(key=("nonparametric_x", "force")))
+    score.option.candidate = SimpleNamespace(
+        effect="nonparametric_x", target="force", family=FAMILY
+    )
     result = SimpleNamespace(share=0.96, contribution=None, score=score, inflation=40.0)
     answer = SimpleNamespace(
         refit=result, ranking=(), state=None, instead=True, search=SimpleNamespace(p_value=1e-9)
@@ -26,6 +29,6 @@ def test_a_curve_that_predicts_worse_does_not_stand_instead_of_names(monkeypatch
     monkeypatch.setattr(unnamed_round, "closest", lambda *_: ())
     monkeypatch.setattr(unnamed_round, "confirmed", lambda *_: (after, "it explains much"))
     monkeypatch.setattr(unnamed_round, "speak_against", lambda *_: against)
-    found, reason = unnamed_round._accepting(outcome, answer, None, None, print)
+    found, reason = unnamed_round._accepting(outcome, answer, None, NUMERICS, print)
     assert (found is outcome) == against
     assert ("predicts runs that were not used worse" in reason) == against

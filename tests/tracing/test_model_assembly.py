@@ -121,7 +121,7 @@ def test_a_curve_over_what_an_effect_brought_leaves_with_it():
         curve = Spline("force", (axis,), (4,), np.eye(7)).effect()
         grown = grown.option(curve, "force", SCALES).assembly
     less = grown.without(grown.steps[0])
-    assert less.added == (("unnamed_displacement", "force"),)
+    assert less.added == (("nonparametric_displacement", "force"),)
     assert "dahl_friction_memory" not in less.model().dofs
     used = less.model().output("force").free_symbols
     assert symbol("dahl_friction_memory") not in used
@@ -160,7 +160,7 @@ def test_options_that_leave_no_inverse_are_skipped():
 
     square = Effect(
         id="square",
-        family="unnamed",
+        family="nonparametric",
         title="Square of the force",
         formula="s F^2",
         amplitudes=(Amplitude("square", "1/force", "s", "square of the force"),),

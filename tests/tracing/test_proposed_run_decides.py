@@ -43,7 +43,7 @@ def proposed(reduced):
         effects=EFFECTS,
         seed=0,
         limit="ranked only",
-        say=lambda _: None,
+        callback=lambda _: None,
     )
     rivals, _ = rivals_of(outcome, named(outcome, list(RIVALS)), NUMERICS)
     free = (-np.inf, np.inf)
@@ -55,7 +55,7 @@ def proposed(reduced):
 
 def closed(records):
     model = Assembly(damper(cubic=False, linear=False))
-    return close_loop(model, assign(records), NUMERICS, effects=EFFECTS, unnamed=False)
+    return close_loop(model, assign(records), NUMERICS, effects=EFFECTS, nonparametric=False)
 
 
 @pytest.mark.slow

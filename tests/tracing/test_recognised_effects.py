@@ -177,7 +177,7 @@ def estimated_best(state) -> str:
     """Which of the best scores explains most once it is estimated, its shape with it: between the
     values of a grid that is a factor of two apart, a score may be a few per cent low."""
     roles = assign(state.fit.records)
-    loop = close_loop(state.assembly, roles, NUMERICS, max_effects=1, unnamed=False)
+    loop = close_loop(state.assembly, roles, NUMERICS, max_effects=1, nonparametric=False)
     return loop.rounds[0].ranking[0].effect
 
 

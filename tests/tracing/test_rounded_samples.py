@@ -16,7 +16,7 @@ from small_campaigns import (
 from bayesoleo import schema
 from bayesoleo.data import (
     SimulatedRun,
-    findings,
+    data_warnings,
     load_campaign,
     reduce_campaign,
     write_campaign,
@@ -66,7 +66,7 @@ def test_coarse_steps_are_no_effect_and_hide_none(tmp_path):
     ):
         reduced = rounded(tmp_path / name, 0.05, 100, law)
         loop = close_loop(
-            Assembly(damper()), assign(reduced.records), NUMERICS, effects=FEW, unnamed=False
+            Assembly(damper()), assign(reduced.records), NUMERICS, effects=FEW, nonparametric=False
         )
         assert loop.effects == expected
         assert loop.final.worst_ratio < 1.3
@@ -76,4 +76,4 @@ def test_coarse_steps_are_no_effect_and_hide_none(tmp_path):
 
 
 def told(reduced):
-    return findings(reduced.records, reduced.campaign.units)
+    return data_warnings(reduced.records, reduced.campaign.units)

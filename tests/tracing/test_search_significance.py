@@ -13,8 +13,9 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.score import Score, score_all
-from bayesoleo.tracing.scoring.significance import SAME, classes, corrected_p, effective_tests
+from bayesoleo.tracing.scoring.significance import classes, corrected_p, effective_tests
 
 
 class Place:
@@ -119,7 +120,7 @@ def test_classes_are_symmetric_and_no_effect_is_in_its_own():
         for j in mates:
             assert i in found[j]
             a, b = rows[i].contribution, rows[j].contribution
-            assert (a @ b) ** 2 > SAME * (a @ a) * (b @ b)
+            assert (a @ b) ** 2 > SearchPolicy().same_cosine * (a @ a) * (b @ b)
     assert found[0]
 
 

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesoleo.tracing.experiments.separation import Foreseen, separate
+from bayesoleo.tracing.experiments.separation import PredictiveDistribution, separate
 
 SIZE = 6
 
 
 def rivals(rng, count, apart=1.0, unknown=3):
     return [
-        Foreseen(apart * rng.standard_normal(SIZE), rng.standard_normal((unknown, SIZE)))
+        PredictiveDistribution(
+            apart * rng.standard_normal(SIZE), rng.standard_normal((unknown, SIZE))
+        )
         for _ in range(count)
     ]
 
@@ -32,7 +34,9 @@ def test_rivals_that_foresee_the_same_are_not_separated():
 def test_with_all_parameters_known_it_is_the_distance_in_units_of_the_noise():
     nothing = np.zeros((0, SIZE))
     moved = np.array([3.0, 0, -4.0, 0, 0, 0])
-    found = separate([Foreseen(np.zeros(SIZE), nothing), Foreseen(moved, nothing)])
+    found = separate(
+        [PredictiveDistribution(np.zeros(SIZE), nothing), PredictiveDistribution(moved, nothing)]
+    )
     assert found.weakest == pytest.approx(5.0)
     assert found.log_bayes_factor[0, 1] == pytest.approx(12.5)
 
@@ -41,8 +45,12 @@ def test_a_difference_that_an_unknown_parameter_can_make_up_counts_no_more():
     known = np.zeros((1, SIZE))
     unknown = np.array([[100.0, 0, 0, 0, 0, 0]])
     moved = np.array([3.0, 0, 0, 0, 0, 0])
-    sure = separate([Foreseen(np.zeros(SIZE), known), Foreseen(moved, known)])
-    unsure = separate([Foreseen(np.zeros(SIZE), unknown), Foreseen(moved, unknown)])
+    sure = separate(
+        [PredictiveDistribution(np.zeros(SIZE), known), PredictiveDistribution(moved, known)]
+    )
+    unsure = separate(
+        [PredictiveDistribution(np.zeros(SIZE), unknown), PredictiveDistribution(moved, unknown)]
+    )
     assert sure.weakest == pytest.approx(3.0)
     assert unsure.weakest < 0.05
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from bayesoleo.tracing.deciding.loop import ClosedLoop
-from bayesoleo.tracing.deciding.rounds import LEVEL, _hidden, _may_be_significant
+from bayesoleo.tracing.deciding.rounds import _hidden, _may_be_significant
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.score import Score
-from bayesoleo.tracing.scoring.significance import SAME, corrected_p, without_twins
+from bayesoleo.tracing.scoring.significance import corrected_p, without_twins
 
-TESTS = 60.0
+TESTS, POLICY = 60.0, SearchPolicy()
+LEVEL, SAME = POLICY.significance, POLICY.same_cosine
 
 
 def score(effect, column, *, family="damping", target="stroke", fall=100.0, inflation=1.0):
@@ -49,7 +51,7 @@ def test_twins_do_the_same_in_one_place_by_one_cause(change, kept):
 def ranked(one, gain):
     """As a round ranks it."""
     p = corrected_p(one, TESTS)
-    return SimpleNamespace(score=one, imitates=False, p_value=p, gain=gain)
+    return SimpleNamespace(score=one, absorbs=False, p_value=p, gain=gain)
 
 
 def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
@@ -58,9 +60,9 @@ def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
     noise = ranked(score("play", [1.0, 1.0], fall=5.0), 0.3)
     small = ranked(score("preload", [1.0, 1.0], fall=90.0, inflation=60.0), 0.05)
     assert found.p_value < LEVEL < hidden.p_value
-    assert _hidden([found, hidden, noise, small], [found], TESTS) == [hidden]
-    assert _may_be_significant(small, TESTS)
-    assert not _may_be_significant(noise, TESTS)
+    assert _hidden([found, hidden, noise, small], [found], TESTS, POLICY) == [hidden]
+    assert _may_be_significant(small, TESTS, POLICY)
+    assert not _may_be_significant(noise, TESTS, POLICY)
 
 
 def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact", held_out=1):
@@ -91,7 +93,7 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
         ({"left": LEVEL / 2}, False),
         ({"effects": 2}, False),
         ({"effects": 0}, False),
-        ({"family": "unnamed"}, False),
+        ({"family": "nonparametric"}, False),
         ({"held_out": 0}, False),
         # One in twenty of it would have to be found if a mere likeness had been named.
         ({"fall": 0.9 * 14.2 / (1 - SAME)}, False),

@@ -53,7 +53,7 @@ def test_cardinal_splines_are_those_of_de_boor():
 
 
 def test_what_the_catalogue_lacks_ends_as_a_curve_without_a_name(strange):
-    assert strange.effects == ("unnamed_displacement",)
+    assert strange.effects == ("nonparametric_displacement",)
     assert strange.verdict == schema.EFFECT_ADDED
     assert strange.final.hold_errors.worst_ratio() < 1.15 < strange.first.hold_errors.worst_ratio()
     accepted = strange.rounds[-2].accepted
@@ -79,13 +79,13 @@ def test_its_shape_is_the_true_one_within_its_band(strange):
 
 def test_the_curve_is_kept_and_told(strange):
     groups = loop_groups(strange, None, 0)
-    found = groups[schema.UNNAMED]
-    assert found.attrs["effect"] == "unnamed_displacement"
+    found = groups[schema.NONPARAMETRIC]
+    assert found.attrs["effect"] == "nonparametric_displacement"
     assert found["value"].attrs[schema.UNITS] == "N"
     summary = summarise(strange, None, ABOUT)
-    first = next(e for e in summary["rounds"] if e["accepted"] == "unnamed_displacement")
+    first = next(e for e in summary["rounds"] if e["accepted"] == "nonparametric_displacement")
     first = first["candidates"][0]
-    assert first["family"] == "unnamed"
+    assert first["family"] == "nonparametric"
     assert first["closest"][0]["effect"]
 
 
@@ -137,7 +137,7 @@ SEVERAL = ("end_stop_upper", "quadratic_stiffness", "cubic_stiffness", "coulomb_
 @pytest.mark.parametrize(
     ("law", "names"),
     [
-        (softened, ("unnamed_displacement",)),
+        (softened, ("nonparametric_displacement",)),
         pytest.param(
             lambda x, v, t: 2.0e4 * x + 200.0 * v + 1.5e7 * x**3 + 10.0 * np.sign(v),
             ("coulomb_friction", "cubic_stiffness"),
@@ -181,7 +181,7 @@ def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_
 )
 def test_pieces_are_cut_finer_while_that_may_pay(coarse, fine, p_value, goes_on):
     """Significance says how fine a curve is; one that stays far behind the names is given up."""
-    assert _goes_on(coarse, fine, p_value) is goes_on
+    assert _goes_on(coarse, fine, p_value, NUMERICS.policy) is goes_on
 
 
 def test_the_score_of_a_curve_that_is_a_named_effect_is_no_less(tmp_path):
@@ -228,7 +228,7 @@ def test_fewer_splines_are_sums_of_more():
 def test_expression_and_values_agree():
     axis = Axis("velocity of x", symbol("v"), "m/s", -1.0, 2.0)
     spline = Spline("x", (axis,), (4,), np.eye(7))
-    assert spline.id == "unnamed_velocity_of_x"
+    assert spline.id == "nonparametric_velocity_of_x"
     x = 0.37
     values = [float(item.xreplace({symbol("v"): x}).evalf(20)) for item in axis.splines(4)]
     np.testing.assert_allclose(values, axis.basis(np.array([x]), 4)[:, 0], atol=1e-15)

@@ -45,7 +45,7 @@ def test_a_product_of_place_and_velocity_is_a_function_of_both(tmp_path):
     reduced = damper_campaign(tmp_path, lambda x, v, t: spring_damper_force(x, v, t) + valve(x, v))
     loop = closed(reduced)
     (accepted,) = [entry.accepted for entry in loop.rounds if entry.accepted]
-    assert set(accepted.effect.removeprefix("unnamed_").split("_and_")) == {
+    assert set(accepted.effect.removeprefix("nonparametric_").split("_and_")) == {
         "displacement", "velocity_of_displacement",
     }  # fmt: skip
     assert loop.verdict == schema.EFFECT_ADDED
@@ -82,7 +82,7 @@ def swept(folder):
 @pytest.mark.slow
 def test_transients_show_a_bump_along_the_stroke_with_its_shape(tmp_path):
     loop = closed(swept(tmp_path))
-    assert loop.effects == ("unnamed_displacement",)
+    assert loop.effects == ("nonparametric_displacement",)
     # A name that helped at first may have been removed again.
     *_, accepted = [entry.accepted for entry in loop.rounds if entry.accepted]
     assert accepted.closest

@@ -45,7 +45,7 @@ def searched(*ratios_and_families):
 
 
 def test_down_to_what_is_expected_is_found_whatever_was_added():
-    for family in ("friction", "unnamed", "run-to-run"):
+    for family in ("friction", "nonparametric", "run-to-run"):
         assert verdict_of(*searched((1.0, family))) == schema.EFFECT_ADDED
     assert verdict_of([], state(1.0), state(1.0)) == schema.NOTHING_MISSING
     assert verdict_of([], NONE, NONE) == schema.UNEXPLAINED
@@ -55,7 +55,7 @@ def test_nine_tenths_must_be_explained_by_physics():
     # Squared: 100 to 13.6 is 98 %, and to 50 three quarters.
     assert verdict_of(*searched((13.6, "friction"))) == schema.EFFECT_ADDED
     assert verdict_of(*searched((50.0, "friction"))) == schema.UNEXPLAINED
-    for symptom in ("run-to-run", "clock", "unnamed"):
+    for symptom in ("run-to-run", "clock", "nonparametric"):
         assert verdict_of(*searched((13.6, symptom))) == schema.UNEXPLAINED
         mixed = searched((20.0, symptom), (13.6, "friction"))
         assert verdict_of(*mixed) == schema.UNEXPLAINED
@@ -75,8 +75,8 @@ def test_less_error_than_chance_allows_is_no_success():
 def test_certainty_of_names():
     assert certainty_of(state(1.0), certain=False) is None
     assert certainty_of(state(1.0, "friction"), certain=True) == schema.CERTAIN
-    assert certainty_of(state(1.0, "friction", "unnamed"), certain=False) == schema.PROBABLE
+    assert certainty_of(state(1.0, "friction", "nonparametric"), certain=False) == schema.PROBABLE
     assert certainty_of(state(13.6, "friction"), certain=False) == schema.LIKENESS
-    assert certainty_of(state(1.0, "unnamed", "clock"), certain=False) == schema.NO_CAUSE
+    assert certainty_of(state(1.0, "nonparametric", "clock"), certain=False) == schema.NO_CAUSE
     quiet = state(0.16, "friction", quiet=("too little",))
     assert certainty_of(quiet, certain=False) == schema.LIKENESS

@@ -12,7 +12,7 @@ from small_campaigns import MASS, oscillator_campaign
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.tracing.scoring.base import Base, RunBase
 from bayesoleo.tracing.scoring.projection import coefficients, squared_distance
-from bayesoleo.tracing.scoring.score import INVISIBLE, SPANNED, _evaluate, score_all
+from bayesoleo.tracing.scoring.score import SPANNED, UNRESOLVED, _evaluate, score_all
 from bayesoleo.tracing.scoring.sensitivities import Block
 
 SAMPLES = 400
@@ -109,7 +109,7 @@ def test_an_offset_that_no_output_contains_scores_nothing(linear_oscillator):
     hidden = ("constant_force", "force_offset_by_run")
     scores, failed = score_all(state.base(), options(state, [*hidden, "cubic_stiffness"]), 1)
     assert [score.option.candidate.effect for score in scores] == ["cubic_stiffness"]
-    assert failed == {f"{name} at position": INVISIBLE for name in hidden}
+    assert failed == {f"{name} at position": UNRESOLVED for name in hidden}
 
 
 def test_the_same_offset_scores_where_an_output_contains_it(linear_oscillator):

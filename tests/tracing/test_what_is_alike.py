@@ -11,9 +11,12 @@ from small_campaigns import damper
 from bayesoleo.model.drive import driven_by
 from bayesoleo.model.kernels import kernels
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit
-from bayesoleo.tracing.deciding.rounds import Ranked, _only_imitates
+from bayesoleo.tracing.deciding.ranking import Ranked
+from bayesoleo.tracing.deciding.refit import Refit
+from bayesoleo.tracing.deciding.rounds import _only_absorbs
+from bayesoleo.tracing.policy import SearchPolicy
 
+AS_LIKELY = SearchPolicy().equal_likelihood
 ALONG, ACROSS = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 NEARLY = np.array([1.0, 0.1])
 #: Of an unknown, with eight thousand samples.
@@ -79,8 +82,8 @@ def test_what_varies_by_run_is_taken_where_it_is_needed(physics, reached, last):
     other = estimated(physics)
     refits = {id(r.score): r for r in (varies, other)}
     item = Ranked(varies.score, 0.0, 0.5, True, ())
-    assert _only_imitates(item, refits) == last
-    assert not _only_imitates(Ranked(other.score, 0.0, 0.5, True, ()), refits)
+    assert _only_absorbs(item, refits) == last
+    assert not _only_absorbs(Ranked(other.score, 0.0, 0.5, True, ()), refits)
 
 
 def test_models_of_the_same_equations_share_their_code():
@@ -112,4 +115,4 @@ def test_what_is_unusual_is_taken_where_it_is_needed(value, reached, last):
     mass = estimated(200.0, reached=reached, usual={"amplitude": 1}, value=value)
     spring = estimated(150.0, reached=reached)
     refits = {id(r.score): r for r in (mass, spring)}
-    assert _only_imitates(Ranked(mass.score, 0.0, 0.5, True, ()), refits) == last
+    assert _only_absorbs(Ranked(mass.score, 0.0, 0.5, True, ()), refits) == last

@@ -40,7 +40,7 @@ def examined(reduced, model, *effects):
         effects=[find_effect(name) for name in effects],
         seed=0,
         limit="ranked only",
-        say=lambda _: None,
+        callback=lambda _: None,
     )
 
 

@@ -90,7 +90,7 @@ CLOSED = set(schema.GROUPS) - {
     schema.SENSITIVITY,
     schema.ERROR_MODEL,
     schema.PROPOSAL,
-    schema.UNNAMED,
+    schema.NONPARAMETRIC,
 }
 
 
@@ -190,7 +190,7 @@ def test_a_second_close_takes_up_the_checkpoints_and_agrees(closed, campaign):
     before = {path: path.stat().st_mtime_ns for path in store.rglob("*") if path.is_file()}
     assert before
     said: list[str] = []
-    again = workflow.close(campaign, MODEL, SETTINGS, out=out, say=said.append)
+    again = workflow.close(campaign, MODEL, SETTINGS, out=out, callback=said.append)
     xr.testing.assert_identical(posterior(again), posterior(tree))
     after = {path: path.stat().st_mtime_ns for path in store.rglob("*") if path.is_file()}
     draws = {path for path in before if path.suffix not in (".lock", ".json")}

@@ -66,4 +66,4 @@ def test_closed_loop_finds_physics_and_offset(campaign):
     # is a function of any quantity: of which it is said to be one, says nothing.
     physics, curve = summaries[1]["effects"]
     assert physics == "coulomb_friction"
-    assert curve.startswith("unnamed_")
+    assert curve.startswith("nonparametric_")

@@ -7,12 +7,12 @@ import pytest
 import xarray as xr
 
 from bayesoleo.errors import InputError
-from bayesoleo.workflow.output import FILES, OLDER, RESULTS, Output
+from bayesoleo.workflow.output import FILES, OLDER, RESULTS, ResultFolder
 
 
 def written(folder, value=0.0):
     """A result written to a folder, not finished yet."""
-    output = Output.checked(folder)
+    output = ResultFolder.checked(folder)
     output.write(xr.DataTree(xr.Dataset({"a": ("x", np.full(2, value))})))
     return output
 
@@ -33,7 +33,7 @@ def test_a_result_that_a_user_put_there_is_not_written_over(tmp_path, name):
     (tmp_path / OLDER).mkdir()
     (tmp_path / OLDER / name).write_text("mine")
     with pytest.raises(InputError, match=r"older: holds a result that was not put aside here"):
-        Output.checked(tmp_path)
+        ResultFolder.checked(tmp_path)
     assert (tmp_path / OLDER / name).read_text() == "mine"
 
 
@@ -43,6 +43,6 @@ def test_what_was_put_aside_goes_with_the_result_that_replaces_it(tmp_path):
     written(tmp_path, 2.0)
     assert (tmp_path / OLDER / RESULTS).read_bytes() == first
     # A later process finishes what the one before it began.
-    Output.checked(tmp_path).finish()
+    ResultFolder.checked(tmp_path).finish()
     assert not (tmp_path / OLDER).exists()
     assert (tmp_path / RESULTS).read_bytes() != first

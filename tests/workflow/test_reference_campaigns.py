@@ -11,7 +11,7 @@ from bayesoleo import schema, workflow
 from bayesoleo.modelfile import load_model
 from bayesoleo.workflow import Settings
 from bayesoleo.workflow.closing import run_loop
-from bayesoleo.workflow.output import Output
+from bayesoleo.workflow.output import ResultFolder
 from bayesoleo.workflow.result import write_result
 from bayesoleo.workflow.stages import Stages
 
@@ -24,9 +24,9 @@ def summary_of(folder: Path, model: str) -> dict:
     reduced = workflow.reduce(folder)
     task = workflow.prepare(reduced, load_model(model), Settings())
     stages = Stages()
-    loop = run_loop(task, Settings().max_effects, stages, Output(None))
+    loop = run_loop(task, Settings().max_effects, stages, ResultFolder(None))
     assert stages.failed == []
-    tree = write_result(task, loop, None, Output(None), stages)
+    tree = write_result(task, loop, None, ResultFolder(None), stages)
     return json.loads(tree.attrs[schema.SUMMARY])
 
 

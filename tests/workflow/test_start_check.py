@@ -14,7 +14,7 @@ from bayesoleo.errors import DataWarning
 from bayesoleo.model import Model
 from bayesoleo.systems import system
 from bayesoleo.workflow import Settings
-from bayesoleo.workflow.start_check import Start, about_start
+from bayesoleo.workflow.start_check import StartCheck, about_start
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def told(campaign: Campaign, model: Model, **factors: float) -> list[str]:
         for run in campaign.runs
     )
     plan = workflow.check(replace(campaign, runs=runs), model, Settings(jobs=1))
-    return [text for text in plan["findings"] if "nominal" in text]
+    return [text for text in plan["data_warnings"] if "nominal" in text]
 
 
 def test_an_honest_start_gives_no_alarm(campaign):
@@ -55,8 +55,8 @@ def test_a_unit_off_by_a_thousand_is_told(campaign, factor, size):
     assert "units of channels" in text
 
 
-def start(correlation: float, ratio: float, run: str = "a") -> Start:
-    return Start(run, "displacement", "converged", correlation, ratio)
+def start(correlation: float, ratio: float, run: str = "a") -> StartCheck:
+    return StartCheck(run, "displacement", "converged", correlation, ratio)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,11 @@ def start(correlation: float, ratio: float, run: str = "a") -> Start:
         # A resonance between the nominal and the true one of some runs.
         ([start(-0.98, 2.0), start(0.9, 1.1, "b")], []),
         ([start(-0.98, 2.0), start(-0.6, 1.1, "b")], ["or a resonance on the wrong side"]),
-        ([Start("a", "displacement", "converged")], []),
-        ([Start("a", "displacement", "outside")], ["no solution at its nominal values in run a"]),
+        ([StartCheck("a", "displacement", "converged")], []),
+        (
+            [StartCheck("a", "displacement", "outside")],
+            ["no solution at its nominal values in run a"],
+        ),
     ],
 )
 def test_what_all_runs_show_alike_is_told(starts, words):
@@ -89,4 +92,4 @@ def test_noise_alone_has_no_size(campaign):
     )
     with pytest.warns(DataWarning, match="nothing in force repeats"):
         plan = workflow.check(replace(campaign, runs=runs), damper(), Settings(jobs=1))
-    assert not [text for text in plan["findings"] if "nominal" in text]
+    assert not [text for text in plan["data_warnings"] if "nominal" in text]

@@ -98,7 +98,7 @@ def test_a_search_that_breaks_off_keeps_the_rounds_before(campaign, whole, tmp_p
 
     said: list[str] = []
     monkeypatch.undo()
-    tree = workflow.close(campaign, damper(), SETTINGS, out=tmp_path, say=said.append)
+    tree = workflow.close(campaign, damper(), SETTINGS, out=tmp_path, callback=said.append)
     assert any(text.startswith("go on after round 1") for text in said)
     assert not any(text.startswith("round 1:") for text in said)
     ours, theirs = (json.loads(item.attrs[schema.SUMMARY]) for item in (tree, whole))
@@ -209,7 +209,7 @@ def test_a_folder_that_fails_on_the_way_does_not_end_the_work(campaign, tmp_path
     said: list[str] = []
     without_page(monkeypatch)
     monkeypatch.setattr(closing, "result_tree", broken)
-    tree = workflow.trace(campaign, damper(), SETTINGS, out=tmp_path, say=said.append)
+    tree = workflow.trace(campaign, damper(), SETTINGS, out=tmp_path, callback=said.append)
     assert any("could not be written" in text for text in said)
     assert json.loads(tree.attrs[schema.SUMMARY])["unfinished"] == []
 
@@ -234,7 +234,7 @@ def test_another_task_starts_anew_and_says_so(campaign, tmp_path, monkeypatch, c
     else:
         kept.write_bytes(kept.read_bytes()[:-5])
     said: list[str] = []
-    workflow.close(source, model, settings, out=tmp_path, say=said.append)
+    workflow.close(source, model, settings, out=tmp_path, callback=said.append)
     (anew,) = [text for text in said if text.startswith("start anew")]
     assert ("damaged" if changed == "file" else f"another {changed}") in anew
     assert any(text.startswith("round 1:") for text in said)
@@ -249,7 +249,7 @@ def test_how_much_is_drawn_has_no_say_in_what_is_missing(campaign, tmp_path, mon
     without_draws(monkeypatch)
     said: list[str] = []
     settings = replace(SETTINGS, quick=False, effective_size=9, command="again")
-    workflow.close(campaign, damper(), settings, out=tmp_path, say=said.append)
+    workflow.close(campaign, damper(), settings, out=tmp_path, callback=said.append)
     assert said[0].startswith("go on after round 2")
     assert not any(text.startswith(("round", "start anew")) for text in said)
 
@@ -285,7 +285,7 @@ def say(text):
 
 effects = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness")))
 settings = Settings(quick=True, jobs=1, effects=effects, seed=5)
-workflow.close({campaign!r}, damper(), settings, out={out!r}, say=say)
+workflow.close({campaign!r}, damper(), settings, out={out!r}, callback=say)
 """
 
 #: Stage that is begun when the process is killed, and the rounds that are finished then.
@@ -309,7 +309,7 @@ def test_killed_at_any_stage_it_goes_on_to_the_same_result(campaign, whole, tmp_
     assert read_tree(tmp_path / "results.nc").attrs[schema.UNFINISHED]
     assert summary["effects"] == (["coulomb_friction"] if KILLS[stage] else [])
     said: list[str] = []
-    tree = workflow.close(campaign, damper(), SETTINGS, out=tmp_path, say=said.append)
+    tree = workflow.close(campaign, damper(), SETTINGS, out=tmp_path, callback=said.append)
     assert f"go on after round {KILLS[stage]}, " in said[0]
     ours, theirs = (json.loads(item.attrs[schema.SUMMARY]) for item in (tree, whole))
     assert ours == theirs

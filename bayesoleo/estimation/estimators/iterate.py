@@ -22,7 +22,7 @@ from bayesoleo.estimation.estimators.outcome import Iteration, Outcome
 from bayesoleo.estimation.estimators.pace import Pace
 from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.objectives.bounded import is_cut
-from bayesoleo.estimation.objectives.equations import Equations
+from bayesoleo.estimation.objectives.equations import WhitenedEquations
 from bayesoleo.estimation.objectives.objective import Objective, log_prior
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
@@ -205,7 +205,7 @@ class _Loop:
             self.state = self.step.accept(self.state, equations.jacobian, ratio, taken)
         return Status.NO_CONVERGENCE
 
-    def part_of(self, proposal: Array, pace: Pace, equations: Equations) -> float:
+    def part_of(self, proposal: Array, pace: Pace, equations: WhitenedEquations) -> float:
         """How much of a proposal to take: more than all of it only well inside the support."""
         if pace.wanted <= 1:
             return pace.wanted
@@ -214,7 +214,7 @@ class _Loop:
         return pace.wanted
 
     def shorten(
-        self, proposal: Array, equations: Equations, variance: Array, resolution: float
+        self, proposal: Array, equations: WhitenedEquations, variance: Array, resolution: float
     ) -> tuple[_Point, int, Array]:
         """First point along ever shorter steps that is not worse than the current one.
 
@@ -257,7 +257,7 @@ class _Loop:
             value += log_prior(self.scale.priors, point.theta)
         return value
 
-    def equations(self, variance: Array) -> Equations:
+    def equations(self, variance: Array) -> WhitenedEquations:
         """Linear equations at the current point, with ``v`` held."""
         theta, errors = self.point.theta, self.objective.errors
         rows = errors.rows(self.point.evaluation, self.scale.unit(theta), variance)
@@ -266,7 +266,9 @@ class _Loop:
         sizes = np.diag(variance) if variance.ndim == 2 else variance
         noise = float(np.exp(0.5 * np.mean(np.log(sizes))))
         place = theta / self.scale.unit(theta)
-        equations = Equations(*rows, slope, self.scale.room(theta), self.scale.root, place, noise)
+        equations = WhitenedEquations(
+            *rows, slope, self.scale.room(theta), self.scale.root, place, noise
+        )
         if not self.step.second_order:
             return equations
         self.evaluations += 2 * theta.size
@@ -282,7 +284,7 @@ class _Loop:
         )
 
     def is_small(
-        self, proposal: Array, equations: Equations, tolerance: float, resolution: float
+        self, proposal: Array, equations: WhitenedEquations, tolerance: float, resolution: float
     ) -> bool:
         if is_cut(proposal, equations.room):
             return False
@@ -295,7 +297,7 @@ class _Loop:
         least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
         return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
 
-    def is_idle(self, won: float, equations: Equations, tolerance: float) -> bool:
+    def is_idle(self, won: float, equations: WhitenedEquations, tolerance: float) -> bool:
         """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
         nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
         rows = equations.root

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
-from bayesoleo.error_models.linearise import Linearised, least_squares
+from bayesoleo.error_models.linearise import LinearisedResidual, least_squares
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.held import Held
 from bayesoleo.estimation.problems.problem import Problem
@@ -118,7 +118,7 @@ def _shift(
     if not evaluation.status.ok or not (np.isfinite(variance) & (variance > 0)).all():
         return None
     unit = np.array([problem.priors[k].sd for k in range(len(theta))])
-    rows = Linearised.of(evaluation, unit).whitened(variance)[0]
+    rows = LinearisedResidual.of(evaluation, unit).whitened(variance)[0]
     # As in the covariance, the prior bounds what the data leave open.
     prior = scaled_root([problem.priors[k] for k in own], unit[own])
     weighted = np.vstack((rows[:, own], prior))

@@ -19,7 +19,7 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.error_models.linearise import RANK
 from bayesoleo.estimation.estimators.steps import Step
-from bayesoleo.estimation.objectives.equations import Equations
+from bayesoleo.estimation.objectives.equations import WhitenedEquations
 
 # A step may miss the radius by this part of it, which saves iterations of the secular equation.
 _SLACK = 0.1
@@ -63,7 +63,7 @@ class LevenbergMarquardtStep(Step[TrustRegion]):
     def begin(self, root: Array) -> TrustRegion:
         return TrustRegion(np.nan, np.zeros(len(root)))
 
-    def prepare(self, state: TrustRegion, equations: Equations) -> TrustRegion:
+    def prepare(self, state: TrustRegion, equations: WhitenedEquations) -> TrustRegion:
         # The staged variance shrinks by decades on the way; lengths must not change with it.
         jacobian = equations.noise * equations.jacobian
         length = np.maximum(state.length, np.linalg.norm(jacobian, axis=0))

@@ -23,7 +23,7 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.error_models.base import ProfiledErrorModel
 from bayesoleo.error_models.independent import output_counts
-from bayesoleo.estimation.objectives.equations import Equations
+from bayesoleo.estimation.objectives.equations import WhitenedEquations
 from bayesoleo.estimation.problems.problem import Evaluation, Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 
@@ -43,10 +43,10 @@ def newton_equations(
     theta: Array,
     evaluation: Evaluation,
     variance: Array,
-    equations: Equations,
+    equations: WhitenedEquations,
     *,
     prior: bool,
-) -> Equations:
+) -> WhitenedEquations:
     """Equations whose step is Newton's.
 
     Parameters
@@ -59,14 +59,14 @@ def newton_equations(
         At ``theta``.
     variance : ndarray, shape (s,) or (s, s)
         Staged there.
-    equations : Equations
+    equations : WhitenedEquations
         Of Gauss and Newton; their slope is that of the prior, if it counts.
     prior : bool
         Whether it does.
 
     Returns
     -------
-    Equations
+    WhitenedEquations
         With the triangular factor of the Hessian as Jacobian. Where the Hessian is not positive
         definite, the directions in which it is not are taken with the opposite sign, so that the
         step climbs.

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from bayesoleo._types import Array
-from bayesoleo.estimation.objectives.equations import Equations
+from bayesoleo.estimation.objectives.equations import WhitenedEquations
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Step[State]:
     def begin(self, root: Array) -> State:
         """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
 
-    def prepare(self, state: State, equations: Equations) -> State:
+    def prepare(self, state: State, equations: WhitenedEquations) -> State:
         """State with what the equations of this iteration ask for."""
         return state
 

@@ -14,7 +14,7 @@ from bayesoleo.error_models.independent import (
 )
 from bayesoleo.error_models.linearise import (
     RANK,
-    Linearised,
+    LinearisedResidual,
     inverse_gram,
     masked,
     pseudo_inverse_gram,
@@ -124,7 +124,7 @@ def _error_covariance(
 def _covariances(
     scale: PriorScale, outcome: Outcome, objective: Objective, error: Array
 ) -> tuple[Array, Array]:
-    """Linearised covariance of the unknowns with and without the prior, each (l, l).
+    """LinearisedResidual covariance of the unknowns with and without the prior, each (l, l).
 
     References
     ----------
@@ -137,7 +137,7 @@ def _covariances(
         size = len(error)
         rows = errors.rows(outcome.evaluation, unit, np.ones(size))[0]
         plain, undetermined = pseudo_inverse_gram(rows, RANK)
-        scores = Linearised.of(outcome.evaluation, unit).whitened(1 / np.diag(error))[0]
+        scores = LinearisedResidual.of(outcome.evaluation, unit).whitened(1 / np.diag(error))[0]
         likelihood = masked(plain @ (scores.T @ scores) @ plain * units, undetermined)
         return likelihood, likelihood
     held = np.diag(error) if isinstance(errors, ProfiledIndependentErrors) else error

@@ -14,7 +14,7 @@ from bayesoleo.estimation.objectives.bounded import bounded_step, on_limit
 
 
 @dataclass(frozen=True)
-class Equations:
+class WhitenedEquations:
     """Whitened least squares in scaled unknowns (the prior's standard deviation is one).
 
     Of an unknown with a log-normal prior it is the logarithm that is scaled.
@@ -80,6 +80,6 @@ class Equations:
         return float(np.sqrt(max(0.0, float(step @ self.gradient))))
 
     def sd(self) -> Array:
-        """Linearised standard deviations ``[A + P'P]^-1/2``, shape (l,)."""
+        """LinearisedResidual standard deviations ``[A + P'P]^-1/2``, shape (l,)."""
         weighted = np.vstack((self.jacobian, self.root))
         return np.sqrt(np.diag(inverse_gram(weighted)))

@@ -18,7 +18,7 @@ from bayesoleo.estimation.problems.problem import Problem
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class BatchNormalEquations:
     """What a Gauss-Newton step needs, for ``L`` vectors, ``s`` outputs and ``l`` unknowns.
 
     Parameters
@@ -55,7 +55,7 @@ class BatchProblem(Problem, Protocol):
     def with_data(self, data: Sequence[Array]) -> Problem:
         """The same problem with other measured samples, shape (n_b,) for each output."""
 
-    def normal_equations(self, theta: Array, data: Sequence[Array]) -> NormalEquations:
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> BatchNormalEquations:
         """Equations at vectors (L, l), each compared with its own row of data (L, n_b)."""
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesoleo._types import Array
 from bayesoleo.error_models.base import RunSamples
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.batch import NormalEquations, reduce_rows
+from bayesoleo.estimation.problems.batch import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
 from bayesoleo.model import Prior
 from bayesoleo.parallel import thread_map
@@ -206,7 +206,7 @@ class CampaignProblem:
             first = last
         return CampaignProblem(predictor, self._free, self._full)
 
-    def normal_equations(self, theta: Array, data: Sequence[Array]) -> NormalEquations:
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> BatchNormalEquations:
         """Equations at vectors (L, l), each compared with its own row of data (L, n_b).
 
         Solves start from the anchor; :meth:`freeze` it near the vectors.
@@ -217,7 +217,7 @@ class CampaignProblem:
         ends = np.cumsum(self.counts[:, 0])
         shape = (len(theta), len(self.outputs), full.shape[1])
 
-        def of_run(r: int) -> NormalEquations:
+        def of_run(r: int) -> BatchNormalEquations:
             samples = self.predictor.runs[r].predict(
                 self.predictor.constants(full, r), derivatives=True
             )
@@ -230,10 +230,10 @@ class CampaignProblem:
             for b, column in enumerate(data):
                 rows = reduce_rows(column[:, cut] - y[:, b], y_p[:, b].mT)
                 gram[:, b, columns[:, None], columns], slope[:, b, columns], sums[:, b] = rows
-            return NormalEquations(gram, slope, sums, samples.status)
+            return BatchNormalEquations(gram, slope, sums, samples.status)
 
         parts = thread_map(of_run, range(len(self.predictor.runs)), self.predictor.jobs)
-        return NormalEquations(
+        return BatchNormalEquations(
             np.sum([part.gram for part in parts], axis=0)[:, :, self._free[:, None], self._free],
             np.sum([part.slope for part in parts], axis=0)[:, :, self._free],
             np.sum([part.sums for part in parts], axis=0),

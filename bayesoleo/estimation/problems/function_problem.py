@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesoleo._types import Array
 from bayesoleo.error_models.base import RunSamples
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.batch import NormalEquations, reduce_rows
+from bayesoleo.estimation.problems.batch import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation.problems.broadcast import Broadcast
 from bayesoleo.estimation.problems.problem import Evaluation, Misfit
 from bayesoleo.model.priors import Prior
@@ -194,7 +194,7 @@ class FunctionProblem:
         failed = (np.full_like(residual, np.nan),), (np.full_like(sensitivity, np.nan),)
         return Evaluation(*failed, Status.NOT_FINITE)
 
-    def normal_equations(self, theta: Array, data: Sequence[Array]) -> NormalEquations:
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> BatchNormalEquations:
         """Equations at vectors (L, l), each compared with its own row of data (L, n)."""
         with np.errstate(all="ignore"):
             residual = np.asarray(data[0] - self._prediction.many(theta), dtype=float)
@@ -202,7 +202,7 @@ class FunctionProblem:
             gram, slope, sums = reduce_rows(residual, sensitivity)
             finite = np.isfinite(sums) & np.isfinite(gram).all(axis=(1, 2))
         status = np.where(finite, Status.CONVERGED, Status.NOT_FINITE).astype(np.int64)
-        return NormalEquations(gram[:, None], slope[:, None], sums[:, None], status)
+        return BatchNormalEquations(gram[:, None], slope[:, None], sums[:, None], status)
 
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors, shape (L, l)."""

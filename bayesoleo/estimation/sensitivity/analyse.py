@@ -16,7 +16,7 @@ from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.sensitivity.features import Feature, Features
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 from bayesoleo.model.priors import LogNormal, Normal, Prior, TruncatedNormal, Uniform
 
 Per = Literal["prior", "percent"]
@@ -31,7 +31,7 @@ def local_sensitivity(
     features: Mapping[str, Feature] | None = None,
     *,
     per: Per = "prior",
-) -> Shown:
+) -> LabelledResult:
     """Change of each feature by one step of each parameter, by linearisation.
 
     Parameters
@@ -48,7 +48,7 @@ def local_sensitivity(
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``change(feature, parameter)`` in the feature's own unit, ``percent(feature, parameter)`` of
         its value, ``value(feature)``, ``step(parameter)``.
 
@@ -95,7 +95,7 @@ def local_sensitivity(
         coords={"feature": found.names, schema.PARAMETER: list(problem.names)},
     )
     data.attrs = {"per": per}
-    return Shown(data, _percent_text(data))
+    return LabelledResult(data, _percent_text(data))
 
 
 def global_sensitivity(
@@ -106,7 +106,7 @@ def global_sensitivity(
     samples: int = 1024,
     seed: int = 0,
     level: float = 0.95,
-) -> Shown:
+) -> LabelledResult:
     """Sobol indices of each feature over the priors; see :func:`sobol`.
 
     Parameters
@@ -142,7 +142,7 @@ def sobol(
     samples: int = 1024,
     seed: int = 0,
     level: float = 0.95,
-) -> Shown:
+) -> LabelledResult:
     """Share of a feature's variance that each parameter causes, alone and in all.
 
     Parameters
@@ -161,7 +161,7 @@ def sobol(
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``first``, ``total``, each with ``_low`` and ``_high``, ``(feature, parameter)``;
         ``variance(feature)``. Where the function failed, the whole sample is left out; attributes
         say how many.
@@ -213,7 +213,7 @@ def sobol(
         spread = found.bootstrap(confidence_level=level, n_resamples=200)
     data = _indices(found, spread, names, features, np.var(f_first[rows], axis=0))
     data.attrs = {"samples": kept, "failed": int(samples - good.all(axis=1).sum()), "level": level}
-    return Shown(data, _sobol_text(data))
+    return LabelledResult(data, _sobol_text(data))
 
 
 def quantile(prior: Prior, part: ArrayLike) -> Array:

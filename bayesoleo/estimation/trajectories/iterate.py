@@ -52,7 +52,7 @@ VARIANCE_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class ShootingIteration:
     """A line of the history: point, variances, objective, and how often its step was shortened."""
 
     theta: Array
@@ -62,7 +62,7 @@ class Line:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ShootingOutcome:
     """Where the iteration ended.
 
     Parameters
@@ -72,7 +72,7 @@ class Outcome:
         Unknowns of each run's steps.
     variance : ndarray, shape (s,)
     status : Status
-    history : tuple of Line
+    history : tuple of ShootingIteration
         Empty if the start could not be evaluated.
     local : Local, optional
         Of the last point that was linearised.
@@ -82,7 +82,7 @@ class Outcome:
     x: tuple[Float[Array, "_steps _width"], ...]
     variance: Float[Array, " outputs"]
     status: Status
-    history: tuple[Line, ...]
+    history: tuple[ShootingIteration, ...]
     local: Local | None
 
 
@@ -95,7 +95,7 @@ def iterate(
     *,
     tolerance: float,
     max_iterations: int,
-) -> Outcome:
+) -> ShootingOutcome:
     """Iterate until the steps are small.
 
     Parameters
@@ -114,12 +114,12 @@ def iterate(
 
     Returns
     -------
-    Outcome
+    ShootingOutcome
     """
-    return _Loop(problem, prior, theta, tuple(x), variance).run(tolerance, max_iterations)
+    return _ShootingLoop(problem, prior, theta, tuple(x), variance).run(tolerance, max_iterations)
 
 
-class _Loop:
+class _ShootingLoop:
     """The present point; lives inside :func:`iterate` only."""
 
     def __init__(
@@ -135,7 +135,7 @@ class _Loop:
         self.theta, self.x = theta, x
         self.staged = variance is not None
         self.variance = problem.first_variance() if variance is None else variance
-        self.history: list[Line] = []
+        self.history: list[ShootingIteration] = []
         self.local: Local | None = None
         self.before: tuple[Change, Change, float] | None = None
         self.damped = 0
@@ -144,7 +144,7 @@ class _Loop:
         self.slack = 1.0 if variance is None else 0.0
         self.first_gaps: Array | None = None
 
-    def run(self, tolerance: float, max_iterations: int) -> Outcome:
+    def run(self, tolerance: float, max_iterations: int) -> ShootingOutcome:
         status = self._restored(self.theta, self.x)
         for _ in range(max_iterations if status.ok else 0):
             self._record()
@@ -297,11 +297,13 @@ class _Loop:
         if pulled.any():
             priors = [self.problem.priors[k] for k in pulled]
             objective += log_prior(priors, self.theta[pulled])
-        self.history.append(Line(self.theta, self.variance, objective, self.damped))
+        self.history.append(ShootingIteration(self.theta, self.variance, objective, self.damped))
         self.damped = 0
 
-    def _outcome(self, status: Status) -> Outcome:
-        return Outcome(self.theta, self.x, self.variance, status, tuple(self.history), self.local)
+    def _outcome(self, status: Status) -> ShootingOutcome:
+        return ShootingOutcome(
+            self.theta, self.x, self.variance, status, tuple(self.history), self.local
+        )
 
 
 def _spread(states: Array) -> Array:
@@ -311,6 +313,6 @@ def _spread(states: Array) -> Array:
     return np.where(resting, np.where(size > 0, size, 1.0), spread)
 
 
-def joined(first: Outcome, second: Outcome) -> Outcome:
+def joined(first: ShootingOutcome, second: ShootingOutcome) -> ShootingOutcome:
     """The second outcome with the history of both; it began where the first ended."""
     return replace(second, history=first.history + second.history[1:])

@@ -29,7 +29,7 @@ from bayesoleo.estimation.estimators.estimate import checked_start
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.bounded import on_limit
 from bayesoleo.estimation.problems.scaling import PriorScale
-from bayesoleo.estimation.trajectories.iterate import Outcome, iterate, joined
+from bayesoleo.estimation.trajectories.iterate import ShootingOutcome, iterate, joined
 from bayesoleo.estimation.trajectories.problem import ShootingProblem
 from bayesoleo.estimation.trajectories.step import PRIORS, Local
 from bayesoleo.model import Model
@@ -43,7 +43,7 @@ MOST_REFINEMENTS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class EstimatedTrajectory:
     """The motion that an estimate found for one record.
 
     Parameters
@@ -85,7 +85,7 @@ class ShootingEstimate:
     ----------
     point : PointEstimate
         Parameters, covariance and history. ``halvings`` counts the steps that were shortened.
-    trajectories : tuple of Trajectory
+    trajectories : tuple of EstimatedTrajectory
         One for each record.
     steps : tuple of int
         Of each record's mesh.
@@ -95,7 +95,7 @@ class ShootingEstimate:
     """
 
     point: PointEstimate
-    trajectories: tuple[Trajectory, ...] = field(repr=False)
+    trajectories: tuple[EstimatedTrajectory, ...] = field(repr=False)
     steps: tuple[int, ...]
     shift: float
 
@@ -223,16 +223,16 @@ def _again(
     problem: ShootingProblem,
     finer: ShootingProblem,
     prior: str,
-    outcome: Outcome,
+    outcome: ShootingOutcome,
     options: Mapping[str, Any],
-) -> Outcome:
+) -> ShootingOutcome:
     """Go on from an outcome on a finer mesh."""
     pairs = zip(problem.runs, finer.runs, outcome.x, strict=True)
     x = [coarse.moved_to(fine, x) for coarse, fine, x in pairs]
     return joined(outcome, iterate(finer, prior, outcome.theta, x, outcome.variance, **options))
 
 
-def _shift(outcome: Outcome, again: Outcome) -> float:
+def _shift(outcome: ShootingOutcome, again: ShootingOutcome) -> float:
     if again.local is None:
         return np.nan
     sd = np.sqrt(np.diag(_covariances(again.local)[0]))
@@ -247,7 +247,7 @@ def _covariances(local: Local) -> tuple[Array, Array]:
 
 
 def _summary(
-    problem: ShootingProblem, method: str, start: Array, outcome: Outcome, shift: float
+    problem: ShootingProblem, method: str, start: Array, outcome: ShootingOutcome, shift: float
 ) -> ShootingEstimate:
     unknowns, history = len(problem.names), outcome.history
     covariance = likelihood = np.full((unknowns, unknowns), np.nan)
@@ -288,8 +288,8 @@ def _summary(
 
 
 def _trajectory(
-    problem: ShootingProblem, outcome: Outcome, r: int, covariance: Array
-) -> Trajectory:
+    problem: ShootingProblem, outcome: ShootingOutcome, r: int, covariance: Array
+) -> EstimatedTrajectory:
     run, x, D = problem.runs[r], outcome.x[r], problem.runs[r].state_size
     predicted = run.predict(x, problem.constants(outcome.theta, r))
     states = np.concatenate([x[:, :D], run.segments.ends(x[..., None])[-1:, :, 0]])
@@ -298,7 +298,7 @@ def _trajectory(
     sd = np.full(D, np.nan)
     if outcome.local is not None:
         sd = outcome.local.normal[r].initial_sd(covariance[np.ix_(own, own)])
-    return Trajectory(
+    return EstimatedTrajectory(
         label=run.record.label,
         time=run.record.time[0] + run.segments.length * np.arange(len(states)),
         states=states,

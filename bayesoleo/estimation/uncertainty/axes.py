@@ -19,7 +19,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import curvature
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 
 Scale = Literal["prior", "value"]
 # Components below this part of the largest do not help a reader.
@@ -30,7 +30,7 @@ _UNDETERMINED = 1.0
 
 def principal_axes(
     problem: Problem, point: PointEstimate, *, scale: Scale = "prior", exact: bool = False
-) -> Shown:
+) -> LabelledResult:
     """Principal axes of the likelihood at an estimate, the sloppiest first.
 
     Parameters
@@ -46,7 +46,7 @@ def principal_axes(
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``information(axis)``, ``sd(axis)``, ``direction(axis, parameter)``, ``words(axis)``,
         ``scale(parameter)``.
 
@@ -80,7 +80,7 @@ def principal_axes(
         coords={schema.PARAMETER: names},
     )
     data.attrs = {"scaled_by": scale}
-    return Shown(data, axes_text(data))
+    return LabelledResult(data, axes_text(data))
 
 
 def over_variances(whole: Array, unknowns: int) -> Array:

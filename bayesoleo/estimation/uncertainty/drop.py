@@ -23,7 +23,7 @@ from bayesoleo.estimation.problems.problem import Problem, measured_of
 Kind = Literal["likelihood", "posterior"]
 
 
-class Drop:
+class LogLikelihoodRatio:
     """Fall of the objective from an estimate, positive away from it.
 
     Parameters

@@ -23,9 +23,9 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import curvature
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.estimation.uncertainty.axes import axes_text, over_variances, principal_axes
-from bayesoleo.estimation.uncertainty.drop import Drop, Kind
+from bayesoleo.estimation.uncertainty.drop import Kind, LogLikelihoodRatio
 from bayesoleo.estimation.uncertainty.plane import Plane
 
 CONDITIONAL, PROFILED = "conditional", "profiled"
@@ -43,7 +43,7 @@ def indifference(
     points: int = 48,
     exact: bool = False,
     progress: Callable[[str], None] | None = None,
-) -> Shown:
+) -> LabelledResult:
     """Contours of the indifference region in planes of two parameters, and its principal axes.
 
     Parameters
@@ -73,7 +73,7 @@ def indifference(
 
     Returns
     -------
-    Shown
+    LabelledResult
         The group ``indifference``: ``contour`` and ``ellipse`` ``(section, pair, point, side)``
         with ``name(pair, side)`` and ``half_width(section,
         pair, side)``; what :func:`~bayesoleo.estimation.uncertainty.axes.principal_axes` gives; the
@@ -91,7 +91,7 @@ def indifference(
         hint = "epsilon must be positive, points an even number from eight"
         raise InputError("no contour can be drawn", value=(epsilon, points), hint=hint)
     kinds = _sections(sections, len(problem.names))
-    drop = Drop(problem, point, kind)
+    drop = LogLikelihoodRatio(problem, point, kind)
     whole = curvature(
         problem, point.theta, point.variance, prior=drop.kind == "posterior", exact=exact
     )
@@ -111,7 +111,7 @@ def indifference(
     axes = principal_axes(problem, point, exact=exact)
     data = _dataset(problem, point, chosen, kinds, (contour, ellipse, half)).merge(axes.data)
     data.attrs = {**axes.data.attrs, "kind": drop.kind, "epsilon": epsilon}
-    return Shown(data, indifference_text(data))
+    return LabelledResult(data, indifference_text(data))
 
 
 def _pairs(problem: Problem, pairs: Sequence[tuple[str, str]] | None) -> list[tuple[int, int]]:

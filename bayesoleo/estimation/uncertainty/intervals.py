@@ -21,7 +21,7 @@ from bayesoleo.estimation.objectives.curvature import (
     prior_precision,
 )
 from bayesoleo.estimation.problems.problem import Problem, measured_of
-from bayesoleo.estimation.shown import Shown, columns
+from bayesoleo.estimation.shown import LabelledResult, columns
 
 Form = Literal["posterior", "propagated"]
 Distribution = Literal["t", "normal"]
@@ -92,14 +92,14 @@ def linearised_intervals(
     level: float = 0.95,
     prior: bool = True,
     exact: bool = False,
-) -> Shown:
+) -> LabelledResult:
     """Two-sided normal intervals of the parameters and the error variances.
 
     Parameters are those of :func:`linearised_covariance`; ``level`` is the coverage.
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``estimate``, ``sd``, ``low``, ``high`` over ``parameter``, in which a variance appears as
         ``variance[output]``, and ``covariance``.
     """
@@ -110,7 +110,7 @@ def linearised_intervals(
     half = stats.norm.isf((1 - level) / 2) * np.sqrt(np.diag(covariance))
     data = _dataset(names, values, covariance, half)
     data.attrs = {"form": form, "level": level, "prior": int(prior), "exact": int(exact)}
-    return Shown(data, intervals_text(data))
+    return LabelledResult(data, intervals_text(data))
 
 
 def over_experiments(
@@ -120,7 +120,7 @@ def over_experiments(
     level: float = 0.95,
     distribution: Distribution = "t",
     of: Literal["mean", "experiment"] = "mean",
-) -> Shown:
+) -> LabelledResult:
     """Mean, covariance and intervals over the estimates of several experiments.
 
     The thesis's choice: what the model leaves out differs from run to run, and shows here.
@@ -140,7 +140,7 @@ def over_experiments(
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``estimate`` (the mean), ``sd`` (of one experiment), ``low``, ``high`` and ``covariance``.
 
     References
@@ -173,7 +173,7 @@ def over_experiments(
         "distribution": distribution,
         "of": of,
     }
-    return Shown(data, intervals_text(data))
+    return LabelledResult(data, intervals_text(data))
 
 
 def _table(

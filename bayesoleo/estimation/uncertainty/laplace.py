@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.error_models.independent import output_counts, staged_variance, sums_of_squares
-from bayesoleo.error_models.linearise import Linearised, inverse_gram
+from bayesoleo.error_models.linearise import LinearisedResidual, inverse_gram
 from bayesoleo.estimation.problems.problem import Problem
 from bayesoleo.estimation.problems.scaling import PriorScale
 
@@ -44,7 +44,7 @@ def mode_covariance(problem: Problem, theta: Array) -> Array:
     counts = output_counts(problem.counts)
     variance = staged_variance(sums_of_squares(evaluation), counts)
     chain = scale.unit(theta)
-    rows = Linearised.of(evaluation, chain).whitened(variance)[0]
+    rows = LinearisedResidual.of(evaluation, chain).whitened(variance)[0]
     covariance = inverse_gram(np.vstack((rows, scale.root)))
     cross = np.column_stack(
         [

@@ -17,8 +17,8 @@ from scipy.interpolate import PchipInterpolator
 from bayesoleo._types import Array
 from bayesoleo.estimation.objectives.curvature import inverse_scaled
 from bayesoleo.estimation.problems.held import Held
-from bayesoleo.estimation.uncertainty.drop import Drop
-from bayesoleo.estimation.uncertainty.profile import Line
+from bayesoleo.estimation.uncertainty.drop import LogLikelihoodRatio
+from bayesoleo.estimation.uncertainty.profile import ProfileLine
 from bayesoleo.estimation.uncertainty.rays import first_crossing
 
 # Least curvature, as part of the prior's: an ellipse stays finite where the data say nothing.
@@ -33,7 +33,7 @@ class Plane:
 
     Parameters
     ----------
-    drop : Drop
+    drop : LogLikelihoodRatio
         Over the two, or over all parameters.
     pair : tuple of int
         The two, among those of ``drop``.
@@ -43,18 +43,20 @@ class Plane:
         Inverse curvature in the unknowns of ``drop``, with the prior's.
     """
 
-    drop: Drop
+    drop: LogLikelihoodRatio
     pair: tuple[int, int]
     block: Array
     covariance: Array
 
     @classmethod
-    def of(cls, drop: Drop, matrix: Array, pair: tuple[int, int], profiled: bool) -> Plane:
+    def of(
+        cls, drop: LogLikelihoodRatio, matrix: Array, pair: tuple[int, int], profiled: bool
+    ) -> Plane:
         """A plane through the estimate.
 
         Parameters
         ----------
-        drop : Drop
+        drop : LogLikelihoodRatio
             Over all parameters.
         matrix : ndarray, shape (l, l)
             Curvature of the objective.
@@ -74,7 +76,7 @@ class Plane:
         point, order = drop.point, sorted(index)
         section = Held(drop.problem, point.theta, others)
         inside = replace(point, names=section.names, theta=point.theta[order])
-        own = Drop(section, inside, drop.kind)
+        own = LogLikelihoodRatio(section, inside, drop.kind)
         return cls(
             drop=own,
             pair=(order.index(pair[0]), order.index(pair[1])),
@@ -114,7 +116,9 @@ class Plane:
         From the lowest value of the first parameter along one wall to the highest and back along
         the other; an end that is open is infinite.
         """
-        line = Line.follow(self.drop, self.pair[0], float(np.sqrt(2 * epsilon)), self.covariance)
+        line = ProfileLine.follow(
+            self.drop, self.pair[0], float(np.sqrt(2 * epsilon)), self.covariance
+        )
         low, high, is_open = self._reach(line)
         nodes = points // 2
         # Dense towards the ends, where an ellipse turns back.
@@ -128,7 +132,7 @@ class Plane:
                 upper[end] = lower[end] = np.inf
         return np.concatenate((upper, lower[::-1]))
 
-    def _reach(self, line: Line) -> tuple[float, float, tuple[bool, bool]]:
+    def _reach(self, line: ProfileLine) -> tuple[float, float, tuple[bool, bool]]:
         """Ends of the region in the first parameter, or of what is drawn; whether it goes on."""
         centre, most = self.centre[0], _OPEN_REACH * self.spread[0]
         ends, is_open = [], []
@@ -142,7 +146,7 @@ class Plane:
             is_open.append(not np.isfinite(limit) and not (at_edge and drawn == last))
         return ends[0], ends[1], (is_open[0], is_open[1])
 
-    def _floor(self, line: Line, x: Array) -> tuple[Array, Array]:
+    def _floor(self, line: ProfileLine, x: Array) -> tuple[Array, Array]:
         """All unknowns along the valley's floor, shape (nodes, l), and the falls there.
 
         The line knows the floor at its own points; between them a narrow valley may bend away from
@@ -182,7 +186,7 @@ class Plane:
         return np.array([self.drop.profiled(row, self.pair)[0] for row in theta])
 
 
-def _foresight(drop: Drop, matrix: Array) -> Array:
+def _foresight(drop: LogLikelihoodRatio, matrix: Array) -> Array:
     """Inverse curvature with the prior's, by which steps are foreseen where the data are silent."""
     precision = np.array([prior.sd**-2 for prior in drop.problem.priors])
     return inverse_scaled(matrix + np.diag(precision))

@@ -19,8 +19,8 @@ from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.problems.problem import Problem
-from bayesoleo.estimation.shown import Shown, columns
-from bayesoleo.estimation.uncertainty.drop import Drop, Kind
+from bayesoleo.estimation.shown import LabelledResult, columns
+from bayesoleo.estimation.uncertainty.drop import Kind, LogLikelihoodRatio
 
 # A profile that has not fallen enough after so many linearised standard deviations is open.
 _FARTHEST = 50.0
@@ -39,7 +39,7 @@ def profile(
     kind: Kind | None = None,
     level: float = 0.95,
     progress: Callable[[str], None] | None = None,
-) -> Shown:
+) -> LabelledResult:
     """Profile the objective along each unknown, all others re-estimated.
 
     Parameters
@@ -59,7 +59,7 @@ def profile(
 
     Returns
     -------
-    Shown
+    LabelledResult
         ``value``, ``fall`` ``(parameter, point)``; ``path(parameter, point, unknown)``, where the
         others went; ``low``, ``high``, ``linear_low``, ``linear_high`` ``(parameter)``. A limit is
         infinite where the profile stays below it for 50 standard deviations or to the end of the
@@ -77,7 +77,7 @@ def profile(
             raise InputError(
                 "there is no such unknown", key=name, hint=f"use {', '.join(problem.names)}"
             )
-    drop = Drop(problem, point, kind)
+    drop = LogLikelihoodRatio(problem, point, kind)
     limit = float(np.sqrt(stats.chi2.isf(1 - level, 1)))
     covariance = point.covariance if drop.kind == "posterior" else point.covariance_likelihood
     lines = []
@@ -86,15 +86,15 @@ def profile(
             progress(name)
         # The covariance with the prior foresees steps: without it a direction that the data leave
         # open would throw the others out of sight.
-        lines.append(Line.follow(drop, problem.names.index(name), limit, point.covariance))
+        lines.append(ProfileLine.follow(drop, problem.names.index(name), limit, point.covariance))
     problem.evaluate(point.theta)
     data = _dataset(problem, point, chosen, lines, limit, covariance)
     data.attrs = {"kind": drop.kind, "level": level}
-    return Shown(data, profile_text(data))
+    return LabelledResult(data, profile_text(data))
 
 
 @dataclass(frozen=True)
-class Line:
+class ProfileLine:
     """A profile.
 
     Parameters
@@ -114,12 +114,14 @@ class Line:
     high: float
 
     @classmethod
-    def follow(cls, drop: Drop, index: int, limit: float, covariance: Array) -> Line:
+    def follow(
+        cls, drop: LogLikelihoodRatio, index: int, limit: float, covariance: Array
+    ) -> ProfileLine:
         """Profile one unknown until the root of twice the fall exceeds a limit, or to its end.
 
         Parameters
         ----------
-        drop : Drop
+        drop : LogLikelihoodRatio
         index : int
             Of the unknown.
         limit : float
@@ -146,7 +148,9 @@ class Line:
 Stop = tuple[float, float, Array]
 
 
-def _side(drop: Drop, index: int, sign: float, limit: float, covariance: Array) -> list[Stop]:
+def _side(
+    drop: LogLikelihoodRatio, index: int, sign: float, limit: float, covariance: Array
+) -> list[Stop]:
     """Follow a profile to one side, in equal steps of the root of its fall as far as foreseen."""
     theta = drop.point.theta.copy()
     variance = covariance[index, index]
@@ -181,7 +185,9 @@ def _side(drop: Drop, index: int, sign: float, limit: float, covariance: Array) 
     return stops
 
 
-def _refined(drop: Drop, index: int, here: Stop, stops: list[Stop], limit: float) -> list[Stop]:
+def _refined(
+    drop: LogLikelihoodRatio, index: int, here: Stop, stops: list[Stop], limit: float
+) -> list[Stop]:
     """The same side with one more stop, where the limit is foreseen by interpolation."""
     place = _crossing([here, *stops], limit, np.nan)
     if np.isnan(place):
@@ -196,7 +202,7 @@ def _refined(drop: Drop, index: int, here: Stop, stops: list[Stop], limit: float
     return sorted(whole, key=lambda stop: abs(stop[0] - here[0]))
 
 
-def _inside(drop: Drop, theta: Array, index: int, value: float) -> Array:
+def _inside(drop: LogLikelihoodRatio, theta: Array, index: int, value: float) -> Array:
     """Start of the other unknowns, kept within their support."""
     start = theta.copy()
     start[index] = value
@@ -226,7 +232,7 @@ def _dataset(
     problem: Problem,
     point: PointEstimate,
     names: list[str],
-    lines: Sequence[Line],
+    lines: Sequence[ProfileLine],
     limit: float,
     covariance: Array,
 ) -> xr.Dataset:

@@ -28,7 +28,7 @@ from bayesoleo.estimation.estimators.steps import Step
 from bayesoleo.estimation.problems.batch import BatchProblem
 from bayesoleo.estimation.problems.problem import measured_of
 from bayesoleo.estimation.problems.scaling import PriorScale
-from bayesoleo.estimation.uncertainty.walk_together import Lanes, Walk
+from bayesoleo.estimation.uncertainty.walk_together import BatchedFit, Lanes
 from bayesoleo.parallel import single_blas_thread, thread_map
 from bayesoleo.solvers.status import Status
 
@@ -148,7 +148,7 @@ def estimate_many(
                 progress=progress,
             )
             return _with_measured(found, problem.names, starts, measured)
-    walk = Walk(problem, step, scale, tolerance, max_iterations, bias_corrected)
+    walk = BatchedFit(problem, step, scale, tolerance, max_iterations, bias_corrected)
     together = step.steady and (step.fixed_prior or not measured.any())
     size = problem.lanes
     cuts = [slice(k, min(k + size, len(starts))) for k in range(0, len(starts), size)]

@@ -26,7 +26,7 @@ from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.objectives.curvature import prior_precision
 from bayesoleo.estimation.problems.batch import BatchProblem
 from bayesoleo.estimation.problems.problem import Problem, measured_of
-from bayesoleo.estimation.shown import Shown
+from bayesoleo.estimation.shown import LabelledResult
 from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
 from bayesoleo.estimation.uncertainty.redraw import DataSource, NoiseBlock, data_source
 from bayesoleo.estimation.uncertainty.replicate import estimate_many
@@ -36,7 +36,7 @@ from bayesoleo.storage.slots import Arrays, Slots
 
 
 @dataclass(frozen=True)
-class _Work:
+class _ReplicationTask:
     """What every replication has in common."""
 
     source: DataSource
@@ -107,7 +107,7 @@ def sampling_distribution(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: bool | float = False,
-) -> Shown:
+) -> LabelledResult:
     """Simulate an experiment again and again, estimate from each, and compare with theory.
 
     Parameters
@@ -145,7 +145,7 @@ def sampling_distribution(
 
     Returns
     -------
-    Shown
+    LabelledResult
         The group ``sampling_distribution``: ``replicate(replication, parameter)``,
         ``status(replication)``, ``variance(replication, output)``; ``truth``, ``mean``, ``bias``,
         ``bias_standard_error``, ``sd``, ``expected_sd``, ``bound_sd``, ``efficiency``
@@ -177,15 +177,15 @@ def sampling_distribution(
     source = data_source(problem, theta, noise, input_noise=input_noise)
     blocks = source.blocks()
     find_method(method)
-    work = _Work(source, theta, method, seed, tolerance, max_iterations)
+    work = _ReplicationTask(source, theta, method, seed, tolerance, max_iterations)
     slots = Slots(out, _fingerprint(problem, work, blocks, block))
     parts = _all_blocks(work, slots, replications, block, jobs, scheduler, progress)
     data = _summarise(problem, work, blocks, parts)
-    return Shown(data, sampling_text(data))
+    return LabelledResult(data, sampling_text(data))
 
 
 def _all_blocks(
-    work: _Work,
+    work: _ReplicationTask,
     slots: Slots,
     replications: int,
     block: int,
@@ -223,14 +223,16 @@ def _all_blocks(
 class _Blocks:
     """Makes a block of replications by its number, wherever it is sent."""
 
-    work: _Work
+    work: _ReplicationTask
     numbers: Sequence[range]
 
     def __call__(self, index: int) -> Arrays:
         return self.work.block(self.numbers[index])
 
 
-def _fingerprint(problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], block: int) -> str:
+def _fingerprint(
+    problem: Problem, work: _ReplicationTask, blocks: Sequence[NoiseBlock], block: int
+) -> str:
     """What the stored replications belong to."""
     settings: list[object] = [
         list(problem.names),
@@ -249,7 +251,7 @@ def _fingerprint(problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], bl
 
 
 def _summarise(
-    problem: Problem, work: _Work, blocks: Sequence[NoiseBlock], parts: Arrays
+    problem: Problem, work: _ReplicationTask, blocks: Sequence[NoiseBlock], parts: Arrays
 ) -> xr.Dataset:
     """The group ``sampling_distribution`` from finished replications."""
     good = parts["status"] == Status.CONVERGED.value

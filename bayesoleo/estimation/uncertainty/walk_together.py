@@ -17,7 +17,7 @@ from bayesoleo.error_models.independent import output_counts, staged_variance
 from bayesoleo.estimation.estimators.estimate import estimate
 from bayesoleo.estimation.estimators.point import PointEstimate
 from bayesoleo.estimation.estimators.steps import Step
-from bayesoleo.estimation.problems.batch import BatchProblem, NormalEquations
+from bayesoleo.estimation.problems.batch import BatchNormalEquations, BatchProblem
 from bayesoleo.estimation.problems.scaling import PriorScale
 from bayesoleo.solvers.status import Status
 
@@ -50,7 +50,7 @@ class Lanes:
 
 
 @dataclass(frozen=True)
-class Walk:
+class BatchedFit:
     """The iteration of one batch."""
 
     problem: BatchProblem
@@ -124,14 +124,14 @@ class Walk:
             merit = merit + self.scale.log_density(theta)
         return merit
 
-    def _precision(self, theta: Array, equations: NormalEquations, variance: Array) -> Array:
+    def _precision(self, theta: Array, equations: BatchNormalEquations, variance: Array) -> Array:
         """``A`` in scaled unknowns, shape (L, l, l)."""
         unit = self.scale.unit(theta)
         gram = np.einsum("lbjk,lb->ljk", equations.gram, 1 / variance)
         return cast(Array, gram * unit[:, :, None] * unit[:, None, :])
 
     def _proposal(
-        self, theta: Array, equations: NormalEquations, variance: Array
+        self, theta: Array, equations: BatchNormalEquations, variance: Array
     ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Scaled steps (L, l), which of them may be taken in full, and which are small."""
         scale, step = self.scale, self.step
@@ -161,7 +161,7 @@ class Walk:
         lanes: Lanes,
         where: NDArray[np.int64],
         theta: Array,
-        equations: NormalEquations,
+        equations: BatchNormalEquations,
         iteration: int,
     ) -> None:
         if not where.size:
@@ -188,8 +188,8 @@ def _inverse(precision: Array) -> Array:
         )
 
 
-def _rows_of(equations: NormalEquations, which: NDArray[np.bool_]) -> NormalEquations:
-    return NormalEquations(
+def _rows_of(equations: BatchNormalEquations, which: NDArray[np.bool_]) -> BatchNormalEquations:
+    return BatchNormalEquations(
         equations.gram[which],
         equations.slope[which],
         equations.sums[which],
@@ -198,6 +198,9 @@ def _rows_of(equations: NormalEquations, which: NDArray[np.bool_]) -> NormalEqua
 
 
 def _only(
-    which: NDArray[np.bool_], alive: NDArray[np.int64], theta: Array, equations: NormalEquations
-) -> tuple[NDArray[np.int64], Array, NormalEquations]:
+    which: NDArray[np.bool_],
+    alive: NDArray[np.int64],
+    theta: Array,
+    equations: BatchNormalEquations,
+) -> tuple[NDArray[np.int64], Array, BatchNormalEquations]:
     return alive[which], theta[which], _rows_of(equations, which)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.machines import Crew
+from bayesoleo.machines import WorkerPool
 from bayesoleo.posterior.density.log_density import Density
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class DistributedDensity:
         self.log_density = log_density
         self.evaluations, self.branch_jumps = log_density.evaluations, 0
         self.failures: Counter[str] = Counter(log_density.failures)
-        self._crew = Crew(client, _Rows(log_density), keep=True)
+        self._crew = WorkerPool(client, _Rows(log_density), keep=True)
 
     @property
     def names(self) -> tuple[str, ...]:

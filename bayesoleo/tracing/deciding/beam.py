@@ -13,27 +13,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
-from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, judged, speak_against
+from bayesoleo.tracing.deciding.confirmation import confirmed, judged, speak_against
 from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.fall import fall_on_hold_out
 from bayesoleo.tracing.deciding.lookahead import leads_as_far
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, fall_from, schwarz_price
-from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.ranking import ABSORBING_FAMILIES, Ranked
+from bayesoleo.tracing.deciding.refit import fall_from, schwarz_price
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import fit_state
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
-
-#: First effects followed besides the one that was taken; and how much less one of them may explain,
-#: beyond the price of its unknowns: where causes led down to the noise, and where they did not or
-#: a curve without a name did.
-MOST_FOLLOWED, TIED, NEAR = 2, 0.02, 0.1
-#: Names stand instead of a curve only if they are better by this much (Kass and Raftery 1995).
-DECISIVE = 10.0
-
-Say = Callable[[str], None]
+from bayesoleo.tracing.policy import SearchPolicy
 
 
 def best_of_beam(
@@ -43,7 +37,7 @@ def best_of_beam(
     follow: Callable[[Progress, int], Progress],
     effects: Sequence[Effect] | None,
     max_effects: int,
-    say: Say,
+    callback: ProgressCallback,
 ) -> Progress:
     """The best final model that the best few first effects lead to.
 
@@ -59,7 +53,7 @@ def best_of_beam(
         Instead of the catalogue.
     max_effects : int
         Effects added at most.
-    say : callable
+    callback : callable
         Told what is being done.
 
     Returns
@@ -69,19 +63,19 @@ def best_of_beam(
         those that are in their place here.
     """
     best = progress
-    for first in followed(progress):
+    for first in followed(progress, numerics.policy):
         if (first.effect, first.target) in best.state.assembly.added:
             continue
-        if not leads_as_far(progress, first, roles, numerics, effects, say):
+        if not leads_as_far(progress, first, roles, numerics, effects, callback):
             continue
-        say(f"follow {first.effect} as the first effect instead")
-        other = _followed(progress, first, roles, numerics, follow, max_effects, say)
+        callback(f"follow {first.effect} as the first effect instead")
+        other = _followed(progress, first, roles, numerics, follow, max_effects, callback)
         if other is not None and other.state.assembly.added:
-            best = _better(best, other, say)
+            best = _better(best, other, numerics.policy, callback)
     return best
 
 
-def followed(progress: Progress) -> list[Ranked]:
+def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
     """First effects that were nearly as good as the one that was taken, the best first.
 
     None where one effect alone led down to the noise. Those that the data could not tell from it
@@ -90,7 +84,7 @@ def followed(progress: Progress) -> list[Ranked]:
     opening, final = progress.rounds[0], progress.state
     taken = opening.accepted
     curve = any(step.effect.family == FAMILY for step in final.assembly.steps)
-    alone = taken is not None and not taken.imitates and len(final.assembly.added) < 2 and not curve
+    alone = taken is not None and not taken.absorbs and len(final.assembly.added) < 2 and not curve
     if final.at_floor and (taken is None or alone):
         return []
     pool = [
@@ -98,13 +92,13 @@ def followed(progress: Progress) -> list[Ranked]:
         for item in opening.ranking
         if item.refit is not None
         and np.isfinite(item.refit.share)
-        and item.p_value < LEVEL
-        and not item.imitates
+        and item.p_value < policy.significance
+        and not item.absorbs
         and item.score.option.candidate.family != FAMILY
     ]
     most = max((worth for worth, _ in pool), default=0.0)
-    clear = final.at_floor and not curve and not _imitates(progress)
-    behind = TIED if clear else NEAR
+    clear = final.at_floor and not curve and not _absorbs(progress)
+    behind = policy.followed_behind_clear if clear else policy.followed_behind
     seen = set(final.assembly.added)
     alike = set() if taken is None else {taken.effect, *taken.same}
     chosen: list[Ranked] = []
@@ -114,7 +108,7 @@ def followed(progress: Progress) -> list[Ranked]:
             if not names & alike:
                 chosen.append(item)
             alike |= names | set(item.same)
-    return chosen[:MOST_FOLLOWED]
+    return chosen[: policy.followed]
 
 
 def _followed(
@@ -124,19 +118,19 @@ def _followed(
     numerics: Numerics,
     follow: Callable[[Progress, int], Progress],
     max_effects: int,
-    say: Say,
+    callback: ProgressCallback,
 ) -> Progress | None:
     opening, result = progress.rounds[0], first.refit
     assert result is not None
-    after, reason = confirmed(opening.before, first, result, roles, numerics, say)
+    after, reason = confirmed(opening.before, first, result, roles, numerics, callback)
     provisional = after is None
     if after is None:
-        if result.share < FAIR_SHARE or not result.excludes_null():
+        if result.share < numerics.policy.fair_share or not result.excludes_null():
             return None
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         reason += "; it is taken on trial, to be confirmed together with the next one"
     present = len(progress.state.assembly.added)
-    few = progress.state.at_floor and not (opening.accepted and opening.accepted.imitates)
+    few = progress.state.at_floor and not (opening.accepted and opening.accepted.absorbs)
     most = max(present, 2) if few else min(max(present + 1, 2), max_effects)
     begun = Round(
         opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
@@ -156,7 +150,9 @@ def _together_confirmed(found: Progress) -> bool:
     return fall_on_hold_out(*judged(found.first, found.state), _inflation(found)).confirms
 
 
-def _better(best: Progress, other: Progress, say: Say) -> Progress:
+def _better(
+    best: Progress, other: Progress, policy: SearchPolicy, callback: ProgressCallback
+) -> Progress:
     """The better of two finished searches, with the other's effects in its classes if it is about
     as likely."""
     gap, scale = likelihood_gap(best, other)
@@ -167,26 +163,29 @@ def _better(best: Progress, other: Progress, say: Say) -> Progress:
     ):
         return best
     curve = any(step.effect.family == FAMILY for step in best.state.assembly.steps)
-    symptom = _imitates(best) and not _imitates(other)
-    if gap > scale * (DECISIVE if curve else -AS_LIKELY if symptom else AS_LIKELY):
-        return _with_notes(best, other, gap, say)
-    if abs(gap) <= AS_LIKELY * scale and not curve:
+    symptom = _absorbs(best) and not _absorbs(other)
+    equal = policy.equal_likelihood
+    if gap > scale * (policy.decisive if curve else -equal if symptom else equal):
+        return _with_notes(best, other, gap, callback)
+    if abs(gap) <= equal * scale and not curve:
         return _with_classes(best, other)
     return best
 
 
-def _imitates(found: Progress) -> bool:
+def _absorbs(found: Progress) -> bool:
     """Whether a model has effects that take up a part of whatever is missing, and name no cause."""
-    return any(step.effect.family in IMITATORS for step in found.state.assembly.steps)
+    return any(step.effect.family in ABSORBING_FAMILIES for step in found.state.assembly.steps)
 
 
-def _with_notes(best: Progress, other: Progress, gap: float, say: Say) -> Progress:
+def _with_notes(
+    best: Progress, other: Progress, gap: float, callback: ProgressCallback
+) -> Progress:
     """The other search, which says what it stands instead of."""
     names, present = (
         " and ".join(effect for effect, _ in one.state.assembly.added) or "no effect"
         for one in (other, best)
     )
-    say(f"take {names} instead of {present}")
+    callback(f"take {names} instead of {present}")
     way = f"falls by {gap:.3g}" if gap > 0 else f"rises by {-gap:.3g} only, and they name causes"
     told = (
         f"instead of {present} the model has {names}: with unknowns counted (Schwarz 1978) the"

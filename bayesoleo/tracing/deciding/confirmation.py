@@ -2,43 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesoleo.tracing.deciding.fall import (
-    ENOUGH,
-    FALSE_ALARM,
-    fall_on_hold_out,
-    with_error,
-)
+from bayesoleo._types import ProgressCallback
+from bayesoleo.tracing.deciding.fall import fall_on_hold_out, with_error
+from bayesoleo.tracing.deciding.ranking import Ranked
 from bayesoleo.tracing.deciding.refit import Refit
 from bayesoleo.tracing.deciding.state import State, fit_state
 from bayesoleo.tracing.errors.holdout import crossed
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles, in_halves
 
-if TYPE_CHECKING:
-    from bayesoleo.tracing.deciding.rounds import Ranked
-
-#: Least part of the present excess that is worth another effect.
-LEAST_SHARE = 0.05
-#: The same of an effect that leaves more than noise. Of four that are missing, as many as are added
-#: by default, the one that explains most explains a quarter where they do different things; half of
-#: that is asked for. What explains less is near to something that is there rather than there.
-FAIR_SHARE = 0.125
-Say = Callable[[str], None]
-
 
 def confirmed(
-    state: State, item: Ranked, result: Refit, roles: Roles, numerics: Numerics, say: Say
+    state: State,
+    item: Ranked,
+    result: Refit,
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
 ) -> tuple[State | None, str]:
     """The state with an estimated effect in, if runs that were not used confirm it, and why."""
     if not np.isfinite(result.share):
         return None, f"{item.effect} could not be estimated"
-    if result.share < (LEAST_SHARE if result.reached else FAIR_SHARE):
+    policy = numerics.policy
+    if result.share < (policy.least_share if result.reached else policy.fair_share):
         share = f"{100 * result.share:.0f} % of the excess, {_on_fitted(result)}"
         return None, f"{item.effect} would explain only {share}"
     if not result.excludes_null():
@@ -46,7 +36,7 @@ def confirmed(
             None,
             f"the posterior of {item.effect} does not exclude its null: {_on_fitted(result)}",
         )
-    say(f"confirm {item.effect} on runs that were not used")
+    callback(f"confirm {item.effect} on runs that were not used")
     after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
@@ -56,18 +46,21 @@ def confirmed(
     where = f"hold-out runs: the weighted squared error falls by {fall}"
     # Halves of a run share whatever is odd in it. They show that a parameter of its own repeats,
     # which is no news where that leaves more than noise.
-    alike = item.imitates and not result.reached
+    alike = item.absorbs and not result.reached
     able = fall.undecided and not fall.speaks_against and not alike
     halves = in_halves(roles) if able else None
     if halves is not None:
         # What happens at the end of the stroke shows only in runs that get there.
-        say(f"runs held out hardly show {item.effect}: confirm it on the other half of the periods")
+        callback(
+            f"runs held out hardly show {item.effect}: confirm it on the other half of the periods"
+        )
         pair = _on_halves(state, after, halves, numerics)
         other = fall_on_hold_out(*pair, result.inflation)
         fall = fall.and_by(other)
         where += f", which hardly shows it, and by {other} on the second half of fitted ones"
     if not fall.confirms:
-        asked = f"{ENOUGH:.2f} standard errors are asked for (false alarms {100 * FALSE_ALARM:g} %)"
+        errors, alarms = policy.confirming_errors, 100 * policy.false_confirmation
+        asked = f"{errors:.2f} standard errors are asked for (false alarms {alarms:g} %)"
         return None, f"{item.effect} does not lower the error on {where}; {asked}"
     return after, f"{_explains(item)} and lowers the error on {where}"
 

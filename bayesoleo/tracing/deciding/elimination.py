@@ -8,26 +8,19 @@ and Multimodel Inference, section 2.5: dispersion.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.tracing.deciding.fall import with_error
 from bayesoleo.tracing.deciding.refit import compare, inflation_along, quick_fit, schwarz_price
 from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting.assembly import Step
+from bayesoleo.tracing.fitting.assembly import AddedEffect
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.projection import squared_distance
-
-#: An effect is needed, and not tried without, if its amplitudes' squared distance from their null
-#: is so many times what its unknowns must be worth: a fit without an effect of that size has far to
-#: go, and the noise's colour does not make up for such a factor.
-PLAINLY = 200.0
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -36,7 +29,7 @@ class Loss:
 
     Parameters
     ----------
-    step : Step
+    step : AddedEffect
         The effect.
     rise : float
         Of the weighted sum of squares on the fitted runs.
@@ -49,7 +42,7 @@ class Loss:
         What one unknown must be worth, in units of the scale.
     """
 
-    step: Step
+    step: AddedEffect
     rise: float
     size: int
     scale: float
@@ -70,7 +63,9 @@ class Loss:
         )
 
 
-def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str], say: Say) -> State:
+def eliminated(
+    state: State, roles: Roles, numerics: Numerics, notes: list[str], callback: ProgressCallback
+) -> State:
     """The state without effects that the last one made superfluous.
 
     Each earlier effect is left out in turn and everything else estimated anew; the one that is
@@ -84,7 +79,7 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
     numerics : Numerics
     notes : list of str
         Told what was taken out, and why.
-    say : callable
+    callback : callable
         Told what is being done.
     """
     while len(state.assembly.steps) > 1:
@@ -93,19 +88,19 @@ def eliminated(state: State, roles: Roles, numerics: Numerics, notes: list[str],
         doubted = [step for step in earlier if not plainly_needed(state, base, step)]
         if not doubted:
             return state
-        say("look whether the earlier effects are still needed")
+        callback("look whether the earlier effects are still needed")
         losses = [loss_without(state, base, step, numerics) for step in doubted]
         least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
         if not least.worth < 0.0:
             return state
         effect = least.step.effect.id
-        say(f"remove {effect}: {least}")
+        callback(f"remove {effect}: {least}")
         notes.append(f"{effect} was removed again, a later effect made it superfluous: {least}")
-        state = fit_state(state.assembly.without(least.step), roles, numerics, progress=say)
+        state = fit_state(state.assembly.without(least.step), roles, numerics, progress=callback)
     return state
 
 
-def plainly_needed(state: State, base: Base, step: Step) -> bool:
+def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
     """Whether an effect's amplitudes are so far from their null that no fit without it is asked
     for: by Wald's statistic, which is smaller than the fall of the sum of squares where they differ
     by much (Hauck and Donner 1977, JASA 72, 851-853)."""
@@ -115,10 +110,10 @@ def plainly_needed(state: State, base: Base, step: Step) -> bool:
     if not index or not point.status.ok or not np.isfinite(covariance).all():
         return False
     distance = squared_distance(point.theta[index], covariance)
-    return bool(distance > PLAINLY * schwarz_price(base) * len(index))
+    return bool(distance > base.policy.plainly_needed * schwarz_price(base) * len(index))
 
 
-def loss_without(state: State, base: Base, step: Step, numerics: Numerics) -> Loss:
+def loss_without(state: State, base: Base, step: AddedEffect, numerics: Numerics) -> Loss:
     """What is lost without one effect of a model, everything else estimated anew."""
     without = state.assembly.without(step).model()
     fit = quick_fit(base, without, base.fit.values, numerics)

@@ -18,14 +18,7 @@ from bayesoleo.prediction.input_noise import input_columns
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.masked import weights
-
-#: Probability with which an effect is confirmed that does not lower the error.
-FALSE_ALARM = 0.025
-#: So many standard errors a fall must exceed.
-ENOUGH = float(stats.norm.isf(FALSE_ALARM))
-#: Runs held out cannot judge an effect by themselves if its fall, should it be real, would not be
-#: confirmed in all but this part of cases.
-MISSED = 0.025
+from bayesoleo.tracing.policy import SearchPolicy
 
 
 @dataclass(frozen=True)
@@ -43,12 +36,14 @@ class Fall:
         What it would be on average if the effect is exactly right.
     spread : float, optional
         Standard error if the effect is there, its own parameters' included; by default the same.
+    policy : SearchPolicy
     """
 
     value: float
     error: float
     expected: float
     spread: float | None = None
+    policy: SearchPolicy = SearchPolicy()
 
     @property
     def scatter(self) -> float:
@@ -59,17 +54,20 @@ class Fall:
     def confirms(self) -> bool:
         """Whether the fall exceeds its error as often as is asked for, and what one unknown that is
         not there would explain as often."""
-        return bool(self.value > max(ENOUGH * self.error, ENOUGH**2))
+        enough = self.policy.confirming_errors
+        return bool(self.value > max(enough * self.error, enough**2))
 
     @property
     def speaks_against(self) -> bool:
         """Whether the squared error rises by more than its error, as often as is asked for."""
-        return bool(-self.value > ENOUGH * max(self.error, self.scatter))
+        enough = self.policy.confirming_errors
+        return bool(-self.value > enough * max(self.error, self.scatter))
 
     @property
     def undecided(self) -> bool:
         """Whether these runs are unlikely to confirm even an effect that is real."""
-        least = ENOUGH * self.error + stats.norm.isf(MISSED) * self.scatter
+        missed = stats.norm.isf(self.policy.missed_confirmation)
+        least = self.policy.confirming_errors * self.error + missed * self.scatter
         return bool(self.expected < least)
 
     @property
@@ -87,6 +85,7 @@ class Fall:
             float(np.hypot(first * self.error, second * other.error)),
             float(first * self.expected + second * other.expected),
             float(np.hypot(first * self.scatter, second * other.scatter)),
+            self.policy,
         )
 
     def __str__(self) -> str:
@@ -143,7 +142,7 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
         float(np.sqrt(variance + 4.0 * inflation * _known_to(state, pull)))
         for state, pull in zip((before, after), pulls, strict=True)
     )
-    return Fall(fall - inflation * charged, error, expected, spread)
+    return Fall(fall - inflation * charged, error, expected, spread, before.policy)
 
 
 def _pull(state: State, prediction: Prediction, measured: State, change: Array) -> Array:

@@ -7,30 +7,23 @@ in seconds whether it can come out better.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
 from bayesoleo.tracing.deciding.elimination import dispersion
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, fall_from, refit, schwarz_price
-from bayesoleo.tracing.deciding.rounds import Ranked
+from bayesoleo.tracing.deciding.ranking import Ranked, score_candidates
+from bayesoleo.tracing.deciding.refit import Refit, fall_from, refit, schwarz_price
 from bayesoleo.tracing.deciding.state import State, state_of
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
 from bayesoleo.tracing.scoring.base import Base
-from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import score_all
-from bayesoleo.tracing.scoring.significance import without_twins
-
-#: Second effects that are estimated beside another first one.
-MOST_SECONDS = 4
-
-Say = Callable[[str], None]
 
 
 def leads_as_far(
@@ -39,7 +32,7 @@ def leads_as_far(
     roles: Roles,
     numerics: Numerics,
     effects: Sequence[Effect] | None,
-    say: Say,
+    callback: ProgressCallback,
 ) -> bool:
     """Whether a first effect with the best second one beside it leaves about as little as the first
     two that were added, unknowns counted, or as the noise.
@@ -54,12 +47,12 @@ def leads_as_far(
     numerics : Numerics
     effects : sequence of Effect or None
         Instead of the catalogue.
-    say : callable
+    callback : callable
         Told what is being done.
     """
     result = first.refit
     assert result is not None
-    say(f"look how far {first.effect} leads as the first effect instead")
+    callback(f"look how far {first.effect} leads as the first effect instead")
     fitted = replace(roles, held_out=(), strategy="none")
     state = state_of(result.assembly, result.fit, fitted)
     if state.at_floor:
@@ -77,19 +70,19 @@ def leads_as_far(
     best = int(np.argmax(worths))
     # Of what is compared: a rival that moves the mean alone may lie in far more noise.
     scale = dispersion(left) * max(result.inflation, tried[best].inflation)
-    return worths[best] > _worth(reference, fall, present) - AS_LIKELY * scale
+    return (
+        worths[best] > _worth(reference, fall, present) - numerics.policy.equal_likelihood * scale
+    )
 
 
 def _best_seconds(
     state: State, numerics: Numerics, effects: Sequence[Effect] | None
 ) -> list[Refit]:
     """The effects that score best beside a first one, estimated."""
-    base, assembly = state.base(), state.assembly
-    scales = scales_of(state.fit, assembly.drive, tuple(assembly.native.dofs))
-    options = assembly.options(scales, None if effects is None else tuple(effects))
-    scores, _ = without_twins(score_all(base, options, numerics.jobs)[0])
+    base = state.base()
+    scores, _ = score_candidates(base, state.assembly, effects, numerics.jobs)
     named = [score for score in scores if score.option.candidate.family != FAMILY]
-    chosen = sorted(named, key=lambda score: -score.fall)[:MOST_SECONDS]
+    chosen = sorted(named, key=lambda score: -score.fall)[: numerics.policy.seconds]
     return thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
 
 

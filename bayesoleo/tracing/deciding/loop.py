@@ -8,33 +8,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.tracing.deciding.beam import best_of_beam
 from bayesoleo.tracing.deciding.elimination import eliminated
 from bayesoleo.tracing.deciding.progress import Progress
 from bayesoleo.tracing.deciding.review import reviewed
-from bayesoleo.tracing.deciding.rounds import LEVEL, Round, examine
+from bayesoleo.tracing.deciding.rounds import Round, examine
 from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.deciding.unnamed_round import unnamed_notes, with_unnamed
+from bayesoleo.tracing.deciding.unnamed_round import nonparametric_notes, with_nonparametric
 from bayesoleo.tracing.deciding.verdict import certainty_of, verdict_of
 from bayesoleo.tracing.errors.same_noise import least_noise
-from bayesoleo.tracing.fitting.assembly import Assembly, Step
+from bayesoleo.tracing.fitting.assembly import AddedEffect, Assembly
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.restart import better_start
 from bayesoleo.tracing.fitting.roles import Roles
-from bayesoleo.tracing.scoring.significance import SAME
+from bayesoleo.tracing.policy import SearchPolicy
 
 #: How a note begins that names parameters.
 ON_LIMIT = "at the limit of their prior's support"
 #: How a note begins of a declared model that was estimated from another start than its own.
 OTHER_OPTIMUM = "from its declared values the model's estimate ended in a lesser optimum, lower"
 
-#: How a note begins of parameters whose sign is not the declared one, and by how many standard
-#: deviations.
-OTHER_SIGN, SURELY = "of the other sign than declared", 3.0
-
-Say = Callable[[str], None]
+#: How a note begins of parameters whose sign is not the declared one.
+OTHER_SIGN = "of the other sign than declared"
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,8 @@ class ClosedLoop:
         What a reader should know.
     complete : bool
         Whether the search came to its end.
+    policy : SearchPolicy
+        By which it decided.
     """
 
     rounds: tuple[Round, ...]
@@ -60,6 +60,7 @@ class ClosedLoop:
     roles: Roles
     notes: tuple[str, ...]
     complete: bool = True
+    policy: SearchPolicy = SearchPolicy()
 
     @property
     def added(self) -> tuple[tuple[str, str], ...]:
@@ -79,7 +80,7 @@ class ClosedLoop:
     @property
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
-        return verdict_of(self.rounds, self.first, self.final)
+        return verdict_of(self.rounds, self.first, self.final, policy=self.policy)
 
     @property
     def certainty(self) -> str | None:
@@ -107,11 +108,12 @@ class ClosedLoop:
             return False
         if found.score.option.candidate.family == FAMILY:
             return False  # a function without a name has none to be certain of
-        if any(item.p_value < LEVEL for item in last.ranking):
+        level, same = self.policy.significance, self.policy.same_cosine
+        if any(item.p_value < level for item in last.ranking):
             return False
-        local = -np.expm1(np.log1p(-LEVEL) / last.tests)
+        local = -np.expm1(np.log1p(-level) / last.tests)
         fall = estimate.fall / estimate.inflation
-        return bool((1.0 - SAME) * fall > stats.chi2.isf(local, 1))
+        return bool((1.0 - same) * fall > stats.chi2.isf(local, 1))
 
 
 def close_loop(
@@ -122,10 +124,10 @@ def close_loop(
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
     max_effects: int = 4,
-    unnamed: bool = True,
+    nonparametric: bool = True,
     known: Progress | None = None,
     keep: Callable[[Progress], None] = lambda _: None,
-    say: Say = lambda _: None,
+    callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model, and add the effects that it lacks one after the other.
 
@@ -143,13 +145,13 @@ def close_loop(
         For the correction for the search.
     max_effects : int
         Effects added at most.
-    unnamed : bool
+    nonparametric : bool
         Whether a smooth function may be added where no named effect explains what is left.
     known : Progress, optional
         Of the same search, stopped before: it goes on from there.
     keep : callable
         Given the progress once the model is estimated, and after each round.
-    say : callable
+    callback : callable
         Told what is being done.
 
     Returns
@@ -157,22 +159,24 @@ def close_loop(
     ClosedLoop
     """
     if known is None:
-        known = _begun(assembly, roles, numerics, say)
+        known = _begun(assembly, roles, numerics, callback)
         keep(known)
-    search = Search(roles, numerics, effects, seed, max_effects, unnamed, keep, say)
+    search = SearchOptions(
+        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback
+    )
     known = searched(known, search)
 
     def follow(other: Progress, most: int) -> Progress:
-        quiet = replace(search, max_effects=most, unnamed=False, keep=lambda _: None)
+        quiet = replace(search, max_effects=most, nonparametric=False, keep=lambda _: None)
         return searched(other, quiet)
 
     roles = _with_noise(roles, known)
-    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, say)
+    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
     return loop_of(known, roles)
 
 
 @dataclass(frozen=True)
-class Search:
+class SearchOptions:
     """How a search is done; see :func:`close_loop`."""
 
     roles: Roles
@@ -180,18 +184,18 @@ class Search:
     effects: Sequence[Effect] | None
     seed: int
     max_effects: int
-    unnamed: bool
+    nonparametric: bool
     keep: Callable[[Progress], None]
-    say: Say
+    callback: ProgressCallback
 
 
-def searched(known: Progress, search: Search) -> Progress:
+def searched(known: Progress, search: SearchOptions) -> Progress:
     """A search carried on to its end, its final effects looked at again."""
     for left in reversed(range(search.max_effects + 1)):
         known = _rounds(known, search)
         roles = _with_noise(search.roles, known)
         known = reviewed(
-            known, roles, search.numerics, search.effects, search.say, replacing=left > 0
+            known, roles, search.numerics, search.effects, search.callback, replacing=left > 0
         )
         if known.finished:
             break
@@ -199,23 +203,31 @@ def searched(known: Progress, search: Search) -> Progress:
     return known
 
 
-def _rounds(known: Progress, search: Search) -> Progress:
+def _rounds(known: Progress, search: SearchOptions) -> Progress:
     """A search carried on until a round accepts nothing."""
-    numerics, say, max_effects = search.numerics, search.say, search.max_effects
+    numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
     roles = _with_noise(search.roles, known)
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
-        say(f"round {len(rounds) + 1}: {_ratios(state)}")
+        callback(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = _limit(state.assembly.steps, len(rounds), max_effects)
         outcome = examine(
-            state, roles, numerics, effects=search.effects, seed=search.seed, limit=limit, say=say
+            state,
+            roles,
+            numerics,
+            effects=search.effects,
+            seed=search.seed,
+            limit=limit,
+            callback=callback,
         )
-        if outcome.after is None and search.unnamed and max_effects > 0:
+        if outcome.after is None and search.nonparametric and max_effects > 0:
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects
-            outcome = with_unnamed(outcome, opening, roles, numerics, room=room, say=say)
+            outcome = with_nonparametric(
+                outcome, opening, roles, numerics, room=room, callback=callback
+            )
         if outcome.after is not None:
-            state = eliminated(outcome.after, roles, numerics, notes, say)
+            state = eliminated(outcome.after, roles, numerics, notes, callback)
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
@@ -232,16 +244,18 @@ def _with_noise(roles: Roles, known: Progress) -> Roles:
     return roles
 
 
-def _begun(assembly: Assembly, roles: Roles, numerics: Numerics, say: Say) -> Progress:
+def _begun(
+    assembly: Assembly, roles: Roles, numerics: Numerics, callback: ProgressCallback
+) -> Progress:
     """The declared model, estimated."""
     notes = [] if roles.strategy == "declared" else [roles.description]
-    state = fit_state(assembly, roles, numerics, progress=say)
+    state = fit_state(assembly, roles, numerics, progress=callback)
     if not state.at_floor:
-        say("more is left than expected: try other starts")
+        callback("more is left than expected: try other starts")
         start = better_start(state.fit, numerics)
         if start is not None:
             before = state.fit.point.objective
-            state = fit_state(assembly, roles, numerics, start=start, progress=say)
+            state = fit_state(assembly, roles, numerics, start=start, progress=callback)
             notes.append(
                 f"{OTHER_OPTIMUM} by {state.fit.point.objective - before:.3g} in log density: look"
                 " whether the declared values and priors are what is meant"
@@ -261,7 +275,7 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     progress = progress.with_same_noise()
     state = progress.state
     notes = [*progress.notes, *_warnings(state.fit), *_turned(progress.first.fit, state.fit)]
-    notes += unnamed_notes(progress.rounds)
+    notes += nonparametric_notes(progress.rounds)
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
     if not state.at_floor:
@@ -270,11 +284,17 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
             " too narrow"
         )
     return ClosedLoop(
-        progress.rounds, progress.first, state, roles, tuple(notes), not progress.broken
+        progress.rounds,
+        progress.first,
+        state,
+        roles,
+        tuple(notes),
+        not progress.broken,
+        state.policy,
     )
 
 
-def _limit(steps: Sequence[Step], rounds: int, max_effects: int) -> str:
+def _limit(steps: Sequence[AddedEffect], rounds: int, max_effects: int) -> str:
     """Why a round may only rank; empty where it may add an effect."""
     added = len(steps)
     if max_effects == 0:
@@ -299,10 +319,10 @@ def _ratios(state: State) -> str:
 
 def _turned(first: Fit, final: Fit) -> list[str]:
     """Parameters that came out with the other sign than they were declared with."""
-    turned = []
+    turned, least = [], final.policy.opposite_sign
     for name, value, sd in zip(final.problem.names, final.point.theta, final.point.sd, strict=True):
         declared = first.model.parameters.get(name)
-        if declared is not None and declared.value * value < 0 and abs(value) > SURELY * sd:
+        if declared is not None and declared.value * value < 0 and abs(value) > least * sd:
             turned.append(f"{name} = {value:.3g}")
     if not turned:
         return []

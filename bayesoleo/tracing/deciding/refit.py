@@ -19,24 +19,11 @@ from bayesoleo.tracing.deciding.robust import clustered_variance
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.masked import weights
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base, replicate
 from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import squared_distance
 from bayesoleo.tracing.scoring.score import Score
-from bayesoleo.tracing.scoring.significance import SAME
-
-#: A new amplitude's prior is normal about its null, this many times as wide as the score expects it
-#: to be: weak, but proper.
-PRIOR_WIDTH = 10.0
-#: Spread of the log-normal prior of a shape parameter about the scanned value that scored best.
-SHAPE_SPREAD = 1.0
-#: Two effects explain the data equally well if the data are less than twenty times as likely by the
-#: one as by the other; where one leaves more than noise, also if what they leave differs by less
-#: than this factor and they do nearly the same.
-AS_LIKELY, AS_WELL = 2.0 * float(np.log(20.0)), 1.25
-#: By so many times that an effect that was not taken may be better, and is not told apart yet: runs
-#: that were not used did not confirm it, which is less than to exclude it.
-BETTER = 2.0
 
 
 @dataclass(frozen=True)
@@ -68,6 +55,7 @@ class Refit:
     price : float
         By which an unknown has to lower the sum to be worth it: the logarithm of the number of
         samples (Schwarz 1978).
+    policy : SearchPolicy
     """
 
     score: Score
@@ -81,6 +69,7 @@ class Refit:
     fall: float
     reached: bool
     price: float
+    policy: SearchPolicy = SearchPolicy()
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot tell two estimated effects apart.
@@ -93,15 +82,17 @@ class Refit:
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
             return False
         gap = self.worth - other.worth
-        scale = AS_LIKELY * max(self.inflation, other.inflation)
-        if -BETTER * scale < gap < scale:
+        policy = self.policy
+        scale = policy.equal_likelihood * max(self.inflation, other.inflation)
+        if -policy.not_taken_odds * scale < gap < scale:
             return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
         if (self.reached and other.reached) or lengths == 0:
             return False
         cosine = float(self.contribution @ other.contribution) / float(lengths)
         low, high = sorted((self.remaining, other.remaining))
-        return cosine > 0 and cosine**2 > SAME and high < AS_WELL * low
+        alike = cosine > 0 and cosine**2 > policy.same_cosine
+        return alike and high < policy.equal_remainder * low
 
     @property
     def unusual(self) -> bool:
@@ -115,7 +106,8 @@ class Refit:
     def outdoes(self, other: Score) -> bool:
         """Whether noise alone is left, and an effect that was only scored explains less of it."""
         mine, its = (one.fall - self.price * one.size for one in (self.score, other))
-        return self.reached and mine - its > AS_LIKELY * max(self.inflation, other.inflation)
+        scale = self.policy.equal_likelihood * max(self.inflation, other.inflation)
+        return self.reached and mine - its > scale
 
     @property
     def size(self) -> int:
@@ -127,16 +119,18 @@ class Refit:
         """Fall of the sum beyond the price of the unknowns."""
         return self.fall - self.price * self.size
 
-    def excludes_null(self, level: float = 0.975) -> bool:
+    def excludes_null(self) -> bool:
         """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
 
-        One amplitude: the probability of its own side of zero is at least ``level``; several: zero
-        lies outside their joint region. Where the likelihood falls by twice the price of all
-        unknowns without the effect, the null is excluded whatever the curvature at the estimate
-        says: far from the null, where amplitude and shape make up for each other, a distance in
-        standard deviations shrinks again (Hauck and Donner 1977, JASA 72, 851-853).
+        One amplitude: the probability of its own side of zero is at least the policy's
+        ``excluded_null``; several: zero lies outside their joint region. Where the likelihood
+        falls by twice the price of all unknowns without the effect, the null is excluded whatever
+        the curvature at the estimate says: far from the null, where amplitude and shape make up for
+        each other, a distance in standard deviations shrinks again (Hauck and Donner 1977, JASA 72,
+        851-853).
         """
-        if self.fall / self.inflation > 2.0 * self.price * self.size:
+        level, price = self.policy.excluded_null, self.policy.excluded_price * self.price
+        if self.fall / self.inflation > price * self.size:
             return True
         names = [name for name in self.fit.problem.names if name in self.score.names]
         index = [self.fit.problem.names.index(name) for name in names]
@@ -168,7 +162,7 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         The mesh is the present fit's.
     """
     assembly = score.option.assembly.with_values(base.fit.shared)
-    assembly = assembly.with_parameters(new_parameters(assembly, score))
+    assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     expected = dict(zip(score.names, map(float, score.expected), strict=True))
     fit = quick_fit(base, model, base.fit.values | expected, numerics)
@@ -186,8 +180,9 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     reached = base.excess - fall < base.feigned
     price = schwarz_price(base)
     return Refit(
-        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price
-    )
+        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price,
+        base.policy,
+    )  # fmt: skip
 
 
 def schwarz_price(base: Base) -> float:
@@ -228,7 +223,7 @@ def inflation_along(
     free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
     own = [k for k, name in enumerate(fit.problem.names) if name in names]
     parts = [
-        _stretches(run, predicted, replicate(record), fit, free, own)
+        _stretches(run, predicted, replicate(record, fit.policy), fit, free, own)
         for run, predicted, record in zip(
             fit.predictor.runs, fit.predictions, fit.records, strict=True
         )
@@ -270,7 +265,7 @@ def _stretches(
     return pulls, sizes, np.moveaxis(mixed, 1, 2)
 
 
-def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
+def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> dict[str, Parameter]:
     """Parameters of the effect with starts and priors from its score."""
     present = assembly.model().parameters
     changed: dict[str, Parameter] = {}
@@ -283,16 +278,18 @@ def new_parameters(assembly: Assembly, score: Score) -> dict[str, Parameter]:
         if score.option.candidate.family == FAMILY:
             own = [abs(v) for v in score.expected]  # a curve's coefficients are of one size
         size = max(max(own), 1e-30)
+        width = policy.prior_width * size
         sign = score.option.candidate.sign.get(name, 0)
         value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0
-        prior: Normal | TruncatedNormal = Normal(0.0, PRIOR_WIDTH * size)
+        prior: Normal | TruncatedNormal = Normal(0.0, width)
         if sign:
             low, high = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
-            prior = TruncatedNormal(0.0, PRIOR_WIDTH * size, low, high)
+            prior = TruncatedNormal(0.0, width, low, high)
             value = value if value * sign > 0 else sign * 1e-3 * size
         changed[name] = replace(present[name], value=value, prior=prior)
     for name, value in score.shapes.items():
-        changed[name] = replace(present[name], value=value, prior=LogNormal(value, SHAPE_SPREAD))
+        prior_of_shape = LogNormal(value, policy.shape_spread)
+        changed[name] = replace(present[name], value=value, prior=prior_of_shape)
     return changed
 
 

@@ -9,39 +9,34 @@ difference is. An effect that does better beside the others than the one that wa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects import Effect
 from bayesoleo.effects.unnamed import FAMILY
 from bayesoleo.parallel import thread_map
-from bayesoleo.tracing.deciding.confirmation import FAIR_SHARE, confirmed, speak_against
+from bayesoleo.tracing.deciding.confirmation import confirmed, speak_against
 from bayesoleo.tracing.deciding.elimination import Loss, dispersion, eliminated, loss_without
 from bayesoleo.tracing.deciding.progress import Progress
-from bayesoleo.tracing.deciding.refit import AS_LIKELY, Refit, refit
-from bayesoleo.tracing.deciding.rounds import IMITATORS, NEAR, Ranked, Round, name_among, rank
+from bayesoleo.tracing.deciding.ranking import (
+    ABSORBING_FAMILIES,
+    Ranked,
+    name_among,
+    rank,
+    score_candidates,
+)
+from bayesoleo.tracing.deciding.refit import Refit, refit
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting.assembly import Step
+from bayesoleo.tracing.fitting.assembly import AddedEffect
 from bayesoleo.tracing.fitting.fit import Numerics
 from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base
-from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import Score, score_all
-from bayesoleo.tracing.scoring.significance import without_twins
-
-#: Rivals of a final effect that are estimated beside the others, and those of which it is asked
-#: whether they do without another effect.
-MOST_RIVALS, MOST_SMALLER = 5, 3
-#: Rivals that do better of which runs that were not used are asked.
-MOST_TRIED = 3
-
-#: Places in the scan of a shape from which an estimate is started again if it explains nearly as
-#: much as the best, to this part, but less by more than so many squared standard deviations.
-STARTS, LITTLE, CLOSE = (0.25, 0.5, 0.75), 0.8, 4.0
-
-Say = Callable[[str], None]
+from bayesoleo.tracing.scoring.score import Score
 
 
 @dataclass(frozen=True)
@@ -75,18 +70,19 @@ class Place:
         """
         own = self.own.refit
         assert own is not None
+        policy = own.policy
         found = []
         for rival in self.rivals:
             result = rival.refit
             assert result is not None
             gap, scale = result.worth - own.worth, max(result.inflation, own.inflation)
-            needed = AS_LIKELY * scale * _dispersion(result, self.without)
-            if rival.imitates < self.own.imitates:
+            needed = policy.equal_likelihood * scale * _dispersion(result, self.without)
+            if rival.absorbs < self.own.absorbs:
                 needed = -needed
-            clearly = result.reached or gap > FAIR_SHARE * own.remaining
-            if rival.imitates <= self.own.imitates and gap > needed and clearly:
+            clearly = result.reached or gap > policy.fair_share * own.remaining
+            if rival.absorbs <= self.own.absorbs and gap > needed and clearly:
                 found.append(rival)
-        return tuple(found[:MOST_TRIED])
+        return tuple(found[: policy.review_confirmed])
 
 
 def _dispersion(result: Refit, without: State) -> float:
@@ -100,7 +96,7 @@ def reviewed(
     roles: Roles,
     numerics: Numerics,
     effects: Sequence[Effect] | None,
-    say: Say,
+    callback: ProgressCallback,
     *,
     replacing: bool = True,
 ) -> Progress:
@@ -114,7 +110,7 @@ def reviewed(
     numerics : Numerics
     effects : sequence of Effect or None
         Instead of the catalogue.
-    say : callable
+    callback : callable
         Told what is being done.
     replacing : bool
         Whether an effect may be replaced by one that does better.
@@ -133,19 +129,21 @@ def reviewed(
         accepted = progress.rounds[number].accepted
         if curve and (accepted is None or not accepted.same):
             continue  # beside a curve nothing is replaced, and only known rivals are asked again
-        say(f"look again at what was like {step.effect.id}")
+        callback(f"look again at what was like {step.effect.id}")
         place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
         if place is None:
             continue
         for better in place.better if replacing and not curve else ():
-            found = _replaced(progress, step, place, better, roles, numerics, say)
+            found = _replaced(progress, step, place, better, roles, numerics, callback)
             if found is not None:
                 return found
         progress = _with_class(progress, place)
-    return progress if curve or not replacing else _smaller(progress, roles, numerics, say)
+    return progress if curve or not replacing else _smaller(progress, roles, numerics, callback)
 
 
-def _smaller(progress: Progress, roles: Roles, numerics: Numerics, say: Say) -> Progress:
+def _smaller(
+    progress: Progress, roles: Roles, numerics: Numerics, callback: ProgressCallback
+) -> Progress:
     """The search with one effect less, if another in one place makes a second superfluous.
 
     An effect that is only near needs a companion for what it lacks; beside each other both seem to
@@ -159,20 +157,20 @@ def _smaller(progress: Progress, roles: Roles, numerics: Numerics, say: Say) -> 
         for result, gap in _close_rivals(progress, step):
             state = fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
             base = state.base()
-            say(f"look whether {result.score.option.key[0]} does without one of the others")
+            callback(f"look whether {result.score.option.key[0]} does without one of the others")
             losses = [
                 loss_without(state, base, other, numerics) for other in state.assembly.steps[:-1]
             ]
             least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
             if not least.worth + gap / least.scale < 0.0:
                 continue
-            found = _without_companion(progress, step, result, least, roles, numerics, say)
+            found = _without_companion(progress, step, result, least, roles, numerics, callback)
             if found is not None:
                 return found
     return progress
 
 
-def _close_rivals(progress: Progress, step: Step) -> list[tuple[Refit, float]]:
+def _close_rivals(progress: Progress, step: AddedEffect) -> list[tuple[Refit, float]]:
     """Estimates of what could stand in an effect's place, and by how much less they are worth: less
     than the unknowns of another effect would be."""
     entry = _entry_of(progress, step)
@@ -184,15 +182,15 @@ def _close_rivals(progress: Progress, step: Step) -> list[tuple[Refit, float]]:
         for item in entry.ranking
         if item.refit is not None
         and item.refit is not own
-        and not item.imitates
+        and not item.absorbs
         and np.isfinite(item.refit.share)
         and item.score.option.candidate.family != FAMILY
     ]
     near = [one for one in rivals if one[1] < 2.0 * own.price * own.inflation]
-    return sorted(near, key=lambda one: one[1])[:MOST_SMALLER]
+    return sorted(near, key=lambda one: one[1])[: own.policy.review_simpler]
 
 
-def _entry_of(progress: Progress, step: Step) -> Round | None:
+def _entry_of(progress: Progress, step: AddedEffect) -> Round | None:
     """The round that added a final effect."""
     key = step.effect.id, step.target
     for item in reversed(progress.rounds):
@@ -203,12 +201,12 @@ def _entry_of(progress: Progress, step: Step) -> Round | None:
 
 def _without_companion(
     progress: Progress,
-    step: Step,
+    step: AddedEffect,
     result: Refit,
     least: Loss,
     roles: Roles,
     numerics: Numerics,
-    say: Say,
+    callback: ProgressCallback,
 ) -> Progress | None:
     """The search with a rival in a place and without another effect, if runs that were not used
     have nothing against it."""
@@ -223,12 +221,12 @@ def _without_companion(
         f"{name} stands instead of {step.effect.id}, and then {least.step.effect.id} is not needed"
     )
     last = replace(entry, accepted=item, after=after, reason=f"{told}: {least}")
-    say(told)
+    callback(told)
     notes = (*progress.notes, f"{told}: {least}")
     return Progress(progress.first, after, (*progress.rounds[:-1], last), notes)
 
 
-def _added_by(progress: Progress, step: Step) -> int | None:
+def _added_by(progress: Progress, step: AddedEffect) -> int | None:
     """Number of the round that added a final effect, if it was beside others than there are now."""
     key = step.effect.id, step.target
     for number, item in reversed(list(enumerate(progress.rounds))):
@@ -241,7 +239,7 @@ def _added_by(progress: Progress, step: Step) -> int | None:
 
 def place_of(
     progress: Progress,
-    step: Step,
+    step: AddedEffect,
     number: int,
     roles: Roles,
     numerics: Numerics,
@@ -261,25 +259,26 @@ def place_of(
     fitted = replace(roles, held_out=(), strategy="none")
     without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
     base = without.base()
-    scales = scales_of(without.fit, less.drive, tuple(less.native.dofs))
-    scores = score_all(base, less.options(scales, effects), numerics.jobs)[0]
+    key = step.effect.id, step.target
     # The effect itself speaks for those that are it in other words.
-    order = sorted(scores, key=lambda score: score.option.key != (step.effect.id, step.target))
-    scores, _ = without_twins(order)
-    if not scores or scores[0].option.key != (step.effect.id, step.target):
+    scores, _ = score_candidates(
+        base, less, effects, numerics.jobs, order=lambda option, _: option.key != key
+    )
+    if not scores or scores[0].option.key != key:
         return None
-    own, rivals = scores[0], _worth_estimating(scores[0], scores[1:], accepted.same, only_known)
-    chosen = [own, *rivals]
+    own, others = scores[0], scores[1:]
+    known = accepted.same
+    chosen = [own, *_worth_estimating(own, others, known, only_known, numerics.policy)]
     results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
     refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
     refits |= _from_other_shapes(base, refits, chosen, numerics)
-    ranking = rank(scores, progress.rounds[number].tests, refits)
+    ranking = rank(scores, progress.rounds[number].tests, refits, policy=numerics.policy)
     mine = next(item for item in ranking if item.score is own)
     if mine.refit is None:
         return None
-    others = [item for item in ranking if item.refit is not None and item is not mine]
-    others.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
-    return Place(number, without, mine, tuple(others))
+    rest = [item for item in ranking if item.refit is not None and item is not mine]
+    rest.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
+    return Place(number, without, mine, tuple(rest))
 
 
 def _from_other_shapes(
@@ -291,14 +290,14 @@ def _from_other_shapes(
     best at the null may lie beside the wrong one: then an effect would be told from one that is the
     same but for its shape.
     """
-    best = max(result.fall for result in refits.values())
+    best, policy = max(result.fall for result in refits.values()), base.policy
     better: dict[int, Refit] = {}
     for score in chosen:
         found, grids = refits[id(score)], score.option.candidate.shapes
-        if not score.shapes or not found.fall > LITTLE * best:
+        if not score.shapes or not found.fall > policy.restart_share * best:
             continue
-        for part in STARTS:
-            if best - found.fall < CLOSE * found.inflation:
+        for part in policy.shape_starts:
+            if best - found.fall < policy.restart_gap * found.inflation:
                 break
             shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
             again = refit(base, replace(score, shapes=shapes), numerics)
@@ -308,29 +307,34 @@ def _from_other_shapes(
 
 
 def _worth_estimating(
-    own: Score, others: Sequence[Score], same: Sequence[str], only_known: bool
+    own: Score,
+    others: Sequence[Score],
+    same: Sequence[str],
+    only_known: bool,
+    policy: SearchPolicy,
 ) -> list[Score]:
     """Those that score near an effect, the best first, and those that were in its class before."""
-    imitates = own.option.candidate.family in IMITATORS
+    absorbs = own.option.candidate.family in ABSORBING_FAMILIES
     near = [
         score
         for score in sorted(others, key=lambda score: -score.fall)
-        if score.fall > NEAR * own.fall
-        and (imitates or score.option.candidate.family not in IMITATORS)
+        if score.fall > policy.near_best * own.fall
+        and (absorbs or score.option.candidate.family not in ABSORBING_FAMILIES)
     ]
-    chosen = [] if only_known else near[:MOST_RIVALS]
+    most = policy.review_rivals
+    chosen = [] if only_known else near[:most]
     before = [one for one in others if name_among(own, one) in same and one not in chosen]
-    return [*chosen, *before[:MOST_RIVALS]]
+    return [*chosen, *before[:most]]
 
 
 def _replaced(
     progress: Progress,
-    step: Step,
+    step: AddedEffect,
     place: Place,
     better: Ranked,
     roles: Roles,
     numerics: Numerics,
-    say: Say,
+    callback: ProgressCallback,
 ) -> Progress | None:
     """The search with another effect in a place, if runs that were not used have nothing against
     it."""
@@ -338,7 +342,7 @@ def _replaced(
     before = fit_state(final.assembly.without(step), roles, numerics)
     assert better.refit is not None
     assert place.own.refit is not None
-    after, reason = confirmed(before, better, better.refit, roles, numerics, say)
+    after, reason = confirmed(before, better, better.refit, roles, numerics, callback)
     if after is None or (final.at_floor and not after.at_floor):
         return None
     if speak_against(final, after, better.refit.inflation):
@@ -352,7 +356,7 @@ def _replaced(
     tests = progress.rounds[place.number].tests
     ranking = (better, place.own, *(item for item in place.rivals if item is not better))
     notes = [*progress.notes, f"{better.effect} replaced {step.effect.id}: {reason}"]
-    state = eliminated(after, roles, numerics, notes, say)
+    state = eliminated(after, roles, numerics, notes, callback)
     last = Round(before, ranking, {}, better, after, reason, tests)
     rounds = (*progress.rounds[:-1], last)
     return Progress(progress.first, state, rounds, tuple(notes))

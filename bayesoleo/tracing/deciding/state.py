@@ -20,6 +20,7 @@ from bayesoleo.tracing.errors.same_noise import Noise, with_same_noise
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base, base_of
 
 
@@ -45,6 +46,11 @@ class State:
     held_out: list[Prediction]
     fit_errors: ErrorTable
     hold_errors: ErrorTable
+
+    @property
+    def policy(self) -> SearchPolicy:
+        """By which it is judged."""
+        return self.fit.policy
 
     @property
     def errors(self) -> ErrorTable:
@@ -80,12 +86,17 @@ class State:
     @property
     def at_floor(self) -> bool:
         """Whether fitted and held-out runs are all down to what is expected of them."""
-        return all(is_at_floor(table) for table in (self.fit_errors, self.hold_errors))
+        return all(
+            is_at_floor(table, policy=self.policy) for table in (self.fit_errors, self.hold_errors)
+        )
 
     @property
     def too_quiet(self) -> tuple[str, ...]:
         """Where less is left than chance allows: a noise that was measured too large."""
-        return (*too_quiet(self.fit_errors), *too_quiet(self.hold_errors))
+        return (
+            *too_quiet(self.fit_errors, policy=self.policy),
+            *too_quiet(self.hold_errors, policy=self.policy),
+        )
 
     def with_noise(self, noise: Noise) -> State:
         """The same errors held against a noise that was found with another model."""
@@ -115,14 +126,14 @@ def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
         if roles.strategy == "leave-one-run-out"
         else predict_held_out(fit, roles.held_out)
     )
-    jobs = fit.numerics.jobs
-    found = _compared(fitted, "fit", roles, jobs)
+    jobs, policy = fit.numerics.jobs, fit.policy
+    found = _compared(fitted, "fit", roles, fit.numerics)
     fit_errors, known = expected_of_fitted(fit, fitted, found)
     if roles.strategy != "leave-one-run-out":
         known = {"": known[""]} if known else {}
     rows = thread_map(
-        lambda pair: expected_of_held_out(*pair, known),
-        list(zip(held_out, _compared(held_out, "hold-out", roles, jobs), strict=True)),
+        lambda pair: expected_of_held_out(*pair, known, policy=policy),
+        list(zip(held_out, _compared(held_out, "hold-out", roles, fit.numerics), strict=True)),
         jobs,
     )
     return State(
@@ -136,11 +147,15 @@ def state_of(assembly: Assembly, fit: Fit, roles: Roles) -> State:
 
 
 def _compared(
-    predictions: Sequence[Prediction], role: str, roles: Roles, jobs: int | None
+    predictions: Sequence[Prediction], role: str, roles: Roles, numerics: Numerics
 ) -> list[Compared]:
     """Errors by run, with the noise as it was measured first."""
     by_label = {p.record.label: role for p in predictions}
-    return thread_map(lambda p: compared(p, by_label, roles.noise_of), predictions, jobs)
+    return thread_map(
+        lambda p: compared(p, by_label, roles.noise_of, policy=numerics.policy),
+        predictions,
+        numerics.jobs,
+    )
 
 
 def _left_out(fit: Fit, roles: Roles) -> list[Prediction]:

@@ -19,36 +19,22 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.effects.unnamed import FAMILY, Axis
 from bayesoleo.tracing.deciding.confirmation import confirmed, speak_against
+from bayesoleo.tracing.deciding.ranking import ABSORBING_FAMILIES, Ranked
 from bayesoleo.tracing.deciding.refit import Refit, fall_from, refit
-from bayesoleo.tracing.deciding.rounds import IMITATORS, LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State
-from bayesoleo.tracing.fitting.assembly import Step
+from bayesoleo.tracing.fitting.assembly import AddedEffect
 from bayesoleo.tracing.fitting.fit import Fit, Numerics
 from bayesoleo.tracing.fitting.roles import Roles
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.significance import SAME
 from bayesoleo.tracing.unnamed.quantities import ranges
-from bayesoleo.tracing.unnamed.search import FINER, Search, Tried, closest, search
+from bayesoleo.tracing.unnamed.search import CurveSearch, Tried, closest, search
 
-#: Unnamed effects added at most.
-MOST_UNNAMED = 1
-#: Where no further effect may be added, a function may stand instead of so many or more.
-FEWEST_REPLACED = 2
-#: Named effects stay beside a function only if that is better by this much, which is called very
-#: strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90(430)).
-DECISIVE = 10.0
-#: Part of the excess that a name explained by itself, from which on it is not taken for the nearest
-#: to something else: a function of the same quantities repeats what it says, and adds freedom.
-OWN_RIGHT = 0.9
-#: Finer pieces are tried as long as they make up this part of what a function is worse by.
-CLOSER = 0.25
-#: Functions estimated before one is chosen.
-MOST_TRIED = 3
-
-Say = Callable[[str], None]
 Merit = Callable[..., float]
 
 
@@ -57,17 +43,23 @@ class _Answer:
     """A function added to one of two models, after estimation."""
 
     state: State
-    search: Search
+    search: CurveSearch
     refit: Refit
     ranking: tuple[Ranked, ...]
     instead: bool
     merit: float
 
 
-def with_unnamed(
-    outcome: Round, first: Round, roles: Roles, numerics: Numerics, *, room: bool = True, say: Say
+def with_nonparametric(
+    outcome: Round,
+    first: Round,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    room: bool = True,
+    callback: ProgressCallback,
 ) -> Round:
-    """A round that accepted nothing, with an unnamed effect where one explains what is left.
+    """A round that accepted nothing, with a nonparametric effect where one explains what is left.
 
     Parameters
     ----------
@@ -81,7 +73,7 @@ def with_unnamed(
         Scheme, threads.
     room : bool
         Whether one more effect may be added; else one may only stand instead of others.
-    say : callable
+    callback : callable
         Told what is being done.
 
     Returns
@@ -90,25 +82,26 @@ def with_unnamed(
         Where a function is confirmed it is the accepted effect, first in the ranking. Where it
         stands instead of effects added before, the new state has none of them.
     """
-    state = outcome.before
+    state, policy = outcome.before, numerics.policy
     steps = state.assembly.steps
     named = len(steps) > len(first.before.assembly.steps)
-    unnamed = sum(step.effect.family == FAMILY for step in steps)
-    if unnamed >= MOST_UNNAMED or (not named and (state.at_floor or not room)):
+    nonparametric = sum(step.effect.family == FAMILY for step in steps)
+    if nonparametric >= policy.curves or (not named and (state.at_floor or not room)):
         return outcome
-    if not room and len(steps) < FEWEST_REPLACED:
+    if not room and len(steps) < policy.fewest_replaced:
         return outcome  # named ones had no chance to come together
     # At the floor nothing is left that a function could explain but noise.
     beside = room and not state.at_floor
-    instead = named and (not _stands_by_itself(first) or _several_in_one_balance(steps))
+    alone = _stands_by_itself(first, policy)
+    instead = named and (not alone or _several_in_one_balance(steps, policy))
     if not (beside or instead):
         return outcome
-    say("look for an effect without a name")
+    callback("look for an effect without a name")
     chances = []
     if not state.at_floor:
         found = _Chance.at(state, outcome, numerics)
-        outcome = replace(outcome, unnamed=found.search)
-        if found.search.p_value >= LEVEL:
+        outcome = replace(outcome, nonparametric=found.search)
+        if found.search.p_value >= policy.significance:
             return outcome
         if beside:
             chances.append(found)
@@ -116,23 +109,28 @@ def with_unnamed(
         # The present model moves as was measured; one with less in it may not get as far.
         also = ranges(state.fit, state.assembly, first.before.assembly.native)
         chances.append(_Chance.at(first.before, first, numerics, also))
-    return _decided(outcome, chances, roles, numerics, say)
+    return _decided(outcome, chances, roles, numerics, callback)
 
 
 def _decided(
-    outcome: Round, chances: Sequence[_Chance], roles: Roles, numerics: Numerics, say: Say
+    outcome: Round,
+    chances: Sequence[_Chance],
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
 ) -> Round:
     """The round with the best function in that the runs not used confirm, or why there is none."""
     reasons, common = [outcome.reason], chances[-1].base
     # One name that leaves noise alone is no sum of names that a single law may be behind: then the
     # more likely of the two stands.
     alone = outcome.before.at_floor and len(outcome.before.assembly.steps) == 1
-    favour = 0.0 if alone else DECISIVE
+    policy = numerics.policy
+    favour = 0.0 if alone else policy.decisive
     merit = partial(_merit, present=outcome.before.fit, reference=common, favour=favour)
-    for k in range(MOST_TRIED):
+    for k in range(policy.curves_tried):
         answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
         for answer in _better(answers, merit):
-            accepted, reason = _accepting(outcome, answer, roles, numerics, say)
+            accepted, reason = _accepting(outcome, answer, roles, numerics, callback)
             if accepted.accepted is not None:
                 return accepted
             reasons.append(reason)
@@ -152,20 +150,20 @@ def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
     return [answers[k] for k in order if merits[k] > 0]
 
 
-def _stands_by_itself(first: Round) -> bool:
+def _stands_by_itself(first: Round, policy: SearchPolicy) -> bool:
     """Whether the first effect explained nearly all of the excess alone; one that takes up a part
     of whatever is missing does so only where it left nothing but noise."""
     found = first.accepted
-    if found is None or found.gain < OWN_RIGHT:
+    if found is None or found.gain < policy.own_right:
         return False
-    return not found.imitates or (found.refit is not None and found.refit.reached)
+    return not found.absorbs or (found.refit is not None and found.refit.reached)
 
 
-def _several_in_one_balance(steps: Sequence[Step]) -> bool:
+def _several_in_one_balance(steps: Sequence[AddedEffect], policy: SearchPolicy) -> bool:
     """Whether names came together in a balance, where one function of its quantities may be what
     all of them are a part of."""
-    places = [step.target for step in steps if step.effect.family not in IMITATORS]
-    return any(places.count(place) >= FEWEST_REPLACED for place in places)
+    places = [step.target for step in steps if step.effect.family not in ABSORBING_FAMILIES]
+    return any(places.count(place) >= policy.fewest_replaced for place in places)
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ class _Chance:
 
     state: State
     base: Base
-    search: Search
+    search: CurveSearch
     outcome: Round
     instead: bool
 
@@ -200,7 +198,7 @@ class _Chance:
         significantly more.
         """
         price = float(np.log(max(self.base.noise, 2.0)))
-        leading = self.search.leading(MOST_TRIED)
+        leading = self.search.leading(numerics.policy.curves_tried)
         chosen = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
         found: list[_Answer] = []
         for item in chosen:
@@ -225,16 +223,17 @@ def _is_better(fine: _Answer, coarse: _Answer) -> bool:
     least = min(fine.refit.inflation, coarse.refit.inflation)
     gained = (fine.refit.fall - coarse.refit.fall) / least
     more = fine.refit.size - coarse.refit.size
-    return _goes_on(coarse.merit, fine.merit, float(stats.chi2.sf(gained, more)))
+    p_value = float(stats.chi2.sf(gained, more))
+    return _goes_on(coarse.merit, fine.merit, p_value, fine.refit.policy)
 
 
-def _goes_on(coarse: float, fine: float, p_value: float) -> bool:
+def _goes_on(coarse: float, fine: float, p_value: float, policy: SearchPolicy) -> bool:
     """Whether to go on to finer pieces, by merits and the probability of the fall by noise."""
     if not np.isfinite(coarse):
         return True
     if fine <= 0.0:
-        return fine - coarse > CLOSER * max(-coarse, 0.0)
-    return p_value < FINER
+        return fine - coarse > policy.finer_gain * max(-coarse, 0.0)
+    return p_value < policy.finer
 
 
 def _merit(
@@ -244,7 +243,7 @@ def _merit(
     inflation: float,
     present: Fit,
     reference: Base,
-    favour: float = DECISIVE,
+    favour: float,
 ) -> float:
     """What a function is worth beyond what was found so far; one that stands instead of names needs
     none of them, and is favoured by so much."""
@@ -257,7 +256,7 @@ def _merit(
 
 
 def _accepting(
-    outcome: Round, answer: _Answer, roles: Roles, numerics: Numerics, say: Say
+    outcome: Round, answer: _Answer, roles: Roles, numerics: Numerics, callback: ProgressCallback
 ) -> tuple[Round, str]:
     """The round with the answer accepted, if it is confirmed, and why."""
     result = answer.refit
@@ -267,10 +266,10 @@ def _accepting(
     same = tuple(
         name.split(" @ ")[0]
         for name, cosine in near
-        if cosine > 0 and cosine**2 > SAME and name not in told_apart
+        if cosine > 0 and cosine**2 > numerics.policy.same_cosine and name not in told_apart
     )
     item = Ranked(result.score, answer.search.p_value, gain, True, same, result, near)
-    after, reason = confirmed(answer.state, item, result, roles, numerics, say)
+    after, reason = confirmed(answer.state, item, result, roles, numerics, callback)
     if after is None:
         return outcome, reason
     if outcome.before.at_floor and not after.at_floor:
@@ -292,7 +291,7 @@ def _told(own: Refit, other: Ranked) -> bool:
     return own.outdoes(other.score)
 
 
-def unnamed_notes(rounds: Sequence[Round]) -> list[str]:
+def nonparametric_notes(rounds: Sequence[Round]) -> list[str]:
     """What is to be said of effects that were added without a name."""
     found = []
     for entry in rounds:

@@ -12,19 +12,19 @@ from collections.abc import Sequence
 
 from bayesoleo import schema
 from bayesoleo.effects.unnamed import FAMILY
-from bayesoleo.tracing.deciding.rounds import IMITATORS, Round
+from bayesoleo.tracing.deciding.ranking import ABSORBING_FAMILIES
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.fitting.assembly import Added
+from bayesoleo.tracing.policy import SearchPolicy
 
-#: Part of the excess that effects of physics must explain for the loop to call the model's lack
-#: found where more than is expected is left: what is left is then less than a third of what there
-#: was, in size.
-MOSTLY = 0.9
 #: Families of effects that name no cause.
-NO_CAUSE = IMITATORS | {FAMILY}
+NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
 
 
-def verdict_of(rounds: Sequence[Round], first: State, final: State) -> str:
+def verdict_of(
+    rounds: Sequence[Round], first: State, final: State, *, policy: SearchPolicy = SearchPolicy()
+) -> str:
     """One of the three verdicts of the summary.
 
     Parameters
@@ -33,12 +33,15 @@ def verdict_of(rounds: Sequence[Round], first: State, final: State) -> str:
         In order.
     first, final : State
         The model as declared, and with all effects.
+    policy : SearchPolicy
+        Its ``explained`` is the part of the excess that effects of physics must explain where more
+        than is expected is left.
     """
     if _as_expected(final):
         return schema.EFFECT_ADDED if final.assembly.added else schema.NOTHING_MISSING
     if final.too_quiet:
         return schema.UNEXPLAINED  # by a noise that is too large all is explained
-    found = explained_by_physics(rounds, first, final) > MOSTLY
+    found = explained_by_physics(rounds, first, final) > policy.explained
     return schema.EFFECT_ADDED if found else schema.UNEXPLAINED
 
 

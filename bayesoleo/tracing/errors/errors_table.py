@@ -20,6 +20,7 @@ from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.errors.record_noise import borne_out, sample_noise
 from bayesoleo.tracing.fitting.masked import counted, of_those_counted, weights, without_masked
 from bayesoleo.tracing.fitting.roles import RecordNoise
+from bayesoleo.tracing.policy import SearchPolicy
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,7 @@ def error_table(
     roles: Mapping[str, str],
     *,
     jobs: int | None = None,
+    policy: SearchPolicy = SearchPolicy(),
 ) -> ErrorTable:
     """Compare predictions with what was measured.
 
@@ -210,12 +212,13 @@ def error_table(
         Role of each run by label.
     jobs : int, optional
         Threads.
+    policy : SearchPolicy
 
     Returns
     -------
     ErrorTable
     """
-    rows = thread_map(lambda p: compared(p, roles)[0], predictions, jobs)
+    rows = thread_map(lambda p: compared(p, roles, policy=policy)[0], predictions, jobs)
     return ErrorTable(tuple(entry for row in rows for entry in row))
 
 
@@ -223,6 +226,8 @@ def compared(
     prediction: Prediction,
     roles: Mapping[str, str],
     measured: Callable[[str, str], RecordNoise | None] = lambda output, label: None,
+    *,
+    policy: SearchPolicy = SearchPolicy(),
 ) -> tuple[list[RunError], Array]:
     """Errors of one run by output, and the input's noise in them.
 
@@ -232,6 +237,7 @@ def compared(
     roles : mapping of str to str
     measured : callable
         The noise of an output in a run where it was measured before; it grows no more.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -247,13 +253,13 @@ def compared(
     for output, rest in zip(predictor.outputs, left, strict=True):
         residual = without_masked(record, rest)
         before.append(measured(output, record.label))
-        averages.append(_average(record, output, residual, before[-1]))
+        averages.append(_average(record, output, residual, before[-1], policy))
         spectra.append(_spectrum(record, residual, averages[-1]))
         # Of a transient all samples: averages over neighbours show no fast noise, input's or not.
         shown.append(averages[-1].values if record.periodic else residual)
     averaged = columns if record.periodic else local_means(columns)
     spread = np.sqrt(np.mean(np.sum(averaged**2, axis=1), axis=1))
-    scale = borne_out(columns, shown, drawn=not record.periodic)
+    scale = borne_out(columns, shown, drawn=not record.periodic, policy=policy)
     factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
     entries = [
         RunError(
@@ -291,9 +297,14 @@ def _spectrum(
 
 
 def _average(
-    record: Record, output: str, residual: Array, before: RecordNoise | None
+    record: Record,
+    output: str,
+    residual: Array,
+    before: RecordNoise | None,
+    policy: SearchPolicy,
 ) -> PeriodicAverage | LocalAverage:
     if not record.periodic:
-        return local_average(residual, sample_noise(record, output, residual, before))
+        noise = sample_noise(record, output, residual, before, policy=policy)
+        return local_average(residual, noise)
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     return of_those_counted(record, periodic_average(residual, step, record.frequency))

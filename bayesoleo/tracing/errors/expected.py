@@ -38,10 +38,7 @@ from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.errors.spread import curved
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
-
-#: A run is expected to leave this part of its noise at least: the share that estimates take up is
-#: known by linearisation only.
-LEAST_LEFT = 0.1
+from bayesoleo.tracing.policy import SearchPolicy
 
 #: Errors of one run by output, and the input's noise in them; see
 #: :func:`bayesoleo.tracing.errors.errors_table.compared`.
@@ -49,7 +46,7 @@ Compared = tuple[list[RunError], Array]
 
 
 @dataclass(frozen=True)
-class Known:
+class EstimateCovariance:
     """What estimates are known to.
 
     Parameters
@@ -70,7 +67,7 @@ class Known:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _LinearisedRun:
     """One run in terms of some unknowns, outputs apart.
 
     Parameters
@@ -97,7 +94,9 @@ class _Run:
     pulled: Array
 
     @classmethod
-    def of(cls, record: Record, found: Compared, sensitivity: Array, weight: Array) -> _Run:
+    def of(
+        cls, record: Record, found: Compared, sensitivity: Array, weight: Array
+    ) -> _LinearisedRun:
         entries, columns = found
         counts = weights(record)
         raw, columns = sensitivity * counts, columns * counts
@@ -138,7 +137,7 @@ def _through(entry: RunError, columns: Array) -> Array:
 
 def expected_of_fitted(
     fit: Fit, fitted: Sequence[Prediction], found: Sequence[Compared]
-) -> tuple[list[RunError], dict[str, Known]]:
+) -> tuple[list[RunError], dict[str, EstimateCovariance]]:
     """Errors of the fitted runs with what is expected of them, and what is known for other runs.
 
     Parameters
@@ -152,7 +151,7 @@ def expected_of_fitted(
     Returns
     -------
     list of RunError
-    dict of str to Known
+    dict of str to EstimateCovariance
         Under ``""`` what the fit knows; by label what it would know without that run. Empty where
         the fit has no covariance.
     """
@@ -161,33 +160,47 @@ def expected_of_fitted(
         return [entry for entries, _ in found for entry in entries], {}
     free = [fit.predictor.layout.names.index(name) for name in names]
     runs = [
-        _Run.of(p.record, one, predicted.sensitivity[:, free], 1.0 / fit.point.variance)
+        _LinearisedRun.of(p.record, one, predicted.sensitivity[:, free], 1.0 / fit.point.variance)
         for p, one, predicted in zip(fitted, found, fit.predictions, strict=True)
     ]
     surplus = sum((run.scatter - run.information for run in runs), np.zeros_like(response))
     covariance = response + response @ surplus @ response
     entries = [
-        _left(entry, run, b, response, covariance)
+        _left(entry, run, b, response, covariance, fit.policy)
         for (errors, _), run in zip(found, runs, strict=True)
         for b, entry in enumerate(errors)
     ]
-    known = {"": Known(names, covariance)}
+    known = {"": EstimateCovariance(names, covariance)}
     for p, run in zip(fitted, runs, strict=True):
         known[p.record.label] = _without(names, response, surplus, run, p.record.label)
     return entries, known
 
 
-def _left(entry: RunError, run: _Run, output: int, response: Array, covariance: Array) -> RunError:
+def _left(
+    entry: RunError,
+    run: _LinearisedRun,
+    output: int,
+    response: Array,
+    covariance: Array,
+    policy: SearchPolicy,
+) -> RunError:
     """What a run leaves that took part in estimating all of its unknowns."""
     size = run.averaged.shape[2]
     square = entry.noise**2 - 2.0 * run.lent(output, response) / size
     square += run.spread(output, covariance)
-    return _with(entry, run, output, square, np.zeros((0, 0)))
+    return _with(entry, run, output, square, np.zeros((0, 0)), policy)
 
 
-def _with(entry: RunError, run: _Run, output: int, square: float, parameters: Array) -> RunError:
+def _with(
+    entry: RunError,
+    run: _LinearisedRun,
+    output: int,
+    square: float,
+    parameters: Array,
+    policy: SearchPolicy,
+) -> RunError:
     """An entry with its expected error, and what of it is noise."""
-    least = (LEAST_LEFT * entry.noise) ** 2
+    least = (policy.least_expected * entry.noise) ** 2
     square = max(square, least)
     own = max(square - float(np.trace(parameters)), least)
     return replace(
@@ -212,8 +225,8 @@ def _coefficients(entry: RunError, inputs: Array) -> float:
 
 
 def _without(
-    names: tuple[str, ...], response: Array, surplus: Array, run: _Run, label: str
-) -> Known:
+    names: tuple[str, ...], response: Array, surplus: Array, run: _LinearisedRun, label: str
+) -> EstimateCovariance:
     """What a fit to all runs but one would know, by linearisation at the fit to all."""
     keep = [k for k, name in enumerate(names) if not name.endswith(f"[{label}]")]
     unit = np.sqrt(np.diag(response))
@@ -224,11 +237,15 @@ def _without(
     partial = (vectors / np.maximum(values, 1e-10 * np.max(values, initial=1e-300))) @ vectors.T
     partial = partial * units[np.ix_(keep, keep)]
     rest = (surplus - run.scatter + run.information)[np.ix_(keep, keep)]
-    return Known(tuple(names[k] for k in keep), partial + partial @ rest @ partial)
+    return EstimateCovariance(tuple(names[k] for k in keep), partial + partial @ rest @ partial)
 
 
 def expected_of_held_out(
-    prediction: Prediction, found: Compared, known: Mapping[str, Known]
+    prediction: Prediction,
+    found: Compared,
+    known: Mapping[str, EstimateCovariance],
+    *,
+    policy: SearchPolicy = SearchPolicy(),
 ) -> list[RunError]:
     """Errors of a run that was not fitted, with what is expected of them.
 
@@ -237,8 +254,9 @@ def expected_of_held_out(
     prediction : Prediction
     found : Compared
         Of the same.
-    known : mapping of str to Known
+    known : mapping of str to EstimateCovariance
         What is known without this run, else under ``""``.
+    policy : SearchPolicy
     """
     mine = known.get(prediction.record.label, known.get(""))
     entries, _ = found
@@ -252,24 +270,28 @@ def expected_of_held_out(
     re_estimated = prediction.re_estimated > 0
     own = np.array([re_estimated and name not in mine.names for name in names], dtype=np.bool_)
     sigma = np.array([max(entry.sigma, 1e-300) for entry in entries])
-    run = _Run.of(prediction.record, found, at_estimate, sigma**-2)
+    run = _LinearisedRun.of(prediction.record, found, at_estimate, sigma**-2)
     shared = mine.of(names)
     response, moved = _own_response(predictor, run, own)
     shared = moved @ shared @ moved.T
     estimated = shared + response + response @ (run.scatter - run.information) @ response
     root = _root(shared)
-    bent = curved(prediction, root, run.averaged) if not own.any() else np.ones(len(entries))
+    bent = np.ones(len(entries))
+    if not own.any():
+        bent = curved(prediction, root, run.averaged, policy)
     size, left = run.averaged.shape[2], []
     for b, entry in enumerate(entries):
         J = root.T @ run.averaged[b]
         parameters = J @ J.T / size * bent[b]
         square = entry.noise**2 - 2.0 * run.lent(b, response) / size
         square += run.spread(b, estimated - shared) + float(np.trace(parameters))
-        left.append(_with(entry, run, b, square, parameters))
+        left.append(_with(entry, run, b, square, parameters, policy))
     return left
 
 
-def _own_response(predictor: Predictor, run: _Run, own: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _own_response(
+    predictor: Predictor, run: _LinearisedRun, own: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """How the run's own unknowns answer its residual ``(l, l)``, and what an error of the shared
     ones becomes of all ``(l, l)``."""
     size = own.size

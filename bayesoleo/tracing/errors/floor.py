@@ -22,18 +22,13 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo.tracing.errors.errors_table import ErrorTable, RunError
-
-#: A ratio to what is expected below this is not worth an effect, however surely it is above one.
-FLOOR_RATIO = 1.15
-#: One below this is a fault, if chance does not explain it: the noise was measured too large by a
-#: third.
-LEAST_RATIO = 0.75
-#: Probability with which noise and the unknowns' errors alone may exceed the limit.
-FALSE_ALARM = 1e-3
+from bayesoleo.tracing.policy import SearchPolicy
 
 
-def limit(entries: Sequence[RunError], tests: int = 1) -> float:
-    """Ratio to what is expected that chance hardly exceeds, at least :data:`FLOOR_RATIO`.
+def limit(
+    entries: Sequence[RunError], tests: int = 1, *, policy: SearchPolicy = SearchPolicy()
+) -> float:
+    """Ratio to what is expected that chance hardly exceeds, at least the policy's ``floor_ratio``.
 
     Parameters
     ----------
@@ -41,11 +36,15 @@ def limit(entries: Sequence[RunError], tests: int = 1) -> float:
         Over which the squared ratio is averaged.
     tests : int
         Ratios that are looked at together.
+    policy : SearchPolicy
     """
-    return max(FLOOR_RATIO, math.sqrt(_quantile(entries, FALSE_ALARM / tests)))
+    level = policy.floor_false_alarm / tests
+    return max(policy.floor_ratio, math.sqrt(_quantile(entries, level)))
 
 
-def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
+def lowest(
+    entries: Sequence[RunError], tests: int = 1, *, policy: SearchPolicy = SearchPolicy()
+) -> float:
     """Ratio to what is expected that chance hardly falls below.
 
     The unknowns' errors may be nothing by chance, but noise is always there: the limit is that of
@@ -57,12 +56,14 @@ def lowest(entries: Sequence[RunError], tests: int = 1) -> float:
         Over which the squared ratio is averaged.
     tests : int
         Ratios that are looked at together.
+    policy : SearchPolicy
     """
     own = float(np.mean([entry.own_share for entry in entries]))
     none = np.zeros((0, 0))
     noise = [replace(e, parameters=none, own_share=e.own_share / own) for e in entries]
     share, number, free = _variate(noise)
-    square = 1.0 + share * (float(stats.f.ppf(FALSE_ALARM / tests, number, free)) - 1.0)
+    level = policy.floor_false_alarm / tests
+    square = 1.0 + share * (float(stats.f.ppf(level, number, free)) - 1.0)
     return math.sqrt(own * max(square, 0.0))
 
 
@@ -114,7 +115,7 @@ def _moments(entries: Sequence[RunError]) -> tuple[float, float]:
     return max(second / size**2, 1e-12), max(third / size**3, 1e-18)
 
 
-def is_at_floor(table: ErrorTable) -> bool:
+def is_at_floor(table: ErrorTable, *, policy: SearchPolicy = SearchPolicy()) -> bool:
     """Whether every output, pooled over each role and in each run, is down to what is expected.
 
     A run that could not be solved is not.
@@ -124,12 +125,13 @@ def is_at_floor(table: ErrorTable) -> bool:
         for output in table.outputs:
             chosen = [e for e in entries if e.role == role and e.output == output]
             pooled = float(np.sqrt(np.mean([entry.ratio_to_expected**2 for entry in chosen])))
-            if not pooled < limit(chosen):
+            if not pooled < limit(chosen, policy=policy):
                 return False
-    return all(entry.ratio_to_expected < limit([entry], len(entries)) for entry in entries)
+    together = len(entries)
+    return all(e.ratio_to_expected < limit([e], together, policy=policy) for e in entries)
 
 
-def too_quiet(table: ErrorTable) -> tuple[str, ...]:
+def too_quiet(table: ErrorTable, *, policy: SearchPolicy = SearchPolicy()) -> tuple[str, ...]:
     """Sentences on outputs that leave less than chance allows, pooled over the runs of a role.
 
     A residual below the noise says that the noise is not what was measured, not that all is well.
@@ -140,10 +142,11 @@ def too_quiet(table: ErrorTable) -> tuple[str, ...]:
             chosen = [e for e in table.entries if e.role == role and e.output == output]
             numbers = table.pooled(role, output)
             ratio = numbers["ratio_to_expected"]
-            if ratio < min(lowest(chosen), LEAST_RATIO):
+            least = lowest(chosen, policy=policy)
+            if ratio < min(least, policy.least_ratio):
                 found.append(
                     f"{output}: the error of the {role} runs is {numbers['repeating']:.3g},"
                     f" {ratio:.2f} times the expected {numbers['expected']:.3g}, and chance allows"
-                    f" {lowest(chosen):.2f} at least: the noise was measured too large"
+                    f" {least:.2f} at least: the noise was measured too large"
                 )
     return tuple(found)

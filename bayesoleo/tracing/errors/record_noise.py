@@ -22,19 +22,19 @@ from bayesoleo.data.smoothing import innovation_noise
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fitting.masked import without_masked
 from bayesoleo.tracing.fitting.roles import RecordNoise
+from bayesoleo.tracing.policy import SearchPolicy
 
-#: Bands that each hold the same part of the power which the input's noise is said to have.
-BANDS = 8
-#: Probability with which true noise is taken for smaller than it is in any of them.
-FALSE_ALARM = 1e-3
 #: Columns whose overlap says how many independent coefficients a band holds.
 MOST_COLUMNS = 128
-#: A later model shows less noise in a transient only if it is less by this factor: differences of
-#: neighbours know the noise to a few per cent.
-CLEARLY_LESS = 0.9
 
 
-def borne_out(columns: Array, residuals: Sequence[Array], *, drawn: bool = False) -> float:
+def borne_out(
+    columns: Array,
+    residuals: Sequence[Array],
+    *,
+    drawn: bool = False,
+    policy: SearchPolicy = SearchPolicy(),
+) -> float:
     """Largest factor, at most one, by which the input's noise may be what the residual holds.
 
     Parameters
@@ -46,6 +46,7 @@ def borne_out(columns: Array, residuals: Sequence[Array], *, drawn: bool = False
     drawn : bool
         Whether columns are draws of an error with as many coefficients as samples, as those of a
         transient's input are, instead of one coefficient each.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -59,18 +60,19 @@ def borne_out(columns: Array, residuals: Sequence[Array], *, drawn: bool = False
             continue
         lines = scipy.fft.rfft(block, axis=1)
         power, there = np.sum(np.abs(lines) ** 2, axis=0), np.abs(scipy.fft.rfft(residual)) ** 2
-        for band in _bands(power):
+        for band in _bands(power, policy.noise_bands):
             coefficients = _of_lines(power[band]) if drawn else _coefficients(lines[:, band])
-            low = float(stats.chi2.ppf(FALSE_ALARM / BANDS, coefficients)) / coefficients
+            level = policy.noise_false_alarm / policy.noise_bands
+            low = float(stats.chi2.ppf(level, coefficients)) / coefficients
             ratio = float(there[band].sum() / power[band].sum())
             least = min(least, ratio / max(low, 1e-300))
     return float(np.sqrt(least))
 
 
-def _bands(power: Array) -> list[slice]:
+def _bands(power: Array, count: int) -> list[slice]:
     """Stretches of lines with about the same part of the power each."""
     total = np.cumsum(power)
-    edges = np.searchsorted(total, np.arange(1, BANDS) / BANDS * total[-1]) + 1
+    edges = np.searchsorted(total, np.arange(1, count) / count * total[-1]) + 1
     ends = np.unique(np.concatenate([[0], edges, [power.size]]))
     found = [slice(int(a), int(b)) for a, b in pairwise(ends)]
     return [band for band in found if power[band].sum() > 0.01 * total[-1]]
@@ -90,7 +92,12 @@ def _coefficients(lines: NDArray[np.complex128]) -> float:
 
 
 def sample_noise(
-    record: Record, output: str, residual: Array, before: RecordNoise | None = None
+    record: Record,
+    output: str,
+    residual: Array,
+    before: RecordNoise | None = None,
+    *,
+    policy: SearchPolicy = SearchPolicy(),
 ) -> float:
     """Standard deviation of the noise of a transient's sample, SI.
 
@@ -105,9 +112,10 @@ def sample_noise(
         Of the present model.
     before : RecordNoise, optional
         Where it was measured before.
+    policy : SearchPolicy
     """
     shown = innovation_noise(residual)
     if before is not None:
         known = before.sigma
-        return shown if shown < CLEARLY_LESS * known else known
+        return shown if shown < policy.clearly_less_noise * known else known
     return min(shown, innovation_noise(without_masked(record, record.samples[output])))

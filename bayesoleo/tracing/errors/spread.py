@@ -11,18 +11,10 @@ from bayesoleo.data.local_average import local_means
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.errors.holdout import Prediction
 from bayesoleo.tracing.fitting.masked import weights
-
-#: Draws of the unknowns: a mean square of changes is known to a fifth where one direction rules.
-DRAWS = 64
-#: Looked at where the linearised changes are this part of the residual's own size or more, in mean
-#: squares: where they are less, their curvature does not matter.
-MATTERS = 1e-3
-#: Changes of the largest draw, in root mean squares of all, are cut off there: a resonance that
-#: grows without bound says that the posterior is no normal distribution, not that anything goes.
-FARTHEST = 5.0
+from bayesoleo.tracing.policy import SearchPolicy
 
 
-def curved(prediction: Prediction, root: Array, averaged: Array) -> Array:
+def curved(prediction: Prediction, root: Array, averaged: Array, policy: SearchPolicy) -> Array:
     """Mean square change over draws of the unknowns, over the linearised one, by output.
 
     Parameters
@@ -33,6 +25,7 @@ def curved(prediction: Prediction, root: Array, averaged: Array) -> Array:
         ``R`` with ``R R'`` the covariance of its unknowns.
     averaged : ndarray, shape (ny, l, N)
         Sensitivities.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -44,26 +37,26 @@ def curved(prediction: Prediction, root: Array, averaged: Array) -> Array:
     record = prediction.record
     left = np.stack([record.samples[o] for o in prediction.predictor.outputs]) - prediction.y
     size = np.mean((left * weights(record)) ** 2, axis=1)
-    if not np.any(linear > MATTERS * size):
+    if not np.any(linear > policy.curvature_matters * size):
         return np.ones(outputs)
-    draws = _inside(prediction, root)
+    draws = _inside(prediction, root, policy.curvature_draws)
     found = prediction.predictor.simulate(draws, 0)
     good = found.status == Status.CONVERGED.value
-    if good.sum() < DRAWS // 2:
+    if good.sum() < policy.curvature_draws // 2:
         return np.ones(outputs)
     changes = (found.y[good] - prediction.y) * weights(record)
     if not record.periodic:
         changes = local_means(changes)
     squares = np.mean(changes**2, axis=2)
-    squares = np.minimum(squares, FARTHEST**2 * np.mean(squares, axis=0))
+    squares = np.minimum(squares, policy.farthest_draw**2 * np.mean(squares, axis=0))
     return np.where(linear > 0, np.mean(squares, axis=0) / np.maximum(linear, 1e-300), 1.0)
 
 
-def _inside(prediction: Prediction, root: Array) -> Array:
+def _inside(prediction: Prediction, root: Array, count: int) -> Array:
     """Vectors of all unknowns drawn about the estimate, within their priors' supports."""
     rng = np.random.default_rng(0)
     # Opposite pairs: the mean of the changes is then that of the curvature alone.
-    half = rng.standard_normal((DRAWS // 2, root.shape[1])) @ root.T
+    half = rng.standard_normal((count // 2, root.shape[1])) @ root.T
     draws = prediction.vector + np.concatenate([half, -half])
     predictor = prediction.predictor
     for k, prior in enumerate(predictor.layout.priors(predictor.model)):

@@ -15,7 +15,7 @@ from bayesoleo.prediction.layout import Layout
 from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.records import Harmonics, Record
 from bayesoleo.solvers.status import Status
-from bayesoleo.tracing.experiments.separation import Foreseen
+from bayesoleo.tracing.experiments.separation import PredictiveDistribution
 from bayesoleo.tracing.fitting.fit import Fit
 
 #: Points of a period at which outputs are compared, and steps of the mesh: a choice between runs
@@ -23,8 +23,6 @@ from bayesoleo.tracing.fitting.fit import Fit
 POINTS, STEPS = 128, 128
 #: Passes that make a response which is an input as well agree with itself, and the orders of it.
 PASSES, ORDERS = 4, 12
-#: Runs from which on the scatter of a parameter between them says what a new one may be like.
-ENOUGH_RUNS = 3
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Knowledge:
             elif model.parameters[owner].by_run:
                 own = [value for key, value in values.items() if key.startswith(f"{owner}[")]
                 theta[k] = np.mean(own) if own else theta[k]
-                if len(own) >= ENOUGH_RUNS and not model.parameters[owner].measured:
+                if len(own) >= fit.policy.enough_runs and not model.parameters[owner].measured:
                     covariance[k, k] = np.var(own, ddof=1) * (1 + 1 / len(own))
         return cls(theta, _root(covariance), model)
 
@@ -126,9 +124,9 @@ def blank_record(
     )
 
 
-def foresee(
+def predictive_distribution(
     rival: Rival, known: Knowledge, record: Record, noise: Mapping[str, float]
-) -> tuple[Foreseen, Array] | Status:
+) -> tuple[PredictiveDistribution, Array] | Status:
     """What a rival foresees of a run.
 
     Parameters
@@ -143,7 +141,7 @@ def foresee(
 
     Returns
     -------
-    Foreseen
+    PredictiveDistribution
         In units of the noise, outputs one after the other.
     ndarray, shape (ny, POINTS)
         Outputs, SI.
@@ -172,7 +170,7 @@ def foresee(
     spread = np.concatenate([sure.reshape(-1, size), entered.reshape(-1, size)])
     if not (np.isfinite(spread).all() and np.isfinite(found.y).all()):
         return Status.INADMISSIBLE
-    return Foreseen((found.y * scale).ravel(), spread), found.y
+    return PredictiveDistribution((found.y * scale).ravel(), spread), found.y
 
 
 def _nothing(fed_back: list[str]) -> dict[str, Harmonics]:

@@ -19,20 +19,17 @@ from bayesoleo.tracing.experiments.foresee import (
     Knowledge,
     Rival,
     blank_record,
-    foresee,
+    predictive_distribution,
 )
 from bayesoleo.tracing.experiments.rig import Limits, Motion, Planned, planned_runs
 from bayesoleo.tracing.experiments.separation import Separation, separate
+from bayesoleo.tracing.policy import SearchPolicy
 
-#: A pair that no run separates by this many standard deviations does not count in the ranking.
-SEPARABLE = 1.0
-#: Information in bits below which two runs are as good, and their weakest pair decides.
-AS_GOOD = 0.01
 BEYOND_LIMITS = "an output beyond its limits"
 
 
 @dataclass(frozen=True)
-class Trial:
+class ProposedRun:
     """A run and how well it would tell the rivals apart.
 
     Parameters
@@ -65,30 +62,32 @@ class Proposals:
         The channel that moves.
     limits : Limits
         What the rig can do.
-    trials : tuple of Trial
+    trials : tuple of ProposedRun
         Runs that were not made, the best first.
-    repeats : tuple of Trial
+    repeats : tuple of ProposedRun
         Each run that was made, were it made once more.
     left_out : mapping of str to int
         Runs without a prediction by reason.
+    policy : SearchPolicy
     """
 
     rivals: tuple[str, ...]
     drive: str
     limits: Limits
-    trials: tuple[Trial, ...]
-    repeats: tuple[Trial, ...]
+    trials: tuple[ProposedRun, ...]
+    repeats: tuple[ProposedRun, ...]
     left_out: Mapping[str, int]
+    policy: SearchPolicy = SearchPolicy()
 
-    def shortlist(self, count: int = 5) -> tuple[Trial, ...]:
+    def shortlist(self, count: int = 5) -> tuple[ProposedRun, ...]:
         """The best run at each frequency, the best first: neighbours on a grid say the same."""
-        best: dict[float, Trial] = {}
+        best: dict[float, ProposedRun] = {}
         for trial in self.trials:
             best.setdefault(trial.frequency, trial)
         return tuple(best.values())[:count]
 
     @property
-    def best_repeat(self) -> Trial | None:
+    def best_repeat(self) -> ProposedRun | None:
         """The run that was made whose repetition would tell most; None if none was solved."""
         return max(self.repeats, key=lambda trial: trial.separation.information, default=None)
 
@@ -100,7 +99,7 @@ class Proposals:
         return tuple(
             (self.rivals[i], self.rivals[j])
             for i, j in zip(first, second, strict=True)
-            if reach[i, j] < SEPARABLE
+            if reach[i, j] < self.policy.separable
         )
 
 
@@ -141,7 +140,7 @@ def propose_runs(
         If there are fewer than two rivals, runs are transient, or the model has several inputs,
         so that it is not clear what a new run would be.
     """
-    drive = drive_of(rivals, records)
+    drive, policy = drive_of(rivals, records), rivals[0].fit.policy
     outputs = rivals[0].fit.predictor.outputs
     chosen = Limits.of(records, drive, outputs) if limits is None else limits
     known = tuple(Knowledge.of(rival.fit) for rival in rivals)
@@ -153,9 +152,10 @@ def propose_runs(
         tuple(rival.name for rival in rivals),
         drive,
         chosen,
-        _ranked([item for item in planned if isinstance(item, Trial)], len(rivals)),
-        tuple(item for item in repeated if isinstance(item, Trial)),
+        _ranked([item for item in planned if isinstance(item, ProposedRun)], len(rivals), policy),
+        tuple(item for item in repeated if isinstance(item, ProposedRun)),
         Counter(item for item in planned if isinstance(item, str)),
+        policy,
     )
 
 
@@ -170,11 +170,13 @@ class _Judge:
     limits: Limits
     noise: Mapping[str, float]
 
-    def __call__(self, run: Planned | Record) -> Trial | str:
+    def __call__(self, run: Planned | Record) -> ProposedRun | str:
         """The trial, or why there is none."""
         record, outputs = self._blank(run), self.rivals[0].fit.predictor.outputs
         pairs = zip(self.rivals, self.known, strict=True)
-        found = [foresee(rival, known, record, self.noise) for rival, known in pairs]
+        found = [
+            predictive_distribution(rival, known, record, self.noise) for rival, known in pairs
+        ]
         failed = [item for item in found if isinstance(item, Status)]
         if failed:
             return failed[0].message
@@ -183,9 +185,9 @@ class _Judge:
             return BEYOND_LIMITS
         separation = separate([item for item, _ in solved])
         if isinstance(run, Planned):
-            return Trial(run.frequency, run.mean, run.amplitude, separation)
+            return ProposedRun(run.frequency, run.mean, run.amplitude, separation)
         move = Motion.of(run, self.drive)
-        return Trial(run.frequency, move.mean, move.amplitude, separation, run.label)
+        return ProposedRun(run.frequency, move.mean, move.amplitude, separation, run.label)
 
     def _blank(self, run: Planned | Record) -> Record:
         """The run without its answers; a planned one under the conditions of the nearest made."""
@@ -284,21 +286,23 @@ def _inside(limits: Limits, outputs: Sequence[str], found: Sequence[Array]) -> b
     return True
 
 
-def _reach(trials: Sequence[Trial], count: int) -> Array:
+def _reach(trials: Sequence[ProposedRun], count: int) -> Array:
     """Largest separation of each pair by any run, shape (count, count)."""
     if not trials:
         return np.zeros((count, count))
     return np.max(np.stack([trial.separation.sigma for trial in trials]), axis=0)
 
 
-def _ranked(trials: Sequence[Trial], count: int) -> tuple[Trial, ...]:
+def _ranked(
+    trials: Sequence[ProposedRun], count: int, policy: SearchPolicy
+) -> tuple[ProposedRun, ...]:
     """By information; where that is all there is to know, by the pair that is separated least."""
     first, second = np.triu_indices(count, 1)
-    can = _reach(trials, count)[first, second] >= SEPARABLE
+    can = _reach(trials, count)[first, second] >= policy.separable
 
-    def worth(trial: Trial) -> tuple[float, float]:
+    def worth(trial: ProposedRun) -> tuple[float, float]:
         sigma = trial.separation.sigma[first, second]
         least = float(sigma[can].min()) if can.any() else float(sigma.min())
-        return round(trial.separation.information / AS_GOOD), least
+        return round(trial.separation.information / policy.equal_information), least
 
     return tuple(sorted(trials, key=worth, reverse=True))

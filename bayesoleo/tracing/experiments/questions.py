@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from bayesoleo._types import ProgressCallback
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.deciding.loop import ClosedLoop
-from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.ranking import Ranked
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.errors.errors_table import ErrorTable, error_table
 from bayesoleo.tracing.errors.holdout import predict_fitted
 from bayesoleo.tracing.experiments.foresee import Rival
@@ -19,8 +21,6 @@ from bayesoleo.tracing.fitting.fit import Numerics
 
 #: Why effects are to be told apart.
 ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def questions_of(
     numerics: Numerics,
     *,
     effects: Sequence[str] = (),
-    say: Say = lambda _: None,
+    callback: ProgressCallback = lambda _: None,
 ) -> tuple[Question, ...]:
     """What each round leaves to be told apart.
 
@@ -69,7 +69,7 @@ def questions_of(
         Scheme, threads.
     effects : sequence of str, optional
         These effects of the last round instead.
-    say : callable
+    callback : callable
         Told what is being done.
     """
     records = [*loop.roles.fitted, *loop.roles.held_out]
@@ -81,10 +81,10 @@ def questions_of(
             continue
         if item.accepted and (item.accepted.effect, item.accepted.target) not in stayed:
             continue  # what was taken out again needs no telling from others
-        chosen = named(item, effects) if effects else standing(item)
+        chosen = named(item, effects) if effects else standing(item, policy=numerics.policy)
         if chosen:
             kind = ASKED if effects else OPEN if item.accepted is None else ALIKE
-            found.append(_answer(number, kind, item, chosen, records, rig, numerics, say))
+            found.append(_answer(number, kind, item, chosen, records, rig, numerics, callback))
     return tuple(found)
 
 
@@ -96,10 +96,10 @@ def _answer(
     records: Sequence[Record],
     rig: Mapping[str, Range],
     numerics: Numerics,
-    say: Say,
+    callback: ProgressCallback,
 ) -> Question:
     names = tuple(label(one, chosen) for one in chosen)
-    say(f"what would tell {', '.join(names)} apart")
+    callback(f"what would tell {', '.join(names)} apart")
     try:
         # Before anything is estimated.
         drive_of([Rival("", item.before.fit)] * 2, records)
@@ -124,4 +124,4 @@ def _left(item: Round, best: Rival, numerics: Numerics) -> ErrorTable:
         return item.after.fit_errors
     predictions = predict_fitted(best.fit)
     roles = {prediction.record.label: "fit" for prediction in predictions}
-    return error_table(predictions, roles, jobs=numerics.jobs)
+    return error_table(predictions, roles, jobs=numerics.jobs, policy=numerics.policy)

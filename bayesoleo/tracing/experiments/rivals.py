@@ -9,17 +9,15 @@ import numpy as np
 
 from bayesoleo.errors import InputError
 from bayesoleo.parallel import thread_map
-from bayesoleo.tracing.deciding.confirmation import LEAST_SHARE
+from bayesoleo.tracing.deciding.ranking import Ranked
 from bayesoleo.tracing.deciding.refit import Refit, refit
-from bayesoleo.tracing.deciding.rounds import LEVEL, Ranked, Round
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.experiments.foresee import Rival
 from bayesoleo.tracing.fitting.fit import Numerics
-
-#: Rivals compared at most: each of them has to be estimated.
-MOST_RIVALS = 4
+from bayesoleo.tracing.policy import SearchPolicy
 
 
-def standing(item: Round, most: int = MOST_RIVALS) -> tuple[Ranked, ...]:
+def standing(item: Round, *, policy: SearchPolicy = SearchPolicy()) -> tuple[Ranked, ...]:
     """Candidates that a round leaves to be told apart, the best first.
 
     Where an effect was accepted, it and those that the data cannot tell from it; else those that
@@ -39,9 +37,11 @@ def standing(item: Round, most: int = MOST_RIVALS) -> tuple[Ranked, ...]:
         chosen = [
             other
             for other in item.ranking
-            if other.p_value < LEVEL and other.gain >= LEAST_SHARE and not other.imitates
+            if other.p_value < policy.significance
+            and other.gain >= policy.least_share
+            and not other.absorbs
         ]
-    return tuple(chosen[:most]) if len(chosen) > 1 else ()
+    return tuple(chosen[: policy.proposal_rivals]) if len(chosen) > 1 else ()
 
 
 def named(item: Round, effects: Sequence[str]) -> tuple[Ranked, ...]:

@@ -25,7 +25,7 @@ from bayesoleo._types import Array
 
 
 @dataclass(frozen=True)
-class Foreseen:
+class PredictiveDistribution:
     """What a rival foresees of an experiment, in units of the noise.
 
     Parameters
@@ -73,12 +73,12 @@ class Separation:
         return float(self.sigma[np.triu_indices(len(self.sigma), 1)].min())
 
 
-def separate(rivals: Sequence[Foreseen]) -> Separation:
+def separate(rivals: Sequence[PredictiveDistribution]) -> Separation:
     """Expected log Bayes factors between all rivals, and the information about which is true.
 
     Parameters
     ----------
-    rivals : sequence of Foreseen
+    rivals : sequence of PredictiveDistribution
         Two or more, of the same experiment in the same units.
 
     Returns
@@ -103,7 +103,7 @@ def separate(rivals: Sequence[Foreseen]) -> Separation:
     return Separation(factor, max(information, 0.0))
 
 
-def _reduced(rivals: Sequence[Foreseen]) -> tuple[Array, list[Array]]:
+def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Array]]:
     """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are not
     sure; in all others they foresee the same."""
     moved = [rival.mean - rivals[0].mean for rival in rivals]

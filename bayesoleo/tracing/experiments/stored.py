@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import schema
-from bayesoleo.tracing.experiments.propose import Proposals, Trial
+from bayesoleo.tracing.experiments.propose import Proposals, ProposedRun
 from bayesoleo.tracing.experiments.questions import Question
 
 #: Runs that the summary lists.
@@ -56,7 +56,7 @@ def proposals_entry(question: Question, unit: str) -> dict[str, Any]:
     }
 
 
-def _trial(found: Proposals, trial: Trial) -> dict[str, Any]:
+def _trial(found: Proposals, trial: ProposedRun) -> dict[str, Any]:
     first, second = np.triu_indices(len(found.rivals), 1)
     sigma = trial.separation.sigma
     pairs = [

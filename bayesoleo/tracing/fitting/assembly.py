@@ -46,7 +46,7 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Step:
+class AddedEffect:
     """One effect that was added.
 
     Parameters
@@ -80,7 +80,7 @@ class Assembly:
         Effects on channels of the driven model, with their targets.
     parameters : mapping of str to Parameter
         Parameters of the sensor effects, which the native model does not have.
-    steps : tuple of Step
+    steps : tuple of AddedEffect
         How it was assembled, in order.
     declared : Model or None
         The model before any effect; ``None`` stands for ``native``.
@@ -94,7 +94,7 @@ class Assembly:
     drive: str | None = None
     sensors: tuple[tuple[Effect, str, Scales], ...] = ()
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    steps: tuple[Step, ...] = ()
+    steps: tuple[AddedEffect, ...] = ()
     declared: Model | None = None
     nuisance: Nuisance = field(default_factory=Nuisance)
     starts: bool = False
@@ -130,7 +130,7 @@ class Assembly:
             {name: replace(present[name], value=value) for name, value in values.items()}
         )
 
-    def without(self, step: Step) -> Assembly:
+    def without(self, step: AddedEffect) -> Assembly:
         """The same assembly with one effect left out, and those that act on what it brought.
 
         An effect acts on what another brought if it sits there, as a parameter that varies by run
@@ -186,7 +186,7 @@ class Assembly:
         self, effect: Effect, candidate: Candidate, scales: Scales, base: Model
     ) -> Assembly:
         """Add an effect, given what it makes of the model that it is added to."""
-        step = Step(effect, candidate.target, scales, candidate.parameters)
+        step = AddedEffect(effect, candidate.target, scales, candidate.parameters)
         grown = replace(self, steps=(*self.steps, step), declared=self.declared or self.native)
         if not effect.on_channels:
             return replace(grown, native=candidate.model)

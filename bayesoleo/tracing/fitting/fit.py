@@ -20,10 +20,8 @@ from bayesoleo.prediction.stability import Stability
 from bayesoleo.solvers.schemes.choose import COLLOCATION, DEFAULT_SCHEME
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.other_starts import doubtful, from_other_starts
+from bayesoleo.tracing.policy import SearchPolicy
 
-#: A mesh is fine enough if halving its steps moves no parameter by more than this many posterior
-#: standard deviations.
-LARGEST_SHIFT = 0.1
 #: What is said of a mesh that did not do, or of which nothing is known.
 TOO_COARSE = (
     "the mesh is too coarse: {} steps leave an error that moves a parameter by {:.2g} of its"
@@ -35,9 +33,6 @@ UNKNOWN_SHIFT = (
     "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
     " the estimates"
 )
-#: What is missed between the points of steps replaces the movement by halving them where it is so
-#: many times larger: both meshes then pass over something.
-MISSED = 3.0
 #: Error of a motion over its swing below which its estimate resolves nothing more.
 RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
@@ -67,6 +62,8 @@ class Numerics:
     scheduler : str or None
         Other processes or machines for fits that do not depend on each other; see
         :func:`bayesoleo.machines.connected`.
+    policy : SearchPolicy
+        By which fits are judged and compared.
     """
 
     scheme: str = DEFAULT_SCHEME
@@ -75,6 +72,7 @@ class Numerics:
     backend: str = "numba"
     scheduler: str | None = None
     solver: str = COLLOCATION
+    policy: SearchPolicy = SearchPolicy()
 
 
 @dataclass(frozen=True)
@@ -119,10 +117,16 @@ class Fit:
             return []
         if not np.isfinite(self.shift):
             return [UNKNOWN_SHIFT.format(self.steps)]
-        if self.shift > LARGEST_SHIFT:
+        largest = self.policy.mesh_shift
+        if self.shift > largest:
             least = f"{self.motion_error:.1g}" if np.isfinite(self.motion_error) else "unknown"
-            return [TOO_COARSE.format(self.steps, self.shift, LARGEST_SHIFT, least)]
+            return [TOO_COARSE.format(self.steps, self.shift, largest, least)]
         return []
+
+    @property
+    def policy(self) -> SearchPolicy:
+        """By which it is judged."""
+        return self.numerics.policy
 
     @property
     def predictor(self) -> Predictor:
@@ -214,11 +218,11 @@ def fit_model(
     ----------
     Verbeek (1993), eqs. 3.17, 3.19 and 3.23.
     """
-    say = progress or (lambda _: None)
+    callback, policy = progress or (lambda _: None), numerics.policy
     steps = numerics.steps or first_steps(model, records)
     while True:
         problem = _problem(model, records, numerics, steps, share)
-        say(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
+        callback(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
         mbe = estimate(
             problem,
             method,
@@ -227,7 +231,7 @@ def fit_model(
             max_iterations=max_iterations,
             resolution=RESOLUTION,
         )
-        say("posterior mode")
+        callback("posterior mode")
         point = polish(
             problem,
             mbe,
@@ -235,8 +239,8 @@ def fit_model(
             max_iterations=max_iterations,
             resolution=RESOLUTION,
         )
-        if start is None and doubtful(problem, point):
-            say("the estimate stands where the priors hardly allow it: other starts")
+        if start is None and doubtful(problem, point, policy):
+            callback("the estimate stands where the priors hardly allow it: other starts")
             mbe, point = from_other_starts(
                 problem,
                 mbe,
@@ -244,6 +248,7 @@ def fit_model(
                 tolerance=tolerance,
                 max_iterations=max_iterations,
                 resolution=RESOLUTION,
+                policy=policy,
             )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
@@ -252,8 +257,8 @@ def fit_model(
         if model.dofs:
             shift = error = float("nan")
             if check_mesh:
-                shift, error = _mesh_shift(problem, point, predictions)
-        fine = not shift > LARGEST_SHIFT
+                shift, error = _mesh_shift(problem, point, predictions, policy)
+        fine = not shift > policy.mesh_shift
         if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
             return Fit(model, problem, mbe, point, predictions, steps, numerics, shift, error)
         # One-step collocation gains more than a factor of four by halving, so one look ahead
@@ -278,7 +283,10 @@ def _problem(
 
 
 def _mesh_shift(
-    problem: CampaignProblem, point: PointEstimate, predictions: list[RunPrediction]
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    policy: SearchPolicy,
 ) -> tuple[float, float]:
     """Shift of the estimate that the discretisation causes, in standard deviations, and the largest
     error of a motion over its swing."""
@@ -294,7 +302,8 @@ def _mesh_shift(
     if len(known) < len(better):
         return shift, error
     missed = _shift(problem, point, predictions, known)
-    return (missed if missed > max(MISSED * shift, LARGEST_SHIFT) else shift), error
+    clearly = missed > max(policy.missed_factor * shift, policy.mesh_shift)
+    return (missed if clearly else shift), error
 
 
 def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | None:

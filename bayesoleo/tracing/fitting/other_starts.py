@@ -14,16 +14,10 @@ from bayesoleo._types import Array
 from bayesoleo.estimation import PointEstimate, estimate, polish
 from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
 from bayesoleo.estimation.problems.scaling import PriorScale
-
-#: Vectors drawn from the priors, and the best of them from which estimates start.
-DRAWS, STARTS = 256, 4
-#: Probability of an unknown as far from its prior's centre as one that is doubted.
-DOUBTED = 1e-4
-#: Rise of the log posterior by which another answer is believed instead.
-BETTER = 3.0
+from bayesoleo.tracing.policy import SearchPolicy
 
 
-def doubtful(problem: CampaignProblem, point: PointEstimate) -> bool:
+def doubtful(problem: CampaignProblem, point: PointEstimate, policy: SearchPolicy) -> bool:
     """Whether an estimate stands where its priors hardly allow it, or did not converge."""
     if point.on_limit or not point.status.ok:
         return True
@@ -32,7 +26,7 @@ def doubtful(problem: CampaignProblem, point: PointEstimate) -> bool:
         away = np.where(
             scale.logarithmic, np.log(point.theta / scale.mean), point.theta - scale.mean
         )
-    return bool(np.any(np.abs(away / scale.spread) > stats.norm.isf(DOUBTED / 2)))
+    return bool(np.any(np.abs(away / scale.spread) > stats.norm.isf(policy.doubtful_prior / 2)))
 
 
 def from_other_starts(
@@ -43,6 +37,7 @@ def from_other_starts(
     tolerance: float,
     max_iterations: int,
     resolution: float,
+    policy: SearchPolicy,
 ) -> tuple[PointEstimate, PointEstimate]:
     """The best of an estimate and those from starts drawn from the priors.
 
@@ -55,6 +50,7 @@ def from_other_starts(
         MBE's estimate from the declared start, and the mode reached from it.
     tolerance, max_iterations, resolution
         As in :func:`~bayesoleo.estimation.estimate`.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -62,19 +58,20 @@ def from_other_starts(
         Those that were given, where no other start leads to a mode that is clearly more likely.
     """
     options = {"tolerance": tolerance, "max_iterations": max_iterations, "resolution": resolution}
-    for start in promising(problem, problem.start):
+    least = policy.better_optimum
+    for start in promising(problem, problem.start, policy):
         first = estimate(problem, "mbe", start=start, **options)  # type: ignore[arg-type]
         if not first.status.ok:
             continue
         found = polish(problem, first, **options)  # type: ignore[arg-type]
-        if found.status.ok and (not point.status.ok or found.objective > point.objective + BETTER):
+        if found.status.ok and (not point.status.ok or found.objective > point.objective + least):
             mbe, point = first, found
-            if not doubtful(problem, point):
+            if not doubtful(problem, point, policy):
                 break
     return mbe, point
 
 
-def promising(problem: CampaignProblem, theta: Array) -> list[Array]:
+def promising(problem: CampaignProblem, theta: Array, policy: SearchPolicy) -> list[Array]:
     """The most likely of many draws from the priors.
 
     Parameters
@@ -83,19 +80,21 @@ def promising(problem: CampaignProblem, theta: Array) -> list[Array]:
         Its solver starts from where it stands.
     theta : ndarray, shape (l,)
         Where unknowns of single runs stay.
+    policy : SearchPolicy
+        How many are drawn and kept.
 
     Returns
     -------
     list of ndarray, shape (l,)
-        At most :data:`STARTS`; those that could not be solved are left out.
+        Those that could not be solved are left out.
     """
     rng, shared = np.random.default_rng(0), problem.predictor.model.parameters
-    draws = np.repeat(np.asarray(theta, dtype=float)[None], DRAWS, axis=0)
+    draws = np.repeat(np.asarray(theta, dtype=float)[None], policy.prior_draws, axis=0)
     for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
         if name in shared:
-            draws[:, k] = prior.sample(rng, DRAWS)
+            draws[:, k] = prior.sample(rng, policy.prior_draws)
     sums = problem.misfit(draws).sum_of_squares.sum(axis=1)
     counts = problem.counts.sum(axis=0)
     cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
-    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[:STARTS]
+    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[: policy.prior_starts]
     return [draws[k] for k in order if np.isfinite(cost[k])]

@@ -12,10 +12,6 @@ from bayesoleo._types import Array
 from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 from bayesoleo.tracing.fitting.other_starts import promising
 
-#: Log density by which another optimum has to be better: less is what an estimate that ends early
-#: leaves.
-BETTER = 5.0
-
 
 def better_start(fit: Fit, numerics: Numerics) -> Array | None:
     """Unknowns from which the estimate ends higher than it did.
@@ -31,8 +27,8 @@ def better_start(fit: Fit, numerics: Numerics) -> Array | None:
     ndarray, shape (l,), or None
         The better optimum; None where none of those that are reached from draws of the priors is.
     """
-    best, height = None, fit.point.objective + BETTER
-    for start in promising(fit.problem, fit.point.theta):
+    best, height = None, fit.point.objective + numerics.policy.better_optimum_declared
+    for start in promising(fit.problem, fit.point.theta, numerics.policy):
         found = fit_model(
             fit.model,
             fit.records,

@@ -15,31 +15,26 @@ import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.effects.titles import in_sentence
-from bayesoleo.effects.unnamed import Spline, UnnamedEffect, tensor
+from bayesoleo.effects.unnamed import NonparametricEffect, Spline, tensor
 from bayesoleo.errors import ModelError
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.errors.holdout import Prediction
-from bayesoleo.tracing.fitting.assembly import Step
+from bayesoleo.tracing.fitting.assembly import AddedEffect
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base
-from bayesoleo.tracing.unnamed.directions import DISTINCT, VISIBLE
 from bayesoleo.tracing.unnamed.forcing import Forced
 from bayesoleo.tracing.unnamed.quantities import Motions, quantities_of
 
-#: A parameter is shared with a curve where the data know less than this part of it beside any
-#: curve of the same quantities: its standard deviation would be three times what it seems.
-OWN = 0.1
 #: Eigenvalues of unit diagonal matrices below this are round-off.
 ROUND_OFF = 1e-10
-#: Part of a run's samples that may lie beyond a curve's range.
-BEYOND = 0.01
 
 
 @dataclass(frozen=True)
 class Curve:
     """A curve in a fitted model."""
 
-    step: Step
+    step: AddedEffect
     spline: Spline
 
     @property
@@ -83,7 +78,7 @@ class CurveFacts:
 def curves(state: State) -> Iterator[Curve]:
     """The curves without a name that a model has."""
     for step in state.assembly.steps:
-        if isinstance(step.effect, UnnamedEffect) and step.effect.spline is not None:
+        if isinstance(step.effect, NonparametricEffect) and step.effect.spline is not None:
             yield Curve(step, step.effect.spline)
 
 
@@ -105,14 +100,16 @@ def shared_parameters(state: State) -> dict[str, str]:
         if products is None:
             continue
         cross, own = products
-        part = own_part(base.gram[np.ix_(rows, rows)], cross[rows], own)
+        part = own_part(base.gram[np.ix_(rows, rows)], cross[rows], own, policy=base.policy)
         for k, value in zip(rows, part, strict=True):
-            if value < OWN:
+            if value < base.policy.own_part:
                 found.setdefault(names[k], curve.title)
     return found
 
 
-def own_part(gram: Array, cross: Array, own: Array) -> Array:
+def own_part(
+    gram: Array, cross: Array, own: Array, *, policy: SearchPolicy = SearchPolicy()
+) -> Array:
     """Part of what the data know of each parameter that is left beside any function of a curve.
 
     Parameters
@@ -123,6 +120,7 @@ def own_part(gram: Array, cross: Array, own: Array) -> Array:
         ``J' W C`` with the curve's splines.
     own : ndarray, shape (K, K)
         ``C' W C``.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -130,9 +128,9 @@ def own_part(gram: Array, cross: Array, own: Array) -> Array:
         Information beside the curve over that without it: one where the curve takes nothing over.
     """
     size = np.sqrt(np.clip(np.diag(own), 0.0, None))
-    seen = size > VISIBLE * size.max(initial=0.0)
+    seen = size > policy.resolved_spline * size.max(initial=0.0)
     values, vectors = np.linalg.eigh(own[np.ix_(seen, seen)] / np.outer(size[seen], size[seen]))
-    clear = values > DISTINCT * values.max(initial=0.0)
+    clear = values > policy.distinct_spline * values.max(initial=0.0)
     unit = (vectors[:, clear] / np.sqrt(values[clear])) / size[seen][:, None]
     along = cross[:, seen] @ unit
     scale = 1.0 / np.sqrt(np.clip(np.diag(gram), 1e-300, None))
@@ -201,7 +199,7 @@ def beyond_range(state: State) -> list[str]:
             for axis, k in zip(curve.spline.axes, numbers, strict=False):
                 values = _along(motions, prediction, k)
                 outside = (values < axis.low) | (values > axis.high)
-                if np.isfinite(values).all() and outside.mean() > BEYOND:
+                if np.isfinite(values).all() and outside.mean() > state.policy.beyond_curve:
                     found.append(
                         f"run {prediction.record.label} goes beyond the range in which"
                         f" {curve.title} was fitted: {axis.name}"

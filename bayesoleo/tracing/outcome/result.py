@@ -19,7 +19,8 @@ from bayesoleo.posterior import LogDensity, Samples, to_datasets
 from bayesoleo.posterior.outcome.blocks import block_groups
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.deciding.loop import ClosedLoop
-from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.ranking import Ranked
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State
 from bayesoleo.tracing.errors.errors_table import RunError
 from bayesoleo.tracing.errors.floor import chance
@@ -160,7 +161,7 @@ def fitted_groups(fit: Fit) -> dict[str, xr.Dataset]:
 def loop_groups(
     loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
 ) -> dict[str, xr.Dataset]:
-    """The groups prediction, residual, discovery, unnamed and period_predictive."""
+    """The groups prediction, residual, discovery, nonparametric and period_predictive."""
     groups = {
         schema.PREDICTION: _predictions(
             [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
@@ -170,7 +171,7 @@ def loop_groups(
     }
     shape = shape_group(loop)
     if shape is not None:
-        groups[schema.UNNAMED] = shape
+        groups[schema.NONPARAMETRIC] = shape
     if drawn is not None:
         final, (samples, density) = loop.final, drawn
         groups[schema.PERIOD_PREDICTIVE] = predictive_group(

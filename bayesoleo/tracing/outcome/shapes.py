@@ -1,4 +1,4 @@
-"""The shape of an unnamed effect, with its uncertainty: what is shown instead of a name."""
+"""The shape of a nonparametric effect, with its uncertainty: what is shown instead of a name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 
 from bayesoleo import schema
 from bayesoleo._types import Array, Float
-from bayesoleo.effects.unnamed import Axis, UnnamedEffect, balance_unit_at
+from bayesoleo.effects.unnamed import Axis, NonparametricEffect, balance_unit_at
 from bayesoleo.tracing.deciding.loop import ClosedLoop
 from bayesoleo.tracing.deciding.state import State
 
@@ -21,7 +21,7 @@ POINT, QUANTITY = "point", "quantity"
 
 
 @dataclass(frozen=True)
-class Shape:
+class EstimatedCurve:
     """An estimated function of one or two quantities.
 
     Parameters
@@ -48,8 +48,8 @@ class Shape:
     sd: Float[Array, " points"]
 
 
-def shapes(state: State) -> Iterator[Shape]:
-    """Every unnamed effect of a fitted model.
+def shapes(state: State) -> Iterator[EstimatedCurve]:
+    """Every nonparametric effect of a fitted model.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def shapes(state: State) -> Iterator[Shape]:
     fit = state.fit
     for step in state.assembly.steps:
         effect = step.effect
-        if not isinstance(effect, UnnamedEffect) or effect.spline is None:
+        if not isinstance(effect, NonparametricEffect) or effect.spline is None:
             continue
         spline = effect.spline
         index = [fit.problem.names.index(name) for name in step.amplitudes]
@@ -68,7 +68,7 @@ def shapes(state: State) -> Iterator[Shape]:
         basis = spline.basis(*places)
         variance = np.einsum("kn,kl,ln->n", basis, covariance, basis)
         unit = balance_unit_at(state.assembly.native, spline.target)
-        yield Shape(
+        yield EstimatedCurve(
             effect.id,
             spline.target,
             spline.axes,
@@ -86,7 +86,7 @@ def _grid(axes: tuple[Axis, ...]) -> Array:
 
 
 def shape_group(loop: ClosedLoop) -> xr.Dataset | None:
-    """The group ``unnamed``, of a closed loop's unnamed effect; None where there is none."""
+    """The group ``nonparametric`` of a closed loop; None where it has no such effect."""
     found = next(shapes(loop.final), None)
     if found is None:
         return None

@@ -12,9 +12,10 @@ from bayesoleo import schema
 from bayesoleo.effects.titles import titles_for, with_titles
 from bayesoleo.posterior import Samples
 from bayesoleo.tracing.deciding.loop import ON_LIMIT, ClosedLoop
-from bayesoleo.tracing.deciding.rounds import Ranked, Round
+from bayesoleo.tracing.deciding.ranking import Ranked
+from bayesoleo.tracing.deciding.rounds import Round
 from bayesoleo.tracing.deciding.state import State
-from bayesoleo.tracing.errors.floor import LEAST_RATIO, limit, lowest
+from bayesoleo.tracing.errors.floor import limit, lowest
 from bayesoleo.tracing.outcome.curves import CurveFacts
 
 
@@ -55,6 +56,7 @@ def summarise(
         "certain": loop.certain,
         "certainty": loop.certainty,
         "titles": titles,
+        "policy": loop.policy.changed(),
         "hold_out": loop.roles.description,
         "re_estimated": max((p.re_estimated for p in final.held_out), default=0),
         "units": {name: final.fit.model.outputs[name].unit for name in final.fit.predictor.outputs},
@@ -111,19 +113,23 @@ def _by_run(state: State) -> dict[str, dict[str, dict[str, Any]]]:
     for own in (state.fit_errors, state.hold_errors):
         for entry in own.entries:
             if any(entry is shown for shown in state.errors.entries):
-                table[entry.output][entry.run]["limit"] = limit([entry], len(own.entries))
+                table[entry.output][entry.run]["limit"] = limit(
+                    [entry], len(own.entries), policy=state.policy
+                )
     return table
 
 
 def _by_role(state: State) -> dict[str, dict[str, dict[str, Any]]]:
     """Pooled errors, each with the ratios that chance hardly exceeds or falls below."""
     found: dict[str, dict[str, dict[str, Any]]] = dict(state.by_role)
+    policy = state.policy
     for table in (state.fit_errors, state.hold_errors):
         for role in {entry.role for entry in table.entries}:
             for output in table.outputs:
                 chosen = [e for e in table.entries if (e.role, e.output) == (role, output)]
-                least = min(lowest(chosen), LEAST_RATIO)
-                found[role][output] |= {"limit": limit(chosen), "lowest": least}
+                least = min(lowest(chosen, policy=policy), policy.least_ratio)
+                most = limit(chosen, policy=policy)
+                found[role][output] |= {"limit": most, "lowest": least}
     return found
 
 

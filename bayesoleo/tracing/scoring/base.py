@@ -18,13 +18,12 @@ from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.errors.errors_table import RunError
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import counted, weights
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.sensitivities import present_constants
 
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.
 MOST_SAMPLES = 1500
-#: Stretches of a transient whose scatter stands in for that between periods.
-STRETCHES = 8
 #: Directions of input noise that are counted in a run, and the squared size, in noise units, below
 #: which one is not worth it.
 MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
@@ -128,6 +127,8 @@ class Base:
     doubt : float
         Standard deviation of the excess where nothing is missing: the residual's own scatter, and
         that of the noise, which is measured too.
+    policy : SearchPolicy
+        By which scores and estimates are judged.
     """
 
     fit: Fit
@@ -137,6 +138,7 @@ class Base:
     noise: float
     excess: float
     doubt: float
+    policy: SearchPolicy = SearchPolicy()
 
     @property
     def fall_back(self) -> float:
@@ -146,7 +148,7 @@ class Base:
     @property
     def feigned(self) -> float:
         """Excess that noise alone exceeds once in forty times."""
-        return 2.0 * self.doubt
+        return self.policy.excess_errors * self.doubt
 
 
 def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
@@ -175,7 +177,8 @@ def base_of(fit: Fit, errors: Mapping[tuple[str, str], RunError]) -> Base:
             variance += 2.0 * own**2 * (1.0 / entry.coefficients + 1.0 / max(entry.free, 1.0))
             excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(run)
-    return Base(fit, runs, gram, gradient, noise, excess, float(np.sqrt(variance)))
+    doubt = float(np.sqrt(variance))
+    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy)
 
 
 def _prior_terms(fit: Fit) -> tuple[Array, Array]:
@@ -212,7 +215,7 @@ def _run_base(
         (run.measured - fit.predictions[r].y).ravel(),
         flat(own),
         flat(from_input * borne_out[:, None, None]),
-        np.tile(replicate(record), len(sigma)),
+        np.tile(replicate(record, fit.policy), len(sigma)),
         spectra,
     )
 
@@ -222,11 +225,12 @@ def _spectra(entries: Sequence[RunError]) -> tuple[NoiseSpectrum, ...]:
     return found if len(found) == len(entries) else ()
 
 
-def replicate(record: Record) -> NDArray[np.int64]:
+def replicate(record: Record, policy: SearchPolicy) -> NDArray[np.int64]:
     """Number of the period that each sample lies in; of a transient, of the stretch."""
     if record.periodic:
         return np.floor(record.phase + 1e-9).astype(np.int64)
-    return np.minimum((STRETCHES * record.position).astype(np.int64), STRETCHES - 1)
+    count = policy.stretches
+    return np.minimum((count * record.position).astype(np.int64), count - 1)
 
 
 def _sigma(noise: float, measured: Array) -> float:

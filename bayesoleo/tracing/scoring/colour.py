@@ -17,13 +17,8 @@ if TYPE_CHECKING:
     from bayesoleo.tracing.scoring.base import Base, RunBase
 
 
-#: Probability with which stationary noise may be taken for one that is not.
-UNSTEADY = 0.05
 #: Degrees of freedom of a variance that is not measured.
 ASSUMED = 1e9
-#: Part of a direction's power between the harmonics from which on it does not repeat; sampling that
-#: does not fit the period leaks less.
-WANDERS = 0.1
 
 
 def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
@@ -53,7 +48,9 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     freedom = variance**2 / scatter if scatter > 0 else ASSUMED
     between, degrees = _between_periods(base.runs, directions)
     # Against the spectrum's own uncertainty: neither is exact.
-    unsteady = degrees > 0 and between / variance > stats.f.isf(UNSTEADY, degrees, freedom)
+    unsteady = degrees > 0 and between / variance > stats.f.isf(
+        base.policy.unsteady, degrees, freedom
+    )
     if unsteady:
         variance, freedom = between, degrees
     return max(1.0, variance / white), 0 if freedom >= ASSUMED else max(1, int(freedom))
@@ -68,7 +65,8 @@ def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
     if not run.spectra:
         return ()
     parts = direction.reshape(len(run.spectra), -1)
-    if not any(_wanders(part, s) for part, s in zip(parts, run.spectra, strict=True)):
+    most = base.policy.aperiodic_power
+    if not any(_wanders(part, s, most) for part, s in zip(parts, run.spectra, strict=True)):
         return run.spectra
     record, found = base.fit.records[r], []
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
@@ -79,10 +77,10 @@ def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
     return tuple(found)
 
 
-def _wanders(signal: Array, spectrum: NoiseSpectrum) -> bool:
+def _wanders(signal: Array, spectrum: NoiseSpectrum, most: float) -> bool:
     """Whether a good part of a signal does not repeat from period to period."""
     power = spectrum.power(signal)
-    return bool(power.sum() - power[:: spectrum.lines].sum() > WANDERS * power.sum())
+    return bool(power.sum() - power[:: spectrum.lines].sum() > most * power.sum())
 
 
 def _by_spectrum(

@@ -26,7 +26,7 @@ _BESIDE, _FEWEST = 25, 5
 _WIDE = 3
 
 
-def hum_of(fit: Fit) -> float | None:
+def dominant_residual_frequency(fit: Fit) -> float | None:
     """Frequency at which the residuals of transients hum, Hz; None where they do not."""
     best: tuple[float, float] = (FALSE_ALARM, 0.0)
     for r, record in enumerate(fit.records):

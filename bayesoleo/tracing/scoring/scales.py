@@ -8,7 +8,7 @@ from bayesoleo.effects import Scales
 from bayesoleo.prediction.records import Record
 from bayesoleo.tracing.fitting.fit import Fit
 from bayesoleo.tracing.fitting.masked import weights
-from bayesoleo.tracing.scoring.hum import hum_of
+from bayesoleo.tracing.scoring.hum import dominant_residual_frequency
 
 POINTS = 512
 
@@ -58,7 +58,16 @@ def scales_of(fit: Fit, drive: str | None, native_dofs: tuple[str, ...]) -> Scal
     stated = [record.conditions for record in fit.records]
     shared = set.intersection(*map(set, stated))
     conditions = {name: float(np.mean([run[name] for run in stated])) for name in shared}
-    return Scales(position, velocity, outputs, *times, ranges, kinds, hum_of(fit), conditions)
+    return Scales(
+        position,
+        velocity,
+        outputs,
+        *times,
+        ranges,
+        kinds,
+        dominant_residual_frequency(fit),
+        conditions,
+    )
 
 
 def _places(record: Record) -> np.ndarray:

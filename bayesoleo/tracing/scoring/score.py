@@ -28,7 +28,7 @@ from bayesoleo.tracing.scoring.sensitivities import Block, sensitivities_of
 
 #: Why an effect has no score.
 SPANNED = "the model can already do what it would"
-INVISIBLE = "not visible in these data: no output changes with it"
+UNRESOLVED = "not visible in these data: no output changes with it"
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _attempt(base: Base, option: Option) -> Score | Status | str:
             best, used = score, block
     if best is None:
         seen = any(item.any() for block in columns for item in block.by_run)
-        return SPANNED if seen else INVISIBLE
+        return SPANNED if seen else UNRESOLVED
     inflation, freedom = inflation_of(base, _directions(base, used, best.expected))
     return replace(best, columns=np.concatenate(thinned), inflation=inflation, freedom=freedom)
 

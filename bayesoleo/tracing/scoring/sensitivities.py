@@ -14,7 +14,7 @@ from bayesoleo.prediction.predictor import Predictor
 from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.fit import Fit
-from bayesoleo.tracing.scoring.visible import without_round_off
+from bayesoleo.tracing.scoring.visible import resolved_sensitivities
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _of_run(fit: Fit, r: int, run: RunPredictor, p: Array) -> Array | Status:
         return Status(int(samples.status.max()))
     constants = run.kernels.derived.constants
     own = [k for k, name in enumerate(constants) if name in fit.model.parameters]
-    return without_round_off(run, p, samples, own)
+    return resolved_sensitivities(run, p, samples, own)
 
 
 def present_constants(fit: Fit, r: int) -> Array:

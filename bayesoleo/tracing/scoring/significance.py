@@ -9,17 +9,13 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo.parallel import single_blas_thread
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.score import Score
 
-#: Effects whose contributions agree to this squared cosine are one class.
-SAME = 0.95
-#: Effects of one family and place that agree to this squared cosine are one effect written in
-#: several ways: what is left of the difference is the tolerance of a constant.
-TWINS = 1.0 - 1e-6
-DRAWS = 4000
 
-
-def effective_tests(scores: Sequence[Score], seed: int) -> float:
+def effective_tests(
+    scores: Sequence[Score], seed: int, *, policy: SearchPolicy = SearchPolicy()
+) -> float:
     """Number of independent tests that a search over correlated candidates amounts to.
 
     Noise is drawn in the space of all candidates' columns, scanned shapes included; its largest
@@ -32,7 +28,7 @@ def effective_tests(scores: Sequence[Score], seed: int) -> float:
     with single_blas_thread():  # of a few hundred columns threads only get in each other's way
         values, vectors = np.linalg.eigh(columns @ columns.T)
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        draws = np.random.default_rng(seed).standard_normal((DRAWS, values.size))
+        draws = np.random.default_rng(seed).standard_normal((policy.search_draws, values.size))
         largest = np.abs(draws @ root.T).max(axis=1)
     smallest_p = 2 * stats.norm.sf(np.median(largest))
     return float(max(1.0, np.log(0.5) / np.log1p(-smallest_p)))
@@ -50,7 +46,9 @@ def corrected_p(score: Score, tests: float) -> float:
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
 
 
-def without_twins(scores: Sequence[Score]) -> tuple[list[Score], dict[str, str]]:
+def without_twins(
+    scores: Sequence[Score], *, policy: SearchPolicy = SearchPolicy()
+) -> tuple[list[Score], dict[str, str]]:
     """Scores without effects that are another one in other words, and which those are.
 
     Where damping is a parameter of the model, more of it in extension is less of it in compression:
@@ -61,6 +59,7 @@ def without_twins(scores: Sequence[Score]) -> tuple[list[Score], dict[str, str]]
     ----------
     scores : sequence of Score
         In the catalogue's order, which says what twins are called.
+    policy : SearchPolicy
 
     Returns
     -------
@@ -72,7 +71,7 @@ def without_twins(scores: Sequence[Score]) -> tuple[list[Score], dict[str, str]]
     twins: dict[str, str] = {}
     for score in scores:
         effect, target = score.option.key
-        like = next((other for other in kept if _are_twins(score, other)), None)
+        like = next((other for other in kept if _are_twins(score, other, policy)), None)
         if like is None:
             kept.append(score)
         else:
@@ -80,16 +79,16 @@ def without_twins(scores: Sequence[Score]) -> tuple[list[Score], dict[str, str]]
     return kept, twins
 
 
-def _are_twins(one: Score, other: Score) -> bool:
+def _are_twins(one: Score, other: Score, policy: SearchPolicy) -> bool:
     here, there = one.option.candidate, other.option.candidate
     if (here.family, here.target) != (there.family, there.target):
         return False
     if len(one.columns) != 1 or len(other.columns) != 1:
         return False  # effects with shapes, or with several unknowns
-    return float(one.columns[0] @ other.columns[0]) ** 2 > TWINS
+    return float(one.columns[0] @ other.columns[0]) ** 2 > policy.twin_cosine
 
 
-def classes(scores: Sequence[Score]) -> list[list[int]]:
+def classes(scores: Sequence[Score], *, policy: SearchPolicy = SearchPolicy()) -> list[list[int]]:
     """For each score the others that these data cannot distinguish from it."""
     size = len(scores)
     found: list[list[int]] = [[] for _ in range(size)]
@@ -101,7 +100,7 @@ def classes(scores: Sequence[Score]) -> list[list[int]]:
             cosine = float(scores[i].contribution @ scores[j].contribution) / (
                 lengths[i] * lengths[j]
             )
-            if cosine > 0 and cosine**2 > SAME:
+            if cosine > 0 and cosine**2 > policy.same_cosine:
                 found[i].append(j)
                 found[j].append(i)
     return found

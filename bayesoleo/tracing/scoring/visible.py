@@ -25,7 +25,7 @@ SUSPECT = 1e-9
 CHANGE, REPEATS = 1e-9, 1e-3
 
 
-def without_round_off(
+def resolved_sensitivities(
     run: RunPredictor, p: Array, samples: Samples, changed: Sequence[int]
 ) -> Array:
     """Derivatives of the outputs, zero where they are round-off.

@@ -17,15 +17,9 @@ from bayesoleo._types import Array
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.projection import coefficients
 
-#: A direction of which the present parameters can do all but this part is theirs.
-OWN = 0.03
-#: A spline that moves the outputs by less than this part of what the strongest does is not visible;
-#: combinations of visible ones that move them by less, squared, are no directions of their own.
-VISIBLE, DISTINCT = 0.03, 1e-4
-
 
 @dataclass(frozen=True)
-class Known:
+class CurveDirections:
     """What of a function the data know beside the present parameters.
 
     Parameters
@@ -46,7 +40,7 @@ class Known:
     fall: float
 
 
-def known_beside(base: Base, own: Array, cross: Array, score: Array) -> Known | None:
+def known_beside(base: Base, own: Array, cross: Array, score: Array) -> CurveDirections | None:
     """Take out what is not visible, and what the present parameters can do.
 
     In coordinates in which ``C' W C`` is one, the eigenvalues of ``C_perp' W C_perp`` are the parts
@@ -65,23 +59,24 @@ def known_beside(base: Base, own: Array, cross: Array, score: Array) -> Known | 
 
     Returns
     -------
-    Known or None
+    CurveDirections or None
         None where nothing is visible, or nothing is left beside the present parameters.
     """
+    policy = base.policy
     project = coefficients(base.gram, cross)
     information = own - cross.T @ project
     rest = score - project.T @ base.gradient
     size = np.sqrt(np.clip(np.diag(own), 0.0, None))
-    seen = size > VISIBLE * size.max(initial=0.0)
+    seen = size > policy.resolved_spline * size.max(initial=0.0)
     if not seen.any() or not np.isfinite(information).all():
         return None
     scaled = own[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
     values, vectors = np.linalg.eigh(scaled)
-    clear = values > DISTINCT * values.max()
+    clear = values > policy.distinct_spline * values.max()
     unit = (vectors[:, clear] / np.sqrt(values[clear])) / size[seen][:, None]
     inner = unit.T @ information[np.ix_(seen, seen)] @ unit
     parts, turned = np.linalg.eigh(0.5 * (inner + inner.T))
-    free = parts > OWN
+    free = parts > policy.own_direction
     if not free.any():
         return None
     directions = unit @ turned[:, free]
@@ -93,7 +88,7 @@ def known_beside(base: Base, own: Array, cross: Array, score: Array) -> Known | 
     full[seen] = weights
     everything = np.zeros(own.shape[0])
     everything[seen] = found
-    return Known(full, found[chosen], everything, float(pull @ (pull / parts[free])))
+    return CurveDirections(full, found[chosen], everything, float(pull @ (pull / parts[free])))
 
 
 def _weights(directions: Array, own: Array) -> tuple[Array, NDArray[np.int64]]:

@@ -34,7 +34,7 @@ Courses = Callable[[Array], Array]
 TOGETHER = 36
 #: Step in phase for derivatives of a course.
 NEARBY = 1e-6
-_AMPLITUDE, _INPUT = "unnamed_amplitude_", "unnamed_course_"
+_AMPLITUDE, _INPUT = "nonparametric_amplitude_", "nonparametric_course_"
 
 
 class _Course:
@@ -137,7 +137,7 @@ def _with_terms(native: Model, target: str) -> Model:
     amplitudes = {f"{_AMPLITUDE}{k}": Parameter(0.0, sd=1.0) for k in range(TOGETHER)}
     total = sp.Add(*(symbol(a) * symbol(u) for a, u in zip(amplitudes, inputs, strict=True)))
     extended = replace(native, inputs={**native.inputs, **inputs}).with_parameters(**amplitudes)
-    return extended.with_term(place.kind, place.target, "unnamed_courses", place.sign * total)
+    return extended.with_term(place.kind, place.target, "nonparametric_courses", place.sign * total)
 
 
 def _shifted(courses: _Remembered, first: int) -> _Remembered:

@@ -21,15 +21,13 @@ from bayesoleo.prediction.run import RunPredictor
 from bayesoleo.tracing.fitting.assembly import Assembly
 from bayesoleo.tracing.fitting.fit import Fit
 
-#: Two quantities whose ranks agree to this are one and the same to a smooth function of either.
-ALIKE = 0.9995
 #: A quantity whose range is a smaller part of its size does not move.
 MOVES = 1e-6
 _PREFIX = "quantity_"
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ModelQuantity:
     """Something of a model that varies in time.
 
     Parameters
@@ -44,7 +42,7 @@ class Quantity:
     unit: str
 
 
-def quantities_of(model: Model) -> list[Quantity]:
+def quantities_of(model: Model) -> list[ModelQuantity]:
     """Positions and velocities, states of first order, and the definitions that move.
 
     Parameters
@@ -52,10 +50,10 @@ def quantities_of(model: Model) -> list[Quantity]:
     model : Model
         In its own drive.
     """
-    found: dict[str, Quantity] = {}
+    found: dict[str, ModelQuantity] = {}
 
     def add(name: str, expression: sp.Expr, unit: str) -> None:
-        found.setdefault(name, Quantity(name, expression, unit))
+        found.setdefault(name, ModelQuantity(name, expression, unit))
 
     for item in model.coordinates():
         unit = model.dofs[item.name].unit if item.name in model.dofs else model.inputs[item.name]
@@ -91,12 +89,12 @@ class Motions:
         The present model.
     assembly : Assembly
         It, with its drive.
-    quantities : sequence of Quantity
+    quantities : sequence of ModelQuantity
     """
 
-    def __init__(self, fit: Fit, assembly: Assembly, quantities: Sequence[Quantity]):
+    def __init__(self, fit: Fit, assembly: Assembly, quantities: Sequence[ModelQuantity]):
         self.fit = fit
-        self.quantities: list[Quantity] = []
+        self.quantities: list[ModelQuantity] = []
         self._functions = []
         for item in quantities:
             expression = _driven(assembly, item)
@@ -141,6 +139,7 @@ class Motions:
         """
         found: list[tuple[int, Axis]] = []
         kept: list[Array] = []
+        same = self.fit.policy.equal_ranks
         records = self.fit.records
         for k, item in enumerate(self.quantities):
             parts = [self.at(r, k, record.position) for r, record in enumerate(records)]
@@ -149,7 +148,7 @@ class Motions:
                 continue
             if np.ptp(values) <= MOVES * np.abs(values).max():
                 continue
-            if any(_alike(values, other) for other in kept):
+            if any(_rank_correlation(values, other) > same for other in kept):
                 continue
             kept.append(values)
             axis = Axis.covering(item.name, item.expression, item.unit, values)
@@ -171,11 +170,11 @@ def ranges(fit: Fit, assembly: Assembly, model: Model) -> dict[str, Axis]:
     return {axis.name: axis for _, axis in Motions(fit, assembly, quantities_of(model)).axes({})}
 
 
-def _alike(values: Array, other: Array) -> bool:
-    return bool(abs(stats.spearmanr(values, other).statistic) > ALIKE)
+def _rank_correlation(values: Array, other: Array) -> float:
+    return float(abs(stats.spearmanr(values, other).statistic))
 
 
-def _driven(assembly: Assembly, item: Quantity) -> sp.Expr | None:
+def _driven(assembly: Assembly, item: ModelQuantity) -> sp.Expr | None:
     """A quantity in the names of the driven model: as an output, it is rewritten with the rest."""
     name = f"{_PREFIX}{item.name}".replace(" ", "_")
     native = assembly.native

@@ -24,21 +24,15 @@ from bayesoleo.errors import ModelError
 from bayesoleo.parallel import thread_map
 from bayesoleo.solvers.status import Status
 from bayesoleo.tracing.fitting.assembly import Assembly
+from bayesoleo.tracing.policy import SearchPolicy
 from bayesoleo.tracing.scoring.base import Base
 from bayesoleo.tracing.scoring.colour import inflation_of
 from bayesoleo.tracing.scoring.projection import coefficients
 from bayesoleo.tracing.scoring.score import Score
-from bayesoleo.tracing.unnamed.directions import Known, known_beside
+from bayesoleo.tracing.unnamed.directions import CurveDirections, known_beside
 from bayesoleo.tracing.unnamed.forcing import Forced
 from bayesoleo.tracing.unnamed.quantities import Motions, quantities_of
 
-#: Pieces of the range of one quantity, and of each of two; each number divides the last, so that
-#: the splines of all are sums of the finest.
-PIECES, PIECES_OF_TWO = (2, 4, 8, 16, 32, 64), (2, 4)
-#: Probability with which noise alone may ask for finer pieces.
-FINER = 0.01
-#: How many of the best single quantities are paired with every other.
-PAIRED = 1
 #: Samples at which splines of one fineness are expressed in those of another.
 _DENSE = 400
 UNIT = Axis("", sp.Integer(0), "", 0.0, 1.0)
@@ -117,15 +111,17 @@ class Tried:
 
 
 @dataclass(frozen=True)
-class Search:
+class CurveSearch:
     """Everything that was tried, the best first.
 
     Parameters
     ----------
     tried : tuple of Tried
+    policy : SearchPolicy
     """
 
     tried: tuple[Tried, ...]
+    policy: SearchPolicy = SearchPolicy()
 
     @property
     def p_value(self) -> float:
@@ -141,7 +137,8 @@ class Search:
         groups: dict[tuple[str, ...], list[Tried]] = {}
         for item in self.tried:
             groups.setdefault(item.key, []).append(item)
-        return tuple(_refined(group) for group in list(groups.values())[:most])
+        finer = self.policy.finer
+        return tuple(_refined(group, finer) for group in list(groups.values())[:most])
 
     def finenesses(self, item: Tried) -> tuple[Tried, ...]:
         """A function of the same quantities in the same balance with any number of pieces, the
@@ -150,14 +147,14 @@ class Search:
         return tuple(sorted(group, key=lambda one: one.pieces))
 
 
-def _refined(group: Sequence[Tried]) -> Tried:
+def _refined(group: Sequence[Tried], level: float) -> Tried:
     """The surest of several finenesses, or finer."""
     chosen = group[0]
     for finer in sorted(group, key=lambda item: item.pieces):
         more = finer.rank - chosen.rank
         if finer.pieces > chosen.pieces and more > 0:
             fall = (finer.fall - chosen.fall) / max(chosen.inflation, finer.inflation)
-            if stats.chi2.sf(fall, more) < FINER:
+            if stats.chi2.sf(fall, more) < level:
                 chosen = finer
     return chosen
 
@@ -175,7 +172,7 @@ def corrected(item: Tried, tests: int) -> float:
 
 def search(
     base: Base, assembly: Assembly, jobs: int | None = None, also: Mapping[str, Axis] | None = None
-) -> Search:
+) -> CurveSearch:
     """Try smooth functions of the model's quantities in all of its balances.
 
     Parameters
@@ -191,7 +188,7 @@ def search(
 
     Returns
     -------
-    Search
+    CurveSearch
         Empty where no quantity moves, or no balance can be solved with a term added.
     """
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
@@ -203,17 +200,17 @@ def search(
         except ModelError:
             continue  # nothing is left to solve for with a term there
     single = [(target, (item,)) for target in forced for item in axes]
-    found = _all(base, motions, forced, single, PIECES, jobs)
+    found = _all(base, motions, forced, single, base.policy.pieces, jobs)
     pairs = [
         (best.target, (item, other))
-        for best in found[:PAIRED]
+        for best in found[: base.policy.paired]
         for item in axes
         if item[1] is best.axes[0]
         for other in axes
         if other is not item
     ]
-    found += _all(base, motions, forced, pairs, PIECES_OF_TWO, jobs)
-    return Search(tuple(sorted(found, key=lambda item: item.log_p)))
+    found += _all(base, motions, forced, pairs, base.policy.pieces_of_two, jobs)
+    return CurveSearch(tuple(sorted(found, key=lambda item: item.log_p)), base.policy)
 
 
 Place = tuple[str, tuple[tuple[int, Axis], ...]]
@@ -281,7 +278,7 @@ def _judged(
     pieces: int,
     columns: Sequence[Array],
     coarse: Array,
-    found: Known,
+    found: CurveDirections,
 ) -> Tried:
     """How likely noise alone would explain as much."""
     fine = coarse @ found.coefficients
@@ -313,7 +310,7 @@ def closest(
     Parameters
     ----------
     contribution : ndarray
-        Of the unnamed effect.
+        Of the nonparametric effect.
     scores : sequence of Score
         Of the named ones, against the same base.
     most : int
