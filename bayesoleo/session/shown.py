@@ -92,7 +92,7 @@ class Result(LabelledResult):
 
     def plot(self, **options: Any) -> Figure:
         """The figure; options are those of the function of this name in :mod:`bayesoleo.plots`."""
-        draw = getattr(figures, self.kind, None) or getattr(plots, self.kind)
+        draw = figures.prediction if self.kind == "prediction" else getattr(plots, self.kind)
         figure: Figure = draw(self.data if self.source is None else self.source, **options)
         return figure
 
