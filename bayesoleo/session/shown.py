@@ -92,8 +92,9 @@ class Result(LabelledResult):
 
     def plot(self, **options: Any) -> Figure:
         """The figure; options are those of the function of this name in :mod:`bayesoleo.plots`."""
+        shown: Any = self.data if self.source is None else self.source
         draw = figures.prediction if self.kind == "prediction" else getattr(plots, self.kind)
-        figure: Figure = draw(self.data if self.source is None else self.source, **options)
+        figure: Figure = draw(shown, **options)
         return figure
 
     def _repr_html_(self) -> str:
