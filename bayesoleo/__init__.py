@@ -16,20 +16,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from bayesoleo._session.campaign import Campaign as Campaign, load_campaign as load_campaign
+    from bayesoleo._session.problem import Problem as Problem
+    from bayesoleo._session.results import (
+        Explanation as Explanation,
+        Fit as Fit,
+        Posterior as Posterior,
+        load_result as load_result,
+    )
+    from bayesoleo._workflow.model_files import load_model as load_model
+    from bayesoleo._workflow.settings import Settings as Settings
     from bayesoleo.data import write_campaign as write_campaign
-    from bayesoleo.model import Model as Model
-    from bayesoleo.model import Output as Output
-    from bayesoleo.model import Parameter as Parameter
-    from bayesoleo.modelfile import load_model as load_model
-    from bayesoleo.session import Campaign as Campaign
-    from bayesoleo.session import Explanation as Explanation
-    from bayesoleo.session import Fit as Fit
-    from bayesoleo.session import Posterior as Posterior
-    from bayesoleo.session import Problem as Problem
-    from bayesoleo.session import load_campaign as load_campaign
-    from bayesoleo.session import load_result as load_result
+    from bayesoleo.model import Model as Model, Output as Output, Parameter as Parameter
     from bayesoleo.systems import system as system
-    from bayesoleo.workflow import Settings as Settings
 
     __version__: str
 
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "data": ("write_campaign",),
     "model": ("Model", "Output", "Parameter"),
-    "modelfile": ("load_model",),
-    "session": (
+    "_workflow.model_files": ("load_model",),
+    "_session": (
         "Campaign",
         "Explanation",
         "Fit",
@@ -48,28 +47,24 @@ _HOMES = {
         "load_result",
     ),
     "systems": ("system",),
-    "workflow": ("Settings",),
+    "_workflow": ("Settings",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 #: Subpackages that are there without an import of their own, as ``bayesoleo.plots``.
 _SUBPACKAGES = (
     "assessment",
     "data",
+    "discovery",
     "effects",
+    "error_models",
     "errors",
     "estimation",
-    "forecast",
     "model",
     "plots",
     "posterior",
-    "report",
-    "schema",
-    "session",
+    "prediction",
     "solvers",
-    "storage",
     "systems",
-    "tracing",
-    "workflow",
 )
 
 __all__ = [*sorted(_HOME), "__version__"]

@@ -1,6 +1,8 @@
 """``python -m bayesoleo`` is the command line."""
 
-from bayesoleo.cli import main
+from __future__ import annotations
+
+from bayesoleo._cli import main
 
 if __name__ == "__main__":
     main()

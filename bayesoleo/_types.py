@@ -12,10 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool as Bool
-from jaxtyping import Complex as Complex
-from jaxtyping import Float as Float
-from jaxtyping import Int as Int
+from jaxtyping import Bool as Bool, Complex as Complex, Float as Float, Int as Int
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

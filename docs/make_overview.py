@@ -15,7 +15,7 @@ from PIL import Image
 
 import bayesoleo
 from bayesoleo import plots
-from bayesoleo.demo import DEMO_SYSTEM, demo_campaign
+from bayesoleo._workflow.simulating import DEMO_SYSTEM, demo_campaign
 
 TARGET = Path(__file__).resolve().parent / "_static" / "overview.png"
 DPI = 110

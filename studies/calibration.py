@@ -28,19 +28,21 @@ import numpy as np
 from calibration_figures import MODELS, STORED
 from numpy.typing import NDArray
 
+from bayesoleo._dask import connected, each_done
+from bayesoleo._storage.resume import Slots
+from bayesoleo.error_models import error_model
 from bayesoleo.estimation import FunctionProblem
-from bayesoleo.machines import connected, each_done
-from bayesoleo.model.priors import Normal
+from bayesoleo.model import Normal
 from bayesoleo.posterior import (
+    DRAWS,
     LogDensity,
     Samples,
-    error_model,
     importance_sample,
     laplace_mixture,
+    rank_of,
+    sample as draw,
+    uniformity,
 )
-from bayesoleo.posterior import sample as draw
-from bayesoleo.posterior.outcome.calibration import DRAWS, rank_of, uniformity
-from bayesoleo.storage.slots import Slots
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray]

@@ -26,9 +26,8 @@ import calibration_oleo as campaign
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.error_models.discrepancy import basis, spectrum
-from bayesoleo.posterior import LogDensity, importance_sample, laplace_mixture
-from bayesoleo.posterior import sample as draw
+from bayesoleo.error_models import basis, spectrum
+from bayesoleo.posterior import LogDensity, importance_sample, laplace_mixture, sample as draw
 
 Arrays = dict[str, NDArray]
 #: Ninety-per-cent intervals.

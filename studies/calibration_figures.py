@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesoleo.posterior.outcome.calibration import uniformity
+from bayesoleo.posterior import uniformity
 
 STORED = Path(__file__).resolve().parent / "tables"
 MODELS = ("independent", "correlated", "discrepancy", "shared-discrepancy")

@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from bayesoleo import Model, system
 from bayesoleo.effects import Scales, find_effect
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model import LogNormal, Normal, driven_by
-from bayesoleo.model.correlated import sample_of
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.systems.verbeek import SHAKER_RUNS
+from bayesoleo.estimation import CampaignProblem
+from bayesoleo.model import LogNormal, Normal, driven_by, sample_of
+from bayesoleo.prediction import Predictor, RunPlan, motion, record_of
+from bayesoleo.systems import SHAKER_RUNS
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo import system
 from bayesoleo.estimation import multiple_shooting
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.records import Record
+from bayesoleo.prediction import Record, transient_record
 
 SEEDS, SAMPLES = 50, 401
 #: Noise over the spread of each component, and how far off the parameters start at most.

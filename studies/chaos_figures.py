@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesoleo import system
-from bayesoleo.plots import style
+from bayesoleo.plots import _style as style
 
 COLOURS = dict(zip(chaos.CASES, ("#0072b2", "#56b4e9", "#009e73", "#e69f00"), strict=True))
 #: Width of the strip in which the fifty estimates of a case stand side by side.

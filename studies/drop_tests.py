@@ -13,15 +13,13 @@ import numpy as np
 
 import bayesoleo
 from bayesoleo import Model
+from bayesoleo.discovery import ModelFit, Numerics, fit_model
 from bayesoleo.estimation import PointEstimate, data_against_prior
 from bayesoleo.model import driven_by
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
-from bayesoleo.systems.drop import drop_test
-from bayesoleo.systems.verbeek import TABLE_6_7
-from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
+from bayesoleo.prediction import Predictor, Record
+from bayesoleo.systems import TABLE_6_7, drop_test
 
-Fits = Mapping[str, tuple[Fit, Model]]
+Fits = Mapping[str, tuple[ModelFit, Model]]
 
 #: Dropped masses, kg.
 MASSES = (350.0, 825.0)
@@ -126,7 +124,7 @@ def fitted(records: Sequence[Record], jobs: int | None = None) -> Fits:
     held = bayesoleo.system("f16n2d2")
     freed = held.freeing("orifice_damping")
 
-    def fit(model: Model, runs: Sequence[Record]) -> tuple[Fit, Model]:
+    def fit(model: Model, runs: Sequence[Record]) -> tuple[ModelFit, Model]:
         return fit_model(driven_by(model, "displacement"), runs, Numerics(jobs=jobs)), model
 
     return {

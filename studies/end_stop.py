@@ -11,14 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.orbits import PeriodicOrbits, periodic_orbit
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import solve_periodic
-from bayesoleo.solvers.shooting.shoot import solve_shooting
+from bayesoleo.model import kernels
+from bayesoleo.prediction import (
+    PeriodicOrbits,
+    RunPlan,
+    RunPredictor,
+    dynamics_of,
+    motion,
+    periodic_orbit,
+    record_of,
+)
+from bayesoleo.solvers import solve_from_guess, solve_periodic, solve_shooting
 from bayesoleo.systems import system
 
 Array = NDArray[np.float64]

@@ -28,10 +28,9 @@ from identification_rows import FACTORS, NONE
 from identification_sizes import NUMERICS, effects, limit, signs
 
 import bayesoleo
+from bayesoleo.discovery import Assembly, assign, close_loop
 from bayesoleo.model import Model, driven_by
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.loop import close_loop
-from bayesoleo.tracing.fitting import Assembly, assign
 
 REPLICATIONS, PLAIN = 5, 200
 #: Of the campaigns' order; each campaign is seeded by its name.

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from bayesoleo._workflow.simulating import to_simulated_run
 from bayesoleo.data import ReducedCampaign, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.model import Model
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
-from bayesoleo.simulation import to_simulated_run
+from bayesoleo.prediction import RunPlan, motion, simulate_run
 
 SYSTEM, DRIVE = "f16n2d2", "displacement"
 NOISE = {"displacement": 5e-5, "force": 20.0, "pressure": 5e3}

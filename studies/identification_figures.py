@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from bayesoleo.effects import find_effect
-from bayesoleo.effects.effect import FAMILIES
-from bayesoleo.plots.style import AFTER, BEFORE, INK, SIMILAR
+from bayesoleo.effects import FAMILIES, find_effect
+from bayesoleo.plots import AFTER, BEFORE, INK, SIMILAR
 
 NOTHING = "nothing"
 #: Outcomes by class, from best to worst, with the colour of each.

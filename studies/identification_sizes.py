@@ -21,16 +21,23 @@ from identification_rows import FACTORS
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
+from bayesoleo.discovery import (
+    Assembly,
+    Numerics,
+    Option,
+    Score,
+    SearchPolicy,
+    State,
+    assign,
+    effective_tests,
+    fit_state,
+    scales_of,
+    score_all,
+    without_twins,
+)
 from bayesoleo.effects import Effect, force_effect
 from bayesoleo.model import driven_by
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting import Assembly, Numerics, assign
-from bayesoleo.tracing.fitting.assembly import Option
-from bayesoleo.tracing.policy import SearchPolicy
-from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import Score, score_all
-from bayesoleo.tracing.scoring.significance import effective_tests, without_twins
 
 NUMERICS = Numerics(jobs=1, backend="numpy")
 #: Of the motion that limits come from.

@@ -26,11 +26,11 @@ from matplotlib.figure import Figure
 from numpy.polynomial import chebyshev
 
 import bayesoleo
-from bayesoleo import workflow
-from bayesoleo.effects.titles import called
-from bayesoleo.plots import style
-from bayesoleo.plots.units import format_number
-from bayesoleo.tracing.deciding.state import State, fit_state
+import bayesoleo._workflow
+from bayesoleo import _workflow as workflow
+from bayesoleo.discovery import State, fit_state
+from bayesoleo.effects import called
+from bayesoleo.plots import _style as style, format_number
 
 OUTPUT = "force"
 #: Degrees of the surface, thresholds of SINDy for columns of unit norm in noise units, points
@@ -305,9 +305,8 @@ def with_process(fitted, held_out) -> Found:
 
 def with_close(task, state: State) -> Found:
     """The closed loop, without sampling."""
-    from bayesoleo.workflow.closing import run_loop
-    from bayesoleo.workflow.output import ResultFolder
-    from bayesoleo.workflow.stages import Stages
+    from bayesoleo._workflow.closing import run_loop
+    from bayesoleo._workflow.output import ResultFolder, Stages
 
     start = time.process_time()
     stages = Stages()

@@ -16,11 +16,12 @@ import numpy as np
 import xarray as xr
 
 import bayesoleo
+import bayesoleo._workflow
 from bayesoleo import Model, Parameter
 from bayesoleo.data import ReducedCampaign
+from bayesoleo.discovery import ModelFit, Numerics, fit_model
 from bayesoleo.errors import InputError
 from bayesoleo.model import driven_by
-from bayesoleo.tracing.fitting.fit import Fit, Numerics, fit_model
 
 #: Models by physics and variant; ``thesis`` leaves theta_4 and theta_6 unlinked.
 MODELS = {
@@ -111,7 +112,8 @@ class Shaker:
         if root is None:
             raise InputError("BAYESOLEO_DATA is not set", hint="name the folder with campaigns/")
         return cls(
-            bayesoleo.workflow.reduce(Path(root) / "campaigns" / "shaker-plain", jobs=jobs), jobs
+            bayesoleo._workflow.task.reduce(Path(root) / "campaigns" / "shaker-plain", jobs=jobs),
+            jobs,
         )
 
     @property
@@ -155,7 +157,7 @@ class Shaker:
     def each(self, physics: str, variant: str, drive: str) -> xr.Dataset:
         """Estimates of each run."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive=drive)
-        return bayesoleo.workflow.estimate_each(
+        return bayesoleo._workflow.estimating.estimate_each(
             self.reduced, self.model(physics, variant), settings
         )
 
@@ -164,10 +166,10 @@ class Shaker:
         """Table 6.5 by force with the friction of the thesis's tables C.1 and D.1."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive="force")
         model = bayesoleo.system(MODELS["thermo-mechanical", "thesis"])
-        return bayesoleo.workflow.estimate_each(self.reduced, model, settings)
+        return bayesoleo._workflow.estimating.estimate_each(self.reduced, model, settings)
 
     @cache  # noqa: B019
-    def joint(self, physics: str, variant: str, drive: str) -> Fit:
+    def joint(self, physics: str, variant: str, drive: str) -> ModelFit:
         """Estimate from all runs."""
         return self._fit(self.model(physics, variant), drive)
 
@@ -187,7 +189,7 @@ class Shaker:
             coords={"run": self.runs},
         )
 
-    def _fit(self, model: Model, drive: str) -> Fit:
+    def _fit(self, model: Model, drive: str) -> ModelFit:
         driven = model if drive in model.inputs else driven_by(model, drive)
         return fit_model(driven, self.reduced.records, Numerics(jobs=self.jobs))
 

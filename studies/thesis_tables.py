@@ -13,12 +13,13 @@ import numpy as np
 import xarray as xr
 
 import bayesoleo
+import bayesoleo._workflow
 from bayesoleo import Model
 from bayesoleo.data import SimulatedRun, write_campaign
 from bayesoleo.errors import InputError
 from bayesoleo.model import driven_by
-from bayesoleo.prediction.simulate import RunPlan, Simulation, motion, simulate_run
-from bayesoleo.systems.verbeek import SHAKER_RUNS, TABLE_6_2, TABLE_6_5, ShakerRun
+from bayesoleo.prediction import RunPlan, Simulation, motion, simulate_run
+from bayesoleo.systems import SHAKER_RUNS, TABLE_6_2, TABLE_6_5, ShakerRun
 
 #: The rig's limit, Pa gauge (Verbeek 1993, chapter 5).
 RIG = 69e5
@@ -76,7 +77,9 @@ def table_6_5_to_6_2(variant: str, jobs: int | None = None) -> xr.Dataset:
         channels = {"force": ("F", "N"), "displacement": ("q", "m")}
         write_campaign(path, name="table 6.5", channels=channels, runs=runs)
         settings = bayesoleo.Settings(drive="model", steps=1024, jobs=jobs)
-        each = bayesoleo.workflow.estimate_each(path, bayesoleo.system("f16n1d1_thesis"), settings)
+        each = bayesoleo._workflow.estimating.estimate_each(
+            path, bayesoleo.system("f16n1d1_thesis"), settings
+        )
     highest = [float(made[run].samples["pressure"].max()) for run in each.run.values]
     each["pressure"] = ("run", highest)
     each.attrs["no_orbit"] = failed

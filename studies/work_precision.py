@@ -14,15 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo.model import Model
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.prediction.solver import periodic_problem
-from bayesoleo.solvers.adaptive.refine import solve_adaptive
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.shooting.shoot import solve_shooting
+from bayesoleo.model import Model, kernels
+from bayesoleo.prediction import (
+    RunPlan,
+    RunPredictor,
+    dynamics_of,
+    motion,
+    periodic_problem,
+    record_of,
+)
+from bayesoleo.solvers import solve_adaptive, solve_from_guess, solve_shooting
 from bayesoleo.systems import system
 
 Array = NDArray[np.float64]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesoleo.data import load_campaign, periodic_average, reduce_campaign
-from bayesoleo.demo import (
+from bayesoleo._workflow.simulating import (
     DEMO_EFFECT,
     DEMO_SYSTEM,
     DEMO_TRUTH,
@@ -15,9 +14,10 @@ from bayesoleo.demo import (
     demo_campaign,
     true_model,
 )
+from bayesoleo.data import load_campaign, periodic_average, reduce_campaign
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import driven_by
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.systems import system
 
 

@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
-from bayesoleo import machines, parallel
+from bayesoleo import _dask as machines, _parallel as parallel
+from bayesoleo._dask import WorkerPool, connected, each_done
+from bayesoleo._storage.resume import Slots
 from bayesoleo.errors import InputError, ResultsError
-from bayesoleo.machines import WorkerPool, connected, each_done
-from bayesoleo.storage.slots import Slots
 
 
 class Counting:

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
+from bayesoleo._dask import connected
+from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.data import dataset_folder
-from bayesoleo.data.files import read_columns
-from bayesoleo.data.registry import VARIABLE
+from bayesoleo.data._files import read_columns
+from bayesoleo.data._registry import VARIABLE
 from bayesoleo.errors import BayesoleoError, MissingExtraError
-from bayesoleo.machines import connected
-from bayesoleo.storage import read_tree, write_tree
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 EXTRAS = {"dask": "distributed", "data": "pooch", "parquet": "pyarrow", "zarr": "zarr"}

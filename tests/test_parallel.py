@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from bayesoleo.parallel import thread_map
+from bayesoleo._parallel import thread_map
 
 
 def test_results_keep_the_order_of_the_items():

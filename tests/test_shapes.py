@@ -16,10 +16,10 @@ from shapes import check_shapes, declared
 
 import bayesoleo
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity, laplace_mixture, sample
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of, simulate_run
 from bayesoleo.systems import system
 
 

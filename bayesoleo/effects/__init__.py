@@ -10,23 +10,6 @@ A catalogue effect, and one of your own:
 'drag'
 """
 
-from bayesoleo.effects.catalogue import candidates, catalogue, describe, find_effect
-from bayesoleo.effects.effect import FAMILIES, Candidate, Effect
-from bayesoleo.effects.force_effect import InternalState, force_effect
-from bayesoleo.effects.parts import Amplitude, Constant, Scales, ShapeParameter
+import lazy_loader
 
-__all__ = [
-    "FAMILIES",
-    "Amplitude",
-    "Candidate",
-    "Constant",
-    "Effect",
-    "InternalState",
-    "Scales",
-    "ShapeParameter",
-    "candidates",
-    "catalogue",
-    "describe",
-    "find_effect",
-    "force_effect",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
 """Periodic solutions of implicit differential equations; this layer knows no model."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,22 +18,24 @@ from pathlib import Path
 from rich.console import Console
 
 import bayesoleo
+import bayesoleo._report
+import bayesoleo._workflow
 from bayesoleo import plots
-from bayesoleo.demo import DEMO_EFFECT, DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
-from bayesoleo.effects.titles import called
+from bayesoleo._workflow.simulating import DEMO_EFFECT, DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
+from bayesoleo.effects import called
 
 folder = demo_campaign(Path(tempfile.mkdtemp()) / "campaign", seed=0)
 model = bayesoleo.system(DEMO_SYSTEM)
-for name, value in bayesoleo.workflow.check(folder, model).items():
+for name, value in bayesoleo._workflow.task.check(folder, model).items():
     print(f"{name:16} {value}")
 
 # %%
 # One call estimates the parameters, holds the residual against the noise, names what is missing,
 # adds it, samples the posterior and compares the error before and after.
 
-tree = bayesoleo.workflow.close(folder, model, bayesoleo.Settings(seed=0, quick=True))
+tree = bayesoleo._workflow.closing.close(folder, model, bayesoleo.Settings(seed=0, quick=True))
 summary = json.loads(tree.attrs["summary"])
-bayesoleo.report.print_summary(summary, Console(width=100))
+bayesoleo._report.terminal.print_summary(summary, Console(width=100))
 
 # %%
 # What the first round saw. Each bar is a candidate of the catalogue, scored without a refit by the

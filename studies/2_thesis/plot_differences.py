@@ -15,8 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from bayesoleo import Model, Parameter
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.prediction import RunPlan, motion, periodic_orbit
 
 model = Model(
     "friction oscillator",

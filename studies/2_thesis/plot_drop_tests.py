@@ -16,10 +16,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo
-from bayesoleo.plots.stored import Study
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.systems.drop import drop_test
+from bayesoleo.plots import Study
+from bayesoleo.prediction import Predictor, transient_record
+from bayesoleo.systems import drop_test
 
 NEEDS = ("drop_tests", "shaker_tables")
 study = Study("drop_tests", data="campaigns/shaker-plain", slow=True, needs=NEEDS)

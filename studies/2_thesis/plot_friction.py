@@ -18,7 +18,7 @@ import numpy as np
 
 import bayesoleo
 from bayesoleo import Parameter
-from bayesoleo.plots.stored import Study
+from bayesoleo.plots import Study
 
 amplitude = Parameter(100.0, "N", relative_sd=1.0, by_run=True)
 model = (

@@ -17,16 +17,8 @@ what the data say. This page repeats the numerical experiment of Verbeek (1993),
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bayesoleo.estimation import (
-    FunctionProblem,
-    estimate,
-    log_likelihood,
-    log_posterior,
-    log_prior,
-    multistart,
-    output_counts,
-    staged_variance,
-)
+from bayesoleo.error_models import log_likelihood, output_counts, staged_variance
+from bayesoleo.estimation import FunctionProblem, estimate, log_posterior, log_prior, multistart
 from bayesoleo.model import Normal
 
 position = np.linspace(0.0, 0.9, 100)

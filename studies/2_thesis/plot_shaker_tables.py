@@ -18,7 +18,7 @@ tests/benchmarks/tables.py --table 6.2 6.3 6.5 6.6 6.7 findings``, with ``--vari
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bayesoleo.plots.stored import Study
+from bayesoleo.plots import Study
 
 PHYSICS = ("mechanical", "thermo-mechanical")
 study = Study("shaker_tables", data="campaigns/shaker-plain", slow=True, needs=("shaker_tables",))

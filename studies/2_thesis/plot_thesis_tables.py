@@ -18,8 +18,8 @@ to that, and out comes table 6.2, if the print is right.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bayesoleo.plots.stored import Study
-from bayesoleo.systems.verbeek import SHAKER_RUNS, TABLE_6_2
+from bayesoleo.plots import Study
+from bayesoleo.systems import SHAKER_RUNS, TABLE_6_2
 
 VARIANTS = ("printed sign, θ5 = 1603", "printed sign, θ5 = 1740", "physical sign, θ5 = 1742")
 for variant in VARIANTS:

@@ -23,7 +23,7 @@ computed anew.
 # %%
 # The table is that of the command it names; where it is not finished, it is an even sample.
 
-from bayesoleo.plots.stored import Study
+from bayesoleo.plots import Study
 
 study = Study("identification", needs=("identification_figures", "identification_rows"))
 figures, campaigns = study.helper("identification_figures"), study.helper("identification_rows")

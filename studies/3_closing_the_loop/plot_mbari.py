@@ -18,10 +18,11 @@ import matplotlib.pyplot as plt
 from rich.console import Console
 
 import bayesoleo
+import bayesoleo._report
+import bayesoleo._workflow
 from bayesoleo import plots
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.plots.stored import Study
-from bayesoleo.report.before_after import print_before_after
+from bayesoleo.plots import Study, print_before_after
 
 PSI = 6894.757
 # Bore 5 in less a rod of 1.5 in; the stroke grows as the chamber shrinks.
@@ -51,14 +52,14 @@ study = Study("mbari", data="measured/mbari_gas_spring", slow=True)
 
 def closed(start, **options):
     """The loop from a model, and its summary."""
-    found = bayesoleo.workflow.close(
+    found = bayesoleo._workflow.closing.close(
         study.campaign, start, bayesoleo.Settings(seed=0, quick=True, **options)
     )
     return found, json.loads(found.attrs["summary"])
 
 
 tree, summary = study.run(lambda: closed(model)) or (None, None)
-study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo._report.terminal.print_summary(summary, Console(width=100)))
 
 # %%
 # What the first round saw. Friction with memory draws a loop too, and explains four fifths; a gas

@@ -17,11 +17,12 @@ import numpy as np
 from rich.console import Console
 
 import bayesoleo
+import bayesoleo._report
+import bayesoleo._workflow
 from bayesoleo import plots
-from bayesoleo.effects.titles import called
+from bayesoleo.effects import called
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.plots.stored import Study
-from bayesoleo.report.before_after import print_before_after
+from bayesoleo.plots import Study, print_before_after
 
 model = Model(
     "viscous damper",
@@ -37,10 +38,12 @@ model = Model(
 study = Study("mr_damper", data="measured/mr_damper")
 
 tree = study.run(
-    lambda: bayesoleo.workflow.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
+    lambda: bayesoleo._workflow.closing.close(
+        study.campaign, model, bayesoleo.Settings(seed=0, quick=True)
+    )
 )
 summary = tree and json.loads(tree.attrs["summary"])
-study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo._report.terminal.print_summary(summary, Console(width=100)))
 
 # %%
 # What the first round saw. The friction models with memory are a class: with one amplitude of the

@@ -26,7 +26,7 @@ the same residual as the closed loop, and is judged on the same runs that were n
 # one where nothing is left.
 
 import bayesoleo
-from bayesoleo.plots.stored import Study
+from bayesoleo.plots import Study
 
 print(bayesoleo.system("f16n2d2").name, "and what it lacks")
 

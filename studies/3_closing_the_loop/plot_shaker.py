@@ -18,20 +18,24 @@ import json
 from rich.console import Console
 
 import bayesoleo
+import bayesoleo._report
+import bayesoleo._workflow
 from bayesoleo import plots
-from bayesoleo.plots.stored import Study
+from bayesoleo.plots import Study
 
 complete = Study("shaker_f16n2d2", data="campaigns/shaker-plain")
 
 
 def show(tree):
     """Verdict, errors and effects."""
-    bayesoleo.report.print_summary(json.loads(tree.attrs["summary"]), Console(width=100))
+    bayesoleo._report.terminal.print_summary(json.loads(tree.attrs["summary"]), Console(width=100))
 
 
 settings = bayesoleo.Settings(seed=0, quick=True)
 tree = complete.run(
-    lambda: bayesoleo.workflow.trace(complete.folder, bayesoleo.system("f16n2d2"), settings)
+    lambda: bayesoleo._workflow.closing.trace(
+        complete.folder, bayesoleo.system("f16n2d2"), settings
+    )
 )
 complete.text("summary", lambda: show(tree))
 
@@ -50,7 +54,9 @@ errors = complete.figure("error", lambda: plots.error(tree))
 
 polytropic = Study("shaker_f16n1d2", data="campaigns/shaker-plain", slow=True)
 found = polytropic.run(
-    lambda: bayesoleo.workflow.close(polytropic.folder, bayesoleo.system("f16n1d2"), settings)
+    lambda: bayesoleo._workflow.closing.close(
+        polytropic.folder, bayesoleo.system("f16n1d2"), settings
+    )
 )
 polytropic.text("summary", lambda: show(found))
 
@@ -68,7 +74,7 @@ pressure = polytropic.figure("residual", lambda: plots.residual(found, "pressure
 driven = Study("shaker_f16n2d1", data="campaigns/shaker-plain", slow=True)
 own = bayesoleo.Settings(seed=0, quick=True, drive="model")
 forced = driven.run(
-    lambda: bayesoleo.workflow.close(driven.folder, bayesoleo.system("f16n2d1"), own)
+    lambda: bayesoleo._workflow.closing.close(driven.folder, bayesoleo.system("f16n2d1"), own)
 )
 driven.text("summary", lambda: show(forced))
 

@@ -18,10 +18,11 @@ import numpy as np
 from rich.console import Console
 
 import bayesoleo
-from bayesoleo.effects.titles import called
+import bayesoleo._report
+import bayesoleo._workflow
+from bayesoleo.effects import called
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.plots.stored import Study
-from bayesoleo.report.before_after import print_before_after
+from bayesoleo.plots import Study, print_before_after
 
 model = Model(
     "linear circuit",
@@ -50,10 +51,12 @@ for line in bayesoleo.systems.equations(model).values():
 # Closing the loop.
 
 tree = study.run(
-    lambda: bayesoleo.workflow.close(study.campaign, model, bayesoleo.Settings(seed=0, quick=True))
+    lambda: bayesoleo._workflow.closing.close(
+        study.campaign, model, bayesoleo.Settings(seed=0, quick=True)
+    )
 )
 summary = tree and json.loads(tree.attrs["summary"])
-study.text("summary", lambda: bayesoleo.report.print_summary(summary, Console(width=100)))
+study.text("summary", lambda: bayesoleo._report.terminal.print_summary(summary, Console(width=100)))
 
 # %%
 # Round by round, on the block that was not used for fitting. The cubic spring comes first and takes

@@ -19,8 +19,8 @@ from scipy.integrate import solve_ivp
 import bayesoleo
 from bayesoleo import plots
 from bayesoleo.estimation import multiple_shooting
-from bayesoleo.plots.stored import Study
-from bayesoleo.prediction.arrays import transient_record
+from bayesoleo.plots import Study
+from bayesoleo.prediction import transient_record
 
 
 def lorenz(_, state, sigma=10.0, rho=28.0, beta=8 / 3):

@@ -19,13 +19,9 @@ import numpy as np
 
 import bayesoleo
 from bayesoleo import plots
-from bayesoleo.data.harmonics import significant_harmonics
-from bayesoleo.data.transforms import HarmonicBasis
-from bayesoleo.estimation import estimate
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.prediction.branch import follow_branch
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.data import HarmonicBasis, significant_harmonics
+from bayesoleo.estimation import CampaignProblem, estimate
+from bayesoleo.prediction import Predictor, RunPlan, follow_branch, motion, record_of
 
 model = bayesoleo.system("duffing")
 plan = RunPlan("sweep", 1.0, {"force": motion(0.0, [6.0])})

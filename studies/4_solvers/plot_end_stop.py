@@ -16,7 +16,7 @@ its own steps. This page has it.
 
 # %%
 # The contact lasts :math:`\pi/\sqrt{\theta}`: at :math:`10^{11}` a hundred-thousandth of a period.
-# The solver ``adaptive`` of :func:`~bayesoleo.prediction.orbits.periodic_orbit` places steps by an
+# The solver ``adaptive`` of :func:`~bayesoleo.prediction._orbits.periodic_orbit` places steps by an
 # estimate of their error, with edges on the ends of the contact, and walks up the stiffness where a
 # direct solution fails.
 
@@ -24,10 +24,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo
-from bayesoleo.plots import style
-from bayesoleo.plots.stored import Study
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.plots import Study, _style as style
+from bayesoleo.prediction import RunPlan, motion, periodic_orbit
 
 model = bayesoleo.system("end_stop")
 plan = RunPlan("end stop", 1.0, {"force": motion(23.0, [20.0])})

@@ -19,9 +19,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo
-from bayesoleo.plots import style
-from bayesoleo.plots.stored import Study
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.plots import Study, _style as style
+from bayesoleo.prediction import RunPlan, motion
 
 model = bayesoleo.system("f16n2d1").with_values(
     {"friction_base": 0.0, "friction_per_pressure": 0.0}

@@ -21,10 +21,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from bayesoleo import Normal
+from bayesoleo.error_models import error_model
 from bayesoleo.estimation import FunctionProblem
-from bayesoleo.plots.stored import Study
-from bayesoleo.posterior import LogDensity, error_model, laplace_mixture, sample
-from bayesoleo.posterior.outcome.calibration import rank_of, uniformity
+from bayesoleo.plots import Study
+from bayesoleo.posterior import LogDensity, laplace_mixture, rank_of, sample, uniformity
 
 position = np.linspace(0.0, 0.9, 100)
 prior, log_variance_prior = Normal(1.0, 0.1), Normal(2 * np.log(0.0792), 0.5)

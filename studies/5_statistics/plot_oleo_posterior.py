@@ -20,9 +20,10 @@ import arviz as az
 import numpy as np
 
 import bayesoleo
+import bayesoleo._workflow
 from bayesoleo import plots
-from bayesoleo.demo import DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
-from bayesoleo.plots.stored import Study
+from bayesoleo._workflow.simulating import DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
+from bayesoleo.plots import Study
 
 campaign = demo_campaign(Path(tempfile.mkdtemp()) / "campaign", seed=0)
 model = bayesoleo.system(DEMO_SYSTEM)
@@ -30,7 +31,7 @@ model = bayesoleo.system(DEMO_SYSTEM)
 
 def sampled(error_model):
     """The result under one error model."""
-    return bayesoleo.workflow.sample(
+    return bayesoleo._workflow.estimating.sample(
         campaign, model, bayesoleo.Settings(seed=0, error_model=error_model, quick=True)
     )
 

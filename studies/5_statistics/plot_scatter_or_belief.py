@@ -20,7 +20,7 @@ from scipy import stats
 
 from bayesoleo.estimation import FunctionProblem, estimate, polish, sampling_distribution
 from bayesoleo.model import Normal
-from bayesoleo.plots import style
+from bayesoleo.plots import _style as style
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 
 NOISE, TRUTH = 0.005 * 10**1.2, 1.2

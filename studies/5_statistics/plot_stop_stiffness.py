@@ -23,7 +23,7 @@ from scipy.interpolate import make_interp_spline
 import bayesoleo
 from bayesoleo.estimation import FunctionProblem, estimate, polish
 from bayesoleo.model import LogNormal
-from bayesoleo.plots import style
+from bayesoleo.plots import _style as style
 from bayesoleo.posterior import (
     LogDensity,
     compare,
@@ -32,8 +32,7 @@ from bayesoleo.posterior import (
     sample,
     to_datasets,
 )
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.prediction import RunPlan, motion, periodic_orbit
 
 TRUTH, NOISE, PRIOR = 100.0, 0.01, LogNormal(200.0, 1.0)
 phase = np.arange(200) / 100

@@ -17,7 +17,7 @@ import xarray as xr
 
 from bayesoleo.estimation import FunctionProblem, multistart
 from bayesoleo.model import Normal
-from bayesoleo.plots import style
+from bayesoleo.plots import _style as style
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 
 TRUTH = 1.2

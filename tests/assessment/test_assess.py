@@ -9,13 +9,13 @@ import pytest
 import xarray as xr
 from small_campaigns import damper, damper_campaign, spring_damper_force, with_friction
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
 from bayesoleo.assessment import assess, score_draws, score_normal, series_of_tree
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model.priors import Normal
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.model._priors import Normal
+from bayesoleo.prediction._predictor import Predictor
 
 
 def fitted(folder, force, **options):

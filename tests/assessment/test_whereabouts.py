@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
 from bayesoleo.assessment import residual_breakdown
-from bayesoleo.assessment.whereabouts import ORDERS
+from bayesoleo.assessment._residual_breakdown import ORDERS
 from bayesoleo.errors import InputError
 
 RUNS, SAMPLES, PERIODS, PHASES, NOISE = 3, 1600, 4, 200, 0.5

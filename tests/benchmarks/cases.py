@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from measuring import PHASES, Array
 
+from bayesoleo._parallel import thread_map
 from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.model import Model
-from bayesoleo.parallel import thread_map
-from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.periodic.solve import Solution, solve_extrapolated
-from bayesoleo.solvers.shooting.shoot import solve_shooting
+from bayesoleo.prediction._inputs import dynamics_of
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._periodic import Solution, solve_extrapolated
+from bayesoleo.solvers._shooting import solve_shooting
 
 #: Parameter vectors in a batch, and their relative distance from the anchor.
 BATCH, SPREAD = 32, 0.01

@@ -17,13 +17,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesoleo._workflow.closing import close
+from bayesoleo._workflow.model_files import load_model
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare
 from bayesoleo.data import dataset_folder
+from bayesoleo.discovery._state import fit_state
 from bayesoleo.model import Parameter
-from bayesoleo.modelfile import load_model
-from bayesoleo.plots.rankings import chosen
+from bayesoleo.plots._discovery import chosen
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.state import fit_state
-from bayesoleo.workflow import Settings, close, prepare
 
 MEASURED = Path(__file__).parents[2] / "studies" / "measured"
 

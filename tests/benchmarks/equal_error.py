@@ -14,9 +14,9 @@ from cases import Case, solve, states
 from measuring import cpu, error, time_at
 
 from bayesoleo.model import Model
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import DEFAULT_SCHEME
 
 #: Errors of the stroke over its amplitude.
 TARGETS = (1e-5, 1e-8)

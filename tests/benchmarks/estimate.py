@@ -20,14 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare, reduce
 from bayesoleo.data import dataset_folder
+from bayesoleo.discovery._fit import RESOLUTION, first_steps
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many, polish
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model.priors import Normal
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.model._priors import Normal
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.systems import system
-from bayesoleo.tracing.fitting.fit import RESOLUTION, first_steps
-from bayesoleo.workflow import Settings, prepare, reduce
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "estimation"))
 from nist_models import FUNCTIONS, Certified, complex_step, read

@@ -17,9 +17,9 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from bayesoleo.model import Model
-from bayesoleo.model.derive import derive
-from bayesoleo.model.expressions import symbol
-from bayesoleo.prediction.records import Harmonics
+from bayesoleo.model._derivatives import derive
+from bayesoleo.model._expressions import symbol
+from bayesoleo.prediction._records import Harmonics
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 
 from bayesoleo.estimation import FunctionProblem, estimate, multistart
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 
 POSITION = np.linspace(0.0, 0.9, 100)
 NOISE = 0.005 * 10**1.2

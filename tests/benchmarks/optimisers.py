@@ -18,8 +18,8 @@ import numpy as np
 
 from bayesoleo.data import dataset_folder
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.estimators.scipy_methods import LEAST_SQUARES, MINIMISERS
-from bayesoleo.model.priors import Normal
+from bayesoleo.estimation._scipy_methods import LEAST_SQUARES, MINIMISERS
+from bayesoleo.model._priors import Normal
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "estimation"))
 from nist_models import FUNCTIONS, complex_step, read

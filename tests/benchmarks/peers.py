@@ -19,12 +19,12 @@ from cases import Case, batch, solve, start, states
 from explicit import Explicit
 from measuring import PHASES, Array, cpu, error
 
+from bayesoleo._parallel import available_cores
 from bayesoleo.model import Model
-from bayesoleo.parallel import available_cores
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.schemes.collocation import Collocation
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._orbit import Status
 
 #: Vectors of a batch: as many as the figures need, for the peers are slow.
 CASADI_BATCH, DIFFRAX_BATCH = 8, 4

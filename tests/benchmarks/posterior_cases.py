@@ -9,10 +9,10 @@ import numpy as np
 from posterior_gas_spring import gas_spring
 
 from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
+from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.model import driven_by
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.systems import system
-from bayesoleo.tracing.fitting.fit import Numerics, fit_model
 
 
 @dataclass(frozen=True)

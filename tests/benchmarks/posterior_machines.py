@@ -12,10 +12,10 @@ import numpy as np
 from posterior_cases import gas_spring_case, oleo_case
 from tqdm import tqdm
 
+from bayesoleo._dask import connected, each_done
 from bayesoleo.estimation import sampling_distribution
-from bayesoleo.estimation.uncertainty.redraw import data_source
-from bayesoleo.estimation.uncertainty.sampling_distribution import _Blocks, _ReplicationTask
-from bayesoleo.machines import connected, each_done
+from bayesoleo.estimation._parametric_bootstrap import data_source
+from bayesoleo.estimation._sampling_distribution import _Blocks, _ReplicationTask
 
 #: Replications of the campaign of 14 runs, one a task.
 TASKS = 48

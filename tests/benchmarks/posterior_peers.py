@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from posterior_cases import Case, gas_spring_case, oleo_case
 
 from bayesoleo.posterior import LogDensity
-from bayesoleo.posterior.sampling.diagnostics import autocorrelation_time, effective_size
+from bayesoleo.posterior._diagnostics import autocorrelation_time, effective_size
 
 Array = NDArray[np.float64]
 

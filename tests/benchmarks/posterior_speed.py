@@ -10,9 +10,9 @@ import numpy as np
 from measuring import cpu
 from posterior_cases import Case, gas_spring_case, oleo_case
 
-from bayesoleo.parallel import available_cores
+from bayesoleo._parallel import available_cores
 from bayesoleo.posterior import sample
-from bayesoleo.posterior.sampling.diagnostics import autocorrelation_time, effective_size
+from bayesoleo.posterior._diagnostics import autocorrelation_time, effective_size
 
 #: Effective draws asked for, and steps of emcee's own move: about the same number of evaluations
 #: for both, and some ten of its autocorrelation times.

@@ -12,7 +12,7 @@ import tempfile
 NEW_MODEL = """
 import time
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
+from bayesoleo.prediction._simulate import RunPlan, motion, simulate_run
 begin, used = time.perf_counter(), time.process_time()
 model = Model("new", inputs={"force": "N"}, dofs={"q": Dof("m")},
     parameters={"damping": Parameter(0.3, sd=0.1), "cubic": Parameter(0.7, sd=0.1)},
@@ -31,8 +31,8 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from cases import batch, campaign
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.systems import system
 
 def megabytes(name):

@@ -17,15 +17,14 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesoleo.model import Model
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.dynamics import dynamics_of
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
-from bayesoleo.solvers.schemes.choose import DEFAULT_SCHEME
-from bayesoleo.solvers.shooting.shoot import Shot, solve_shooting
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._inputs import dynamics_of
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import sensitivities, solve_from_guess, solve_periodic
+from bayesoleo.solvers._schemes import DEFAULT_SCHEME
+from bayesoleo.solvers._shooting import Shot, solve_shooting
 from bayesoleo.systems import system
 
 #: Errors over the amplitude of the stroke at which times are compared.

@@ -35,9 +35,9 @@ import shooting
 import solves
 from cases import Case, campaign, cases
 
-from bayesoleo.parallel import available_cores
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo._parallel import available_cores
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._simulate import RunPlan, motion
 from bayesoleo.systems import system
 
 #: Verbeek (1993), section 4.3.3, at the stiffest stop, from 60 periods of LSODA at rtol 1e-9.

@@ -8,12 +8,12 @@ import numpy as np
 from cases import BATCH, Case, batch, solve, states
 from measuring import best, cpu, error, exponent
 
+from bayesoleo._parallel import thread_map
 from bayesoleo.model import Dof, Model, Output, Parameter, driven_by
-from bayesoleo.parallel import thread_map
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._orbit import Status
 from bayesoleo.systems import system
 
 THESIS_STEPS = 800

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from truth_systems import make
 
-from bayesoleo.tracing.fitting.fit import Numerics, fit_model
-from bayesoleo.tracing.fitting.other_starts import doubtful
+from bayesoleo.discovery._fit import Numerics, doubtful, fit_model
 
 NUMERICS = Numerics(steps=128, jobs=1)
 

@@ -11,7 +11,7 @@ import solves
 from cases import cases
 from measuring import exponent, time_at
 
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
 from bayesoleo.systems import system
 
 

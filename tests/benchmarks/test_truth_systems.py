@@ -9,9 +9,9 @@ import pytest
 import truth_systems
 from truth_systems import KINDS, Extra, Made, Noise, Plan, make
 
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.workflow.settings import Settings
-from bayesoleo.workflow.task import prepare
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare
+from bayesoleo.prediction._predictor import Predictor
 
 SMALL = Plan(fitted=1, held_out=1, periods=4, per_period=60.3)
 QUIET = Noise(relative=0.002)

@@ -29,12 +29,11 @@ import identification_rows as rows
 import numpy as np
 
 from bayesoleo.data import ReducedCampaign, dataset_folder, load_campaign, reduce_campaign
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._round import examine
+from bayesoleo.discovery._state import fit_state
 from bayesoleo.systems import system
-from bayesoleo.tracing.deciding.rounds import examine
-from bayesoleo.tracing.deciding.state import fit_state
-from bayesoleo.tracing.fitting.assembly import Assembly
-from bayesoleo.tracing.fitting.fit import Numerics
-from bayesoleo.tracing.fitting.roles import assign
 
 FOURTEEN_RUNS = "shaker-wall"
 #: Figures of the committed table that are repeated beside the sample's.

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from truth_systems import KINDS, Made, Plan, make
 
-from bayesoleo import schema
-from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop
-from bayesoleo.workflow.settings import Settings
-from bayesoleo.workflow.task import prepare
+from bayesoleo import _schema as schema
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare
+from bayesoleo.discovery._loop import ClosedLoop, close_loop
 
 #: Campaigns of each kind.
 EACH = 50

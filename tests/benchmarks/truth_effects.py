@@ -27,15 +27,14 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 from truth_systems import Extra, Made, Noise, Plan, Sizes, make, model_of
 
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare
+from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._loop import ClosedLoop, close_loop
+from bayesoleo.discovery._score_basis import Base, coefficients
+from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.prediction.records import Record
-from bayesoleo.tracing.deciding.loop import ClosedLoop, close_loop
-from bayesoleo.tracing.deciding.state import State, fit_state
-from bayesoleo.tracing.fitting.fit import Numerics
-from bayesoleo.tracing.scoring.base import Base
-from bayesoleo.tracing.scoring.projection import coefficients
-from bayesoleo.workflow.settings import Settings
-from bayesoleo.workflow.task import prepare
+from bayesoleo.prediction._records import Record
 
 Array = NDArray[np.float64]
 #: Of position, velocity, time and own states.

@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 from scipy import fft, io
 
 import bayesoleo
+import bayesoleo._workflow
 from bayesoleo.data import load_campaign, reduce_campaign
 from bayesoleo.errors import DataWarning
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._orbit import Status
 
 Array = NDArray[np.float64]
 
@@ -186,7 +187,7 @@ def _campaign(folder: Path, toml: str, *files: Path) -> Any:
 
 
 def _estimate(campaign: Any, model: Model) -> Array:
-    tree = bayesoleo.workflow.estimate(campaign, model, SETTINGS)
+    tree = bayesoleo._workflow.estimating.estimate(campaign, model, SETTINGS)
     point = tree["point"].to_dataset()
     return np.array([float(point.estimate.sel(parameter=name)) for name in model.estimated()])
 
@@ -239,7 +240,7 @@ def _emps(data: Path, room: Path, say: Callable[[str], Any]) -> dict[str, float]
         campaign = _campaign(room / kind, toml, room / "emps.csv")
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", DataWarning)
-            tree = bayesoleo.workflow.estimate(campaign, DRIVE, SETTINGS)
+            tree = bayesoleo._workflow.estimating.estimate(campaign, DRIVE, SETTINGS)
         for item in said:
             say(str(item.message))
         found[f"emps_{kind}_N"] = float(np.sqrt(tree["point"]["variance"].values[0]))

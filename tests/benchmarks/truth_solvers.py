@@ -27,15 +27,14 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from bayesoleo.model import Dof, Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.motion_error import TOLERANCE as KNOWN
-from bayesoleo.prediction.motion_error import motion_error
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.records import Harmonics, Record
-from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.prediction.transient import TransientRun
-from bayesoleo.solvers.adaptive.switched import state_rows
-from bayesoleo.solvers.schemes.choose import SOLVERS
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._records import Harmonics, Record
+from bayesoleo.prediction._run_errors import TOLERANCE as KNOWN, motion_error
+from bayesoleo.prediction._simulate import RunPlan, motion
+from bayesoleo.prediction._transient_run import TransientRun
+from bayesoleo.solvers._schemes import SOLVERS
+from bayesoleo.solvers._switched import state_rows
 
 Array = np.ndarray
 Rates = Callable[[float, Array], tuple[float, ...]]

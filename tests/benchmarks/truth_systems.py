@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from bayesoleo.data import Campaign, ReducedCampaign, Run, reduce_campaign
-from bayesoleo.data.declaration import Channel
+from bayesoleo.data import CampaignData, ReducedCampaign, Run, reduce_campaign
+from bayesoleo.data._campaign_toml import Channel
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.systems.oleo import mechanical_oleo
+from bayesoleo.systems._oleo import mechanical_oleo
 
 Array = NDArray[np.float64]
 
@@ -793,5 +793,7 @@ def _campaign(
         )
         for run in runs
     )
-    campaign = Campaign(kind, "", system.controlled, Path("simulated"), channels, loaded, "0" * 64)
+    campaign = CampaignData(
+        kind, "", system.controlled, Path("simulated"), channels, loaded, "0" * 64
+    )
     return reduce_campaign(campaign, jobs=1)

@@ -22,10 +22,10 @@ import numpy as np
 from scipy import stats
 from truth_systems import KINDS, Made, make
 
-from bayesoleo.tracing.fitting.fit import Fit, fit_model
-from bayesoleo.workflow.sampling import draw
-from bayesoleo.workflow.settings import Settings
-from bayesoleo.workflow.task import Task, prepare
+from bayesoleo._workflow.estimating import draw
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import Task, prepare
+from bayesoleo.discovery._fit import ModelFit, fit_model
 
 #: Campaigns of each kind, those of them that are sampled, and the level of the intervals.
 CAMPAIGNS, SAMPLED, LEVEL = 50, 5, 0.9
@@ -78,19 +78,19 @@ def counted(fraction: float = 1.0, say: Callable[[str], None] = print) -> Tally:
     return Tally(linear, drawn, toleranced, failed)
 
 
-def _fitted(kind: str, seed: int) -> tuple[Made, Task, Fit]:
+def _fitted(kind: str, seed: int) -> tuple[Made, Task, ModelFit]:
     made = make(kind, seed, weak=seed % 2 == 0, toleranced=True, within=np.inf)
     task = prepare(made.campaign, made.model, Settings(seed=seed, jobs=1, quick=True))
     return made, task, fit_model(task.assembly.model(), task.roles.fitted, task.settings.numerics)
 
 
-def _linear(made: Made, fit: Fit) -> Iterator[tuple[str, bool]]:
+def _linear(made: Made, fit: ModelFit) -> Iterator[tuple[str, bool]]:
     half = stats.norm.ppf(0.5 + LEVEL / 2) * fit.point.sd
     for name, estimate, reach in zip(fit.point.names, fit.point.theta, half, strict=True):
         yield name, bool(abs(estimate - made.truth[name]) < reach)
 
 
-def _drawn(made: Made, task: Task, fit: Fit) -> Iterator[tuple[str, bool]]:
+def _drawn(made: Made, task: Task, fit: ModelFit) -> Iterator[tuple[str, bool]]:
     samples, _ = draw(task, fit, None, lambda _: None, False)
     for name in fit.point.names:
         values = samples.draws[:, :, samples.names.index(name)]

@@ -12,7 +12,7 @@ import pytest
 from small_rig import CAMPAIGN, MODEL, rows, write_rows
 from typer.testing import CliRunner
 
-from bayesoleo.cli import app
+from bayesoleo._cli import app
 
 TREE = Path(__file__).parents[1] / "plots" / "synthetic_tree.py"
 

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from bayesoleo import plots, schema
-from bayesoleo.storage import read_tree
+from bayesoleo import _schema as schema, plots
+from bayesoleo._storage.result_files import read_tree
 
 
 @pytest.fixture

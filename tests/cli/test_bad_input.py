@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 from small_rig import CAMPAIGN, MODEL, rows, write_rows
 
-from bayesoleo import schema
-from bayesoleo.storage import read_tree, write_tree
+from bayesoleo import _schema as schema
+from bayesoleo._storage.result_files import read_tree, write_tree
 
 
 def change(path, old, new):
@@ -45,7 +45,7 @@ def test_a_transient_to_propose_from_is_refused_before_anything_is_estimated(
     def estimated(*_):
         raise AssertionError
 
-    monkeypatch.setattr("bayesoleo.workflow.proposing.run_loop", estimated)
+    monkeypatch.setattr("bayesoleo._workflow.closing.run_loop", estimated)
     for frequency in ("frequency = 1.0", "frequency = 2.0"):
         change(campaign / "campaign.toml", frequency, 'kind = "transient"')
     message = "what to measure next is foreseen for periodic runs only"
@@ -137,7 +137,9 @@ def test_unknown_effect(refused):
 def test_output_folder_is_tried_before_any_work(
     refused, campaign, model, tmp_path, command, monkeypatch
 ):
-    monkeypatch.setattr("bayesoleo.modelfile.load_model", lambda _: pytest.fail("work was begun"))
+    monkeypatch.setattr(
+        "bayesoleo._workflow.model_files.load_model", lambda _: pytest.fail("work was begun")
+    )
     taken = tmp_path / "taken"
     taken.write_text("a file")
     line = refused(command, campaign, "--model", model, "--out", taken / "results")
@@ -215,9 +217,9 @@ def test_demo_spares_a_campaign_that_is_not_its_own(refused, campaign, tmp_path,
     import sys
     from types import ModuleType
 
-    module = ModuleType("bayesoleo.demo")
+    module = ModuleType("bayesoleo._workflow.simulating")
     module.demo_campaign = demo_campaign
-    monkeypatch.setitem(sys.modules, "bayesoleo.demo", module)
+    monkeypatch.setitem(sys.modules, "bayesoleo._workflow.simulating", module)
     out = tmp_path / "mine"
     out.mkdir()
     campaign.rename(out / "campaign")

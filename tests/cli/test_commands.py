@@ -10,12 +10,12 @@ import pytest
 import typer.main
 from rich.console import Console
 
-from bayesoleo import schema, workflow
-from bayesoleo.cli import app, options, shell, tables
-from bayesoleo.cli.listing import readable
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._cli import app, options, shell, shell as tables
+from bayesoleo._cli.listing import readable
+from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.effects import catalogue
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.storage import read_tree, write_tree
+from bayesoleo.solvers._schemes import scheme
 from bayesoleo.systems import systems
 
 COMMANDS = tuple(typer.main.get_command(app).commands)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 from bayesoleo import estimation
+from bayesoleo._storage.result_files import read_tree
 from bayesoleo.errors import InputError
-from bayesoleo.storage import read_tree
 
 
 def test_each_run_gets_its_line_and_the_runs_are_compared(run, campaign, model, tmp_path):

@@ -7,9 +7,9 @@ import sys
 import pytest
 from small_rig import MODEL
 
+from bayesoleo._workflow.model_files import load_effects, load_model
 from bayesoleo.effects import catalogue
 from bayesoleo.errors import ModelError, ModelWarning
-from bayesoleo.modelfile import load_effects, load_model
 
 
 def test_built_in_and_file(model):

@@ -8,7 +8,7 @@ import math
 import pytest
 from small_campaigns import damper_campaign
 
-from bayesoleo.cli.proposing import _limit
+from bayesoleo._cli.closing import _limit
 
 MODEL = """
 from bayesoleo import Model, Output, Parameter

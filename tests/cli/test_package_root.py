@@ -52,6 +52,6 @@ def test_import_brings_nothing_with_it():
 
 def test_help_does_not_wait_for_numbers():
     heavy = "{'numpy', 'scipy', 'sympy', 'numba', 'xarray', 'pandas', 'matplotlib'}"
-    code = f"import sys, bayesoleo.cli; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, bayesoleo._cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

@@ -11,8 +11,8 @@ import warnings
 
 import pytest
 
-from bayesoleo import workflow
-from bayesoleo.cli import shell
+from bayesoleo import _workflow as workflow
+from bayesoleo._cli import shell
 from bayesoleo.errors import DataWarning, InputError, ModelError
 
 

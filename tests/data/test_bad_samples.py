@@ -7,7 +7,7 @@ import pytest
 from small_table import table
 
 from bayesoleo.data import load_campaign
-from bayesoleo.data.bad_samples import impossible_sample
+from bayesoleo.data._sample_quality import impossible_sample
 from bayesoleo.errors import CampaignError
 
 

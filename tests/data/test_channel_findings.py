@@ -10,8 +10,8 @@ import pytest
 from small_campaigns import damper_campaign, spring_damper_force
 
 from bayesoleo.data import data_warnings, foreign_line, repeating_rounding, step_of
-from bayesoleo.data.lines import foreign_lines
-from bayesoleo.data.resolution import clipped, rounding_that_repeats
+from bayesoleo.data._harmonics import foreign_lines
+from bayesoleo.data._sample_quality import clipped, rounding_that_repeats
 
 FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
 

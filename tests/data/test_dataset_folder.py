@@ -4,7 +4,7 @@ import pooch
 import pytest
 
 from bayesoleo.data import dataset_folder
-from bayesoleo.data.registry import REGISTERED, VARIABLE
+from bayesoleo.data._registry import REGISTERED, VARIABLE
 from bayesoleo.errors import CampaignError
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesoleo.data.transforms import ChirpTransform, HarmonicBasis, highest_order
+from bayesoleo.data._fourier import ChirpTransform, HarmonicBasis, highest_order
 
 
 @pytest.mark.parametrize("step", [0.0301, -0.2, 1 / 37.3])

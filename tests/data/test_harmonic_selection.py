@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import HarmonicBasis, significant_harmonics
-from bayesoleo.data.harmonics import coefficient_variances, within_bandwidth
+from bayesoleo.data._harmonics import coefficient_variances, within_bandwidth
 
 
 def signal(basis, true, rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import periodic_average
-from bayesoleo.data.noise_spectrum import noise_spectrum
+from bayesoleo.data._noise import noise_spectrum
 
 SAMPLES, PERIODS, STEP = 2000, 4, 0.002
 

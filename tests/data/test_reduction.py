@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
-from bayesoleo.data.smoothing import innovation_noise
+from bayesoleo.data._noise import innovation_noise
 from bayesoleo.errors import CampaignError
 
 CHANNELS = {"displacement": ("x_mm", "mm"), "force": ("f_N", "N")}

@@ -6,7 +6,7 @@ import pytest
 import scipy.io
 import xarray as xr
 
-from bayesoleo.data.files import read_columns
+from bayesoleo.data._files import read_columns
 from bayesoleo.errors import CampaignError
 
 VALUES = np.column_stack([np.arange(8) * 0.5, np.arange(8.0) ** 2, np.linspace(-1, 1, 8)])

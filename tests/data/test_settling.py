@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesoleo.data.settling import sample_count, settled_start, whole_periods
+from bayesoleo.data._sample_quality import sample_count, settled_start, whole_periods
 
 
 def stationary(rng, samples, step, noise=0.1):

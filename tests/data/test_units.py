@@ -4,11 +4,10 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
+from bayesoleo._units import check_kind, parse_unit, same_quantity
 from bayesoleo.errors import CampaignError
-from bayesoleo.units import check_kind, parse_unit, same_quantity
 
 UNITS = [
     "mm",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import SimulatedRun, load_campaign, write_campaign
-from bayesoleo.data.rig import read_rig
+from bayesoleo.data._campaign_toml import read_rig
 from bayesoleo.errors import CampaignError
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bayesoleo.data.declaration import read_declaration
+from bayesoleo.data._campaign_toml import read_declaration
 from bayesoleo.model import Model
 
 ROOT = Path(__file__).resolve().parents[2]

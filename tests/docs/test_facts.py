@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bayesoleo import schema
-from bayesoleo.data import declaration, declared_run
+from bayesoleo import _schema as schema
+from bayesoleo.data import _campaign_toml as declaration, _campaign_toml as declared_run
 from bayesoleo.effects import FAMILIES, catalogue
-from bayesoleo.model.expressions import FUNCTIONS
+from bayesoleo.model._expressions import FUNCTIONS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -75,7 +75,7 @@ def test_the_table_of_effects_holds_every_one_with_formula_scan_and_source(monke
 
 
 def test_every_command_is_described() -> None:
-    cli = pytest.importorskip("bayesoleo.cli")
+    cli = pytest.importorskip("bayesoleo._cli")
     import typer.main
 
     commands = typer.main.get_command(cli.app).commands

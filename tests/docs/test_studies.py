@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from bayesoleo.plots import stored as stored_module
+from bayesoleo.plots import _stored as stored_module
 
 STUDIES = Path(__file__).resolve().parents[2] / "studies"
 PAGES = sorted(STUDIES.glob("*/plot_*.py"))

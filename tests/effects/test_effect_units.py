@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from bayesoleo.effects import find_effect
-from bayesoleo.effects.units import balance_unit, parse_unit, unit_of, unit_text
+from bayesoleo.effects._places import balance_unit, parse_unit, unit_of, unit_text
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.systems import system

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from bayesoleo._workflow.model_files import load_model
 from bayesoleo.effects import catalogue, find_effect
-from bayesoleo.effects.gas import as_gas_spring
-from bayesoleo.effects.gas_names import undeclared
+from bayesoleo.effects._gas import as_gas_spring, undeclared
 from bayesoleo.model import Condition, Model, Output, Parameter
-from bayesoleo.model.expressions import symbol
-from bayesoleo.modelfile import load_model
+from bayesoleo.model._expressions import symbol
 from bayesoleo.systems import system
 
 FILE = """

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayesoleo.model import driven_by
-from bayesoleo.model.expressions import symbol
-from bayesoleo.model.kernels import kernels
+from bayesoleo.model._expressions import symbol
+from bayesoleo.model._kernels import kernels
 from bayesoleo.systems import system
 
 #: Position, velocity and what higher derivatives there are, at points that include reversals.

@@ -8,7 +8,7 @@ import sympy as sp
 
 from bayesoleo.effects import Candidate
 from bayesoleo.model import Model
-from bayesoleo.model.expressions import derivative_symbol, partial, split_derivative, symbol
+from bayesoleo.model._expressions import derivative_symbol, partial, split_derivative, symbol
 
 STATES = 3
 

@@ -7,9 +7,9 @@ import pytest
 import sympy as sp
 
 from bayesoleo.effects import find_effect
-from bayesoleo.effects.places import damping_terms, force_places
+from bayesoleo.effects._places import damping_terms, force_places
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.expressions import derivative_symbol, symbol, total_derivative
+from bayesoleo.model._expressions import derivative_symbol, symbol, total_derivative
 from bayesoleo.systems import system
 
 

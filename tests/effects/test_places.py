@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from bayesoleo.effects import catalogue, find_effect
-from bayesoleo.effects.places import force_places
-from bayesoleo.effects.unnamed import balance_places
+from bayesoleo.effects._nonparametric import balance_places
+from bayesoleo.effects._places import force_places
 from bayesoleo.model import Dof, Model, Output, Parameter
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.records import Record
+from bayesoleo.prediction._records import Record, transient_record
 
 LORENZ = np.array([10.0, 28.0, 8 / 3])
 ROSSLER = np.array([0.2, 0.2, 5.7])

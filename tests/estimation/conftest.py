@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import FunctionProblem
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 
 
 @pytest.fixture(scope="session")

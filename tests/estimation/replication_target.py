@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from bayesoleo.estimation import FunctionProblem, sampling_distribution
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 
 DESIGN = np.linspace(0.0, 1.0, 20)
 

@@ -20,9 +20,9 @@ from bayesoleo.estimation import (
     profile,
     sampling_distribution,
 )
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Normal, Parameter, Uniform
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.systems import system
 
 GAIN, OFFSET, TOLERANCE, NOISE = 2.0, 0.5, 0.2, 0.05

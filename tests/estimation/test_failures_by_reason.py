@@ -8,12 +8,12 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo.estimation import estimate, multistart, to_dataset
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Parameter, driven_by
 from bayesoleo.posterior import LogDensity
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run
-from bayesoleo.solvers.status import Status, added, counted
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of, simulate_run
+from bayesoleo.solvers._orbit import Status, added, counted
 
 #: Reached in the record, m, of a stroke that ends at ``TRUTH``: beyond that the gas law has no
 #: pressure.

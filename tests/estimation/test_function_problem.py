@@ -7,8 +7,8 @@ import pytest
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.model.priors import Normal, TruncatedNormal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import Normal, TruncatedNormal
+from bayesoleo.solvers._orbit import Status
 
 X = np.linspace(0.1, 2.0, 30)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import estimate, multistart, polish
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._orbit import Status
 
 TOLERANCE = 1e-4  # of the relative step, for which the counts were published
 WIDE = [("be", 4, 5), ("mve", 4, 5), ("mmve", 4, 5), ("mbe", 4, 5)]

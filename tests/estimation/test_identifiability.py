@@ -7,7 +7,7 @@ import pytest
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, data_against_prior, estimate
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 from bayesoleo.systems import system
 
 

@@ -8,11 +8,10 @@ from scipy import stats
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.uncertainty.axes import as_product, in_words, principal_axes
-from bayesoleo.estimation.uncertainty.drop import LogLikelihoodRatio
-from bayesoleo.estimation.uncertainty.indifference import indifference
-from bayesoleo.estimation.uncertainty.profile import profile
-from bayesoleo.model.priors import Normal, Uniform
+from bayesoleo.estimation._identifiability import as_product, in_words, principal_axes
+from bayesoleo.estimation._indifference_regions import indifference
+from bayesoleo.estimation._profile_likelihood import LogLikelihoodRatio, profile
+from bayesoleo.model._priors import Normal, Uniform
 
 SIZE = 30
 

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesoleo.error_models._independent import output_counts
 from bayesoleo.errors import InputError
-from bayesoleo.estimation import FunctionProblem, estimate, log_posterior, output_counts
-from bayesoleo.estimation.objectives.curvature import curvature, prior_precision
-from bayesoleo.estimation.problems.held import Held
-from bayesoleo.estimation.uncertainty.intervals import (
+from bayesoleo.estimation import FunctionProblem, estimate, log_posterior
+from bayesoleo.estimation._intervals import (
     linearised_covariance,
     linearised_intervals,
     over_experiments,
 )
-from bayesoleo.estimation.uncertainty.profile import profile
-from bayesoleo.model.correlated import JointNormal
-from bayesoleo.model.priors import LogNormal, Normal, Uniform
+from bayesoleo.estimation._objectives import curvature, prior_precision
+from bayesoleo.estimation._problem import Held
+from bayesoleo.estimation._profile_likelihood import profile
+from bayesoleo.model._correlated_priors import JointNormal
+from bayesoleo.model._priors import LogNormal, Normal, Uniform
 
 SIZE = 40
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import METHODS, FunctionProblem, estimate, multistart
-from bayesoleo.model.priors import Normal, TruncatedNormal, Uniform
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import Normal, TruncatedNormal, Uniform
+from bayesoleo.solvers._orbit import Status
 
 TIME = np.linspace(0.0, 3.0, 60)
 

@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many, log_prior
 from bayesoleo.model import Model, Output, Parameter, with_joint_prior
-from bayesoleo.model.correlated import JointNormal, log_density_of, sample_of
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._correlated_priors import JointNormal, log_density_of, sample_of
+from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity
 
 MEAN = np.array([1.0, 2.0])

@@ -5,19 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesoleo.estimation import (
-    FunctionProblem,
-    estimate,
-    log_posterior,
-    mode_covariance,
-    output_counts,
-    polish,
-    staged_variance,
-    sums_of_squares,
-)
-from bayesoleo.estimation.problems.problem import Evaluation
-from bayesoleo.model.priors import LogNormal, Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.error_models._independent import output_counts, staged_variance, sums_of_squares
+from bayesoleo.estimation import FunctionProblem, estimate, log_posterior, mode_covariance, polish
+from bayesoleo.estimation._problem import Evaluation
+from bayesoleo.model._priors import LogNormal, Normal
+from bayesoleo.solvers._orbit import Status
 
 CENTRE = np.array([1.0, -2e4, 3e-7])
 SPREAD = np.array([0.5, 1e4, 1e-7])

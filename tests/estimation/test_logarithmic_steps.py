@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
+from bayesoleo.error_models._independent import output_counts, sums_of_squares
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import (
     METHODS,
@@ -14,12 +14,10 @@ from bayesoleo.estimation import (
     estimate,
     log_posterior,
     mode_covariance,
-    output_counts,
     polish,
-    sums_of_squares,
 )
-from bayesoleo.model.priors import LogNormal, Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import LogNormal, Normal
+from bayesoleo.solvers._orbit import Status
 
 VELOCITY = np.sin(np.linspace(0.0, 2 * np.pi, 200, endpoint=False))
 TRUTH = np.array([60.0, 20.0])

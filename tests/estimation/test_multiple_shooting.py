@@ -10,10 +10,10 @@ from chaotic_records import Chaos
 from scipy.optimize import least_squares
 
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.trajectories.multiple_shooting import multiple_shooting
+from bayesoleo.estimation._multiple_shooting import multiple_shooting
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.solvers._orbit import Status
 from bayesoleo.systems import system
 
 SEEDS = 50

@@ -7,8 +7,8 @@ import pytest
 from nist_models import FUNCTIONS, complex_step, read
 
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.model.priors import Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import Normal
+from bayesoleo.solvers._orbit import Status
 
 pytestmark = pytest.mark.reference
 

@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesoleo._workflow.estimating import estimate as estimate_campaign
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.data import SimulatedRun, write_campaign
+from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._hold_out_error import predict_held_out
 from bayesoleo.errors import InputError
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.runs.nuisance import Nuisance, declared_nuisance, uncertain_conditions
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._nuisance import Nuisance, declared_nuisance, uncertain_conditions
 from bayesoleo.model import Model, Output, Parameter, driven_by
-from bayesoleo.model.document import from_document, to_document
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Harmonics, Record
+from bayesoleo.model._documents import from_document, to_document
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Harmonics, Record
 from bayesoleo.systems import system
-from bayesoleo.tracing.errors.holdout import predict_held_out
-from bayesoleo.tracing.fitting.fit import Numerics, fit_model
-from bayesoleo.workflow import Settings
-from bayesoleo.workflow import estimate as estimate_campaign
 
 AREA, STIFFNESS, NOISE = 2.0e-3, 900.0, 5.0
 #: Label, mean displacement, declared pressure and its sd, true error in sds.

@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import OBJECTIVES, Evaluation, Misfit, estimate
-from bayesoleo.model.priors import Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import Normal
+from bayesoleo.solvers._orbit import Status
 
 TIME = np.linspace(0.0, 3.0, 60)
 TRUTH = np.array([2.0, 0.8])

@@ -8,7 +8,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import xarray as xr
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, between_runs, estimate, estimate_each
-from bayesoleo.estimation.runs.hierarchy import pooled
-from bayesoleo.model.priors import Normal
+from bayesoleo.estimation._between_runs import pooled
+from bayesoleo.model._priors import Normal
 
 #: Trials of a vaccine: cases and others, vaccinated and not (Colditz and others 1994, *JAMA* 271).
 VACCINE = """

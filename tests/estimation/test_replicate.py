@@ -7,8 +7,8 @@ import pytest
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many
-from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal, Uniform
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal, Uniform
+from bayesoleo.solvers._orbit import Status
 
 X = np.linspace(0.0, 2.0, 40)
 

@@ -8,9 +8,9 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import estimate, estimate_many
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.prediction._predictor import Predictor
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,16 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.problems.problem import Evaluation
-from bayesoleo.estimation.uncertainty.bounds import cramer_rao, propagated
-from bayesoleo.estimation.uncertainty.redraw import NoiseBlock, data_source
-from bayesoleo.estimation.uncertainty.sampling_distribution import sampling_distribution
-from bayesoleo.model.priors import Normal
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.status import Status
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._intervals import cramer_rao, propagated
+from bayesoleo.estimation._parametric_bootstrap import NoiseBlock, data_source
+from bayesoleo.estimation._problem import Evaluation
+from bayesoleo.estimation._sampling_distribution import sampling_distribution
+from bayesoleo.model._priors import Normal
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._orbit import Status
 
-module = importlib.import_module("bayesoleo.estimation.uncertainty.sampling_distribution")
+module = importlib.import_module("bayesoleo.estimation._sampling_distribution")
 TRUTH, NOISE = np.array([1.0, -2.0]), 0.3
 
 

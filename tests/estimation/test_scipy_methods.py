@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import FunctionProblem, estimate
-from bayesoleo.estimation.estimators.scipy_methods import LEAST_SQUARES, MINIMISERS
-from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal
-from bayesoleo.solvers.status import Status
+from bayesoleo.estimation._scipy_methods import LEAST_SQUARES, MINIMISERS
+from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal
+from bayesoleo.solvers._orbit import Status
 
 TIME = np.linspace(0.0, 4.0, 50)
 #: Methods that stop by a fixed smallest radius or count, not by the asked tolerance.

@@ -9,16 +9,11 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.estimation.sensitivity.analyse import (
-    global_sensitivity,
-    local_sensitivity,
-    quantile,
-    sobol,
-)
-from bayesoleo.model.correlated import JointNormal
-from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal, Uniform
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._sensitivity import global_sensitivity, local_sensitivity, quantile, sobol
+from bayesoleo.model._correlated_priors import JointNormal
+from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal, Uniform
+from bayesoleo.prediction._predictor import Predictor
 
 
 def test_ishigami_function():

@@ -9,7 +9,7 @@ import pytest
 
 from bayesoleo import plots
 from bayesoleo.estimation import FunctionProblem, estimate, multistart, polish, to_dataset
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 
 
 @pytest.fixture

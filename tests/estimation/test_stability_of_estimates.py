@@ -9,14 +9,14 @@ import pytest
 import xarray as xr
 from scipy.integrate import solve_ivp
 
+from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Harmonics, Record
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.prediction.stability import Stability
-from bayesoleo.storage import read_tree, write_tree
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Harmonics, Record
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._stability import Stability
 from bayesoleo.systems import system
 
 

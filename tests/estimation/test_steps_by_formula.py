@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import Evaluation, FunctionProblem, estimate
-from bayesoleo.model.priors import Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._priors import Normal
+from bayesoleo.solvers._orbit import Status
 
 TIME = np.linspace(0.0, 2.0, 40)
 CENTRE, SD = np.array([1.9, 0.9]), np.array([0.3, 0.2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import estimate, polish, to_dataset
 

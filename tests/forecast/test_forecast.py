@@ -17,11 +17,12 @@ from small_campaigns import (
 )
 
 import bayesoleo
-from bayesoleo import plots, schema, workflow
+import bayesoleo._workflow
+from bayesoleo import _schema as schema, _workflow as workflow, plots
+from bayesoleo._workflow.predicting import draws_of, predict
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.errors import InputError
-from bayesoleo.forecast import draws_of, predict
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.workflow import Settings
 
 SETTINGS = Settings(jobs=1, steps=64)
 NOISE = 0.5
@@ -122,7 +123,7 @@ def test_what_cannot_be_foreseen_is_said(estimated):
         predict(tree, reduced, runs=["z"])
     with pytest.raises(InputError, match="two or more"):
         predict(tree, reduced, draws=1)
-    assert bayesoleo.forecast.predict is predict
+    assert bayesoleo._workflow.predicting.predict is predict
 
 
 def test_model_of_another_experiment_takes_the_estimates(estimated):

@@ -7,7 +7,7 @@ import sympy as sp
 
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Condition, LogNormal, Model, Normal, Output, Parameter
-from bayesoleo.model.expressions import derivative_symbol, symbol
+from bayesoleo.model._expressions import derivative_symbol, symbol
 
 
 def declare(**changes):

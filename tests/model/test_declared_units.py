@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from bayesoleo._units import in_si
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Condition, Dof, Model, Output, Parameter
-from bayesoleo.units import in_si
 
 
 def law(unit: str = "N/m", **changes) -> Model:

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from bayesoleo._units import dimensions, unit_of_dimensions
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.model.dimensions import check_dimensions
+from bayesoleo.model._dimensions import check_dimensions
 from bayesoleo.systems import system, systems
-from bayesoleo.units import dimensions, unit_of_dimensions
 
 UNITS = {"mass": "kg", "damping": "N*s/m", "stiffness": "N/m", "cubic": "N/m**3"}
 EQUATION = {

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 import sympy as sp
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Model, Output, Parameter, driven_by, possible_drives
-from bayesoleo.model.expressions import derivative_symbol, symbol
+from bayesoleo.model._expressions import derivative_symbol, symbol
 from bayesoleo.systems import system
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import sympy as sp
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bayesoleo.errors import ModelError
-from bayesoleo.model.expressions import (
+from bayesoleo.model._expressions import (
     derivative_symbol,
     parse,
     partial,

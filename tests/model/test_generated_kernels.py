@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 import sympy as sp
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, assume, given, settings, strategies as st
 
-from bayesoleo.compiled import cache_folder
+from bayesoleo._compiled import cache_folder
 from bayesoleo.model import Condition, Model, Output, Parameter
-from bayesoleo.model.derive import derive
-from bayesoleo.model.expressions import FUNCTIONS, symbol
-from bayesoleo.model.kernels import _counts, _results, kernels
-from bayesoleo.model.printing import statements
+from bayesoleo.model._code_printing import statements
+from bayesoleo.model._derivatives import derive
+from bayesoleo.model._expressions import FUNCTIONS, symbol
+from bayesoleo.model._kernels import _counts, _results, kernels
 from bayesoleo.systems import system
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.systems._oleo import thermomechanical_oleo
 
 NAMES = ("x", "w", "a", "b")
 

@@ -1,4 +1,4 @@
-"""Results made up from closed formulas, in the layout of `bayesoleo.schema`: 14 runs, and 2."""
+"""Results made up from closed formulas, in the layout of `bayesoleo._schema`: 14 runs, and 2."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 import numpy as np
 import xarray as xr
 
-from bayesoleo import schema
-from bayesoleo.storage import provenance
+from bayesoleo import _schema as schema
+from bayesoleo._storage.result_files import provenance
 
 PHASES = (np.arange(100) + 0.5) / 100
 NOISE = {"force": 20.0, "pressure": 5e3}

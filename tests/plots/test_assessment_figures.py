@@ -23,9 +23,9 @@ from bayesoleo.estimation import (
     sampling_distribution,
     sobol,
 )
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model.priors import Normal
-from bayesoleo.prediction.predictor import Predictor
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.model._priors import Normal
+from bayesoleo.prediction._predictor import Predictor
 
 
 @pytest.fixture(scope="module")

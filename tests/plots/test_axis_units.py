@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bayesoleo.plots.units import engineering, format_number, format_unit, format_value
+from bayesoleo.plots._style import engineering, format_number, format_unit, format_value
 
 UNITS = ["N", "Pa", "m", "m/s", "s/m", "N/m", "m^2", "m**3", "kg", "1", "", "N*s^2/m^2", "mol/Pa"]
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bayesoleo import plots
-from bayesoleo.estimation.trajectories.multiple_shooting import EstimatedTrajectory
-from bayesoleo.plots import style
-from bayesoleo.prediction.branch import follow_branch
-from bayesoleo.prediction.simulate import RunPlan, motion
+from bayesoleo.estimation._multiple_shooting import EstimatedTrajectory
+from bayesoleo.plots import _style as style
+from bayesoleo.prediction._branches import follow_branch
+from bayesoleo.prediction._simulate import RunPlan, motion
 from bayesoleo.systems import system
 
 

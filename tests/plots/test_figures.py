@@ -13,9 +13,9 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from bayesoleo import plots, schema
-from bayesoleo.plots import reading, style
-from bayesoleo.plots.rankings import chosen, similar
+from bayesoleo import _schema as schema, plots
+from bayesoleo.plots import _reading as reading, _style as style
+from bayesoleo.plots._discovery import chosen, similar
 
 
 def texts(figure):

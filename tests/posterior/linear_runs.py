@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo.error_models.base import RunSamples
-from bayesoleo.estimation.problems.problem import Evaluation, Misfit
-from bayesoleo.model.priors import Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.error_models._base import RunSamples
+from bayesoleo.estimation._problem import Evaluation, Misfit
+from bayesoleo.model._priors import Normal
+from bayesoleo.solvers._orbit import Status
 
 LEVEL = Normal(0.0, 2.0)
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesoleo.estimation.problems.problem import Evaluation, Misfit
-from bayesoleo.model.priors import Normal
-from bayesoleo.solvers.status import Status
+from bayesoleo.estimation._problem import Evaluation, Misfit
+from bayesoleo.model._priors import Normal
+from bayesoleo.solvers._orbit import Status
 
 COMPRESSION = np.linspace(0.0, 0.9, 100)
 

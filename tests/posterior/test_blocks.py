@@ -6,9 +6,9 @@ from linear_runs import linear_runs
 from test_error_model_densities import Campaign
 
 from bayesoleo.error_models import ERROR_MODELS, error_model
-from bayesoleo.error_models.base import RunSamples
+from bayesoleo.error_models._base import RunSamples
 from bayesoleo.posterior import LogDensity, laplace_mixture, sample
-from bayesoleo.posterior.outcome.blocks import MOST_BLOCKS, STRETCHES, Blocks, block_groups, cut
+from bayesoleo.posterior._datatree import MOST_BLOCKS, STRETCHES, Blocks, block_groups, cut
 
 
 @pytest.mark.parametrize("word", ERROR_MODELS)

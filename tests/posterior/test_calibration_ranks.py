@@ -5,7 +5,7 @@ import pytest
 from posterior_targets import Gaussian
 
 from bayesoleo.posterior import Mixture, sample
-from bayesoleo.posterior.outcome.calibration import DRAWS, rank_of, uniformity
+from bayesoleo.posterior._comparison import DRAWS, rank_of, uniformity
 
 
 def test_uniform_ranks_leave_the_band_as_often_as_they_should():

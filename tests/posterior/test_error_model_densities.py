@@ -7,11 +7,11 @@ import pytest
 from scipy import integrate, special, stats
 
 from bayesoleo.error_models import ERROR_MODELS, error_model
-from bayesoleo.error_models.base import RunSamples
-from bayesoleo.error_models.correlated import covariance
-from bayesoleo.error_models.discrepancy import basis, spectrum
+from bayesoleo.error_models._base import RunSamples
+from bayesoleo.error_models._correlated import covariance
+from bayesoleo.error_models._discrepancy import basis, spectrum
 from bayesoleo.errors import InputError
-from bayesoleo.posterior.outcome.predictive import sd_of_averages
+from bayesoleo.posterior._datatree import sd_of_averages
 
 
 @dataclass

@@ -6,16 +6,10 @@ import pytest
 import xarray as xr
 from linear_runs import linear_runs
 
-from bayesoleo.error_models.discrepancy import basis, spectrum
+from bayesoleo.error_models._discrepancy import basis, spectrum
+from bayesoleo.error_models._registry import ERROR_MODELS
 from bayesoleo.errors import InputError
-from bayesoleo.posterior import (
-    ERROR_MODELS,
-    LogDensity,
-    laplace_mixture,
-    prior_sensitivity,
-    sample,
-    to_datasets,
-)
+from bayesoleo.posterior import LogDensity, laplace_mixture, prior_sensitivity, sample, to_datasets
 
 RUNS, PERIODS, COUNT = 4, 4, 200
 

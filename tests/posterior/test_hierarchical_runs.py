@@ -6,7 +6,7 @@ from linear_runs import linear_runs
 from scipy import stats
 
 from bayesoleo.errors import InputError
-from bayesoleo.model.priors import LogNormal
+from bayesoleo.model._priors import LogNormal
 from bayesoleo.posterior import LogDensity, hierarchical, laplace_mixture, sample
 
 RUNS, COUNT, NOISE = 6, 20, 0.5

@@ -6,9 +6,14 @@ from posterior_gas_spring import gas_spring
 from posterior_targets import Banana, Bimodal, Gaussian
 from test_posterior_sample import grid
 
-from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
-from bayesoleo.posterior.approximation import mode_search
-from bayesoleo.posterior.approximation.mode_search import with_other_modes
+from bayesoleo.posterior import (
+    LogDensity,
+    Mixture,
+    _mode_search as mode_search,
+    laplace_mixture,
+    sample,
+)
+from bayesoleo.posterior._mode_search import with_other_modes
 
 
 def at_rest(dimension: int) -> Mixture:

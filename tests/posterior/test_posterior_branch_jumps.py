@@ -6,7 +6,7 @@ import numpy as np
 from kill_target import run
 from posterior_targets import Gaussian
 
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity, to_datasets
 
 

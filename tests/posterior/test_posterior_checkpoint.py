@@ -11,9 +11,9 @@ import pytest
 from kill_target import run
 from posterior_targets import Gaussian
 
+from bayesoleo._storage import files as atomic
 from bayesoleo.errors import ResultsError
-from bayesoleo.posterior.sampling import checkpoint
-from bayesoleo.storage import atomic
+from bayesoleo.posterior import _checkpoints as checkpoint
 
 CHILD = Path(__file__).with_name("kill_target.py")
 

@@ -8,7 +8,7 @@ from bayesoleo import plots
 from bayesoleo.errors import ResultsError
 from bayesoleo.estimation import FunctionProblem, estimate, indifference, sampling_distribution
 from bayesoleo.model import Normal
-from bayesoleo.plots.pairs import inside
+from bayesoleo.plots._posterior import inside
 from bayesoleo.posterior import (
     LogDensity,
     compare,

@@ -7,10 +7,10 @@ import pytest
 from posterior_gas_spring import GasSpring, gas_spring, measured
 from scipy import stats
 
-from bayesoleo.estimation.problems.problem import Misfit
-from bayesoleo.model.priors import LogNormal, Normal
+from bayesoleo.estimation._problem import Misfit
+from bayesoleo.model._priors import LogNormal, Normal
 from bayesoleo.posterior import LogDensity
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._orbit import Status
 
 
 def test_value_is_likelihood_times_prior():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.posterior import compare_with_point
-from bayesoleo.posterior.sampling.diagnostics import (
+from bayesoleo.posterior._diagnostics import (
     autocorrelation_time,
     effective_size,
     nested_rhat,

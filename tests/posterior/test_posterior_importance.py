@@ -5,8 +5,7 @@ import pytest
 from posterior_targets import Banana, Gaussian
 from scipy import stats
 
-from bayesoleo.error_models.differences import derivatives
-from bayesoleo.error_models.fitted_start import climb
+from bayesoleo.error_models._fitting import climb, derivatives
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import Mixture, importance_sample
 

@@ -8,11 +8,11 @@ from posterior_gas_spring import GasSpring, gas_spring, measured
 from scipy import stats
 
 from bayesoleo.errors import InputError
-from bayesoleo.model.priors import Normal
+from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity, Mixture, Mode, find_mode, laplace_mixture
-from bayesoleo.posterior.approximation.laplace import gauss_newton_covariance, mixture_of
-from bayesoleo.posterior.approximation.mixture import DEGREES_OF_FREEDOM
-from bayesoleo.solvers.status import Status
+from bayesoleo.posterior._laplace import gauss_newton_covariance, mixture_of
+from bayesoleo.posterior._mixture import DEGREES_OF_FREEDOM
+from bayesoleo.solvers._orbit import Status
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from posterior_targets import Gaussian
 from scipy import stats
 
 from bayesoleo.posterior import Mixture
-from bayesoleo.posterior.sampling.moves import (
+from bayesoleo.posterior._ensemble_moves import (
     Counted,
     Grouped,
     IndependenceMove,

@@ -9,7 +9,7 @@ from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
-from bayesoleo.posterior.sampling.segment import REASONS
+from bayesoleo.posterior._checkpoints import REASONS
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
@@ -62,8 +62,8 @@ def test_a_curved_density_that_no_mixture_fits():
 
 
 def test_a_first_look_ends_after_so_many_evaluations_and_says_so(monkeypatch):
-    monkeypatch.setattr("bayesoleo.posterior.sampling.sample.QUICK_EVALUATIONS", 4_000)
-    monkeypatch.setattr("bayesoleo.posterior.sampling.sample.QUICK_STEPS", 1)
+    monkeypatch.setattr("bayesoleo.posterior._sampler.QUICK_EVALUATIONS", 4_000)
+    monkeypatch.setattr("bayesoleo.posterior._sampler.QUICK_STEPS", 1)
     target = BentRidge()
     samples = sample(target, normal_mixture(target.sd), seed=1, quick=True, progress=False)
     assert not samples.reached

@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bayesoleo.model.priors import LogNormal, Normal, TruncatedNormal, Uniform
-from bayesoleo.model.transforms import Transform, Transforms
+from bayesoleo.model._priors import (
+    LogNormal,
+    Normal,
+    Transform,
+    Transforms,
+    TruncatedNormal,
+    Uniform,
+)
 
 SUPPORTS = [(-np.inf, np.inf), (2.0, np.inf), (-np.inf, -3.0), (1e3, 5e3)]
 

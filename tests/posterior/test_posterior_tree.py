@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from posterior_targets import Gaussian
 
-from bayesoleo.model.priors import LogNormal, Normal
+from bayesoleo.model._priors import LogNormal, Normal
 from bayesoleo.posterior import Mixture, sample, to_datasets
 
 

@@ -7,11 +7,11 @@ import pytest
 from scipy import stats
 
 from bayesoleo.error_models import error_model
-from bayesoleo.error_models.base import RunSamples
-from bayesoleo.error_models.discrepancy import basis, spectrum
-from bayesoleo.error_models.shared import _dense, _diagonal
-from bayesoleo.estimation.problems.campaign_problem import _samples_of
-from bayesoleo.prediction.records import Harmonics, Record
+from bayesoleo.error_models._base import RunSamples
+from bayesoleo.error_models._discrepancy import basis, spectrum
+from bayesoleo.error_models._shared import _dense, _diagonal
+from bayesoleo.estimation._campaign_problem import _samples_of
+from bayesoleo.prediction._records import Harmonics, Record
 
 WORD = "shared-discrepancy"
 

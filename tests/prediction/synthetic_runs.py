@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bayesoleo.model import Model
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Harmonics, Record
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Harmonics, Record
 
 CONDITIONS = {"initial_pressure": 4.9e5, "ambient_temperature": 293.0}
 PERIODS, PER_PERIOD = 3, 127.4

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from bayesoleo.errors import InputError
-from bayesoleo.prediction.branch import follow_branch
-from bayesoleo.prediction.limit_cycle import limit_cycle
-from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._branches import follow_branch, limit_cycle
+from bayesoleo.prediction._simulate import RunPlan, motion
+from bayesoleo.solvers._orbit import Status
 from bayesoleo.systems import system
 
 #: The swing is read at the mesh's points. The widest gap between Radau's is 0.49 of a step, so that

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from bayesoleo.prediction.band_limited import (
+from bayesoleo.prediction._band_limited import (
     band_limited,
     band_limited_channels,
     declared,

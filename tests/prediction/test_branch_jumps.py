@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesoleo.prediction.branch import follow_branch
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.prediction.stability import Stability, count_unstable, swings
+from bayesoleo.prediction._branches import follow_branch
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._stability import Stability, count_unstable, swings
 from bayesoleo.systems import system
 
 #: Between the folds of the declared Duffing system under 6 N, which are at 2.37 and 5.27 Hz.

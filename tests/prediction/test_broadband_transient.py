@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.solvers._orbit import Status
 
 STEP, COUNT = 1.0 / 600.0, 3000
 OMEGA = 2 * np.pi * 60.0

@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from bayesoleo import system
-from bayesoleo.cli import options
+from bayesoleo._cli import options
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.simulating import to_simulated_run
+from bayesoleo._workflow.task import check
 from bayesoleo.data import load_campaign, reduce_campaign, write_campaign
+from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.motion_error import motion_error
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of, simulate_run
-from bayesoleo.prediction.transient import TransientRun
-from bayesoleo.simulation import to_simulated_run
-from bayesoleo.solvers.schemes.choose import SOLVERS
-from bayesoleo.solvers.status import Status
-from bayesoleo.tracing.fitting.fit import Numerics, fit_model
-from bayesoleo.workflow import Settings, check
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.prediction._run_errors import motion_error
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of, simulate_run
+from bayesoleo.prediction._transient_run import TransientRun
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import SOLVERS
 
 SAMPLES = {"periods": 3.0, "samples_per_period": 200.0}
 #: By name: the model, its runs, and where estimates start, over the truth.

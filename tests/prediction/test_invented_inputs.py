@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.invented import without_invented
+from bayesoleo.prediction._input_bandwidth import without_invented
+from bayesoleo.prediction._records import transient_record
 
 STEP = 1e-3
 TIME = STEP * np.arange(6000)

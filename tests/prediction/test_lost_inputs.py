@@ -7,9 +7,8 @@ import pytest
 from scipy import signal
 
 from bayesoleo.data import HarmonicBasis, significant_harmonics
-from bayesoleo.prediction.arrays import transient_record
-from bayesoleo.prediction.lost import lost_inputs
-from bayesoleo.prediction.records import Record
+from bayesoleo.prediction._input_bandwidth import lost_inputs
+from bayesoleo.prediction._records import Record, transient_record
 
 STEP = 1e-3
 TIME = STEP * np.arange(8000)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bayesoleo.errors import CampaignError
-from bayesoleo.model.expressions import within
-from bayesoleo.prediction.inputs import harmonics_of, input_rows, signal_of
-from bayesoleo.prediction.records import Harmonics, Record
+from bayesoleo.model._expressions import within
+from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
+from bayesoleo.prediction._records import Harmonics, Record
 
 
 def harmonics(**amplitudes):

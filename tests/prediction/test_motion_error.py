@@ -7,12 +7,12 @@ import pytest
 from scipy.linalg import expm
 
 from bayesoleo.model import Dof, Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.motion_error import motion_error, outputs_of
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.prediction.smoothing import exact_signal
-from bayesoleo.prediction.transient import TransientRun
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._band_limited import exact_signal
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._run_errors import motion_error, outputs_of
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._transient_run import TransientRun
 
 K, C = 100.0, 0.5
 MODEL = Model(

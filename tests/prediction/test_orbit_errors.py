@@ -5,11 +5,11 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.solvers.schemes.choose import SOLVERS
-from bayesoleo.solvers.shooting import shoot
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._simulate import RunPlan, motion
+from bayesoleo.solvers import _shooting as shoot
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import SOLVERS
 
 OWN = SOLVERS[:-1]
 PHASES = np.arange(4096) / 4096
@@ -76,7 +76,7 @@ def test_a_steep_function_of_the_input_is_resolved(method, tau):
 
 def test_without_finer_steps_the_error_is_told(monkeypatch):
     """Shooting alone passes over the step of the function, and its estimate knows."""
-    from bayesoleo.prediction import solver
+    from bayesoleo.prediction import _periodic_solver as solver
 
     monkeypatch.setattr(solver, "MORE_SHOTS", 0)
     found = periodic_orbit(lag(1e-6, 50.0), COSINE, None, "shooting", backend="numpy", jobs=1)
@@ -145,7 +145,7 @@ def test_a_stop_of_equal_steps_is_not_called_converged():
 
 
 def test_an_error_that_cannot_be_estimated_has_a_status(monkeypatch):
-    from bayesoleo.solvers.adaptive import error_estimate
+    from bayesoleo.solvers import _error_estimate as error_estimate
 
     monkeypatch.setattr(error_estimate, "_look", lambda *_: None)
     found = periodic_orbit(lag(1e-2, 1.0), COSINE, backend="numpy", jobs=1)
@@ -159,8 +159,8 @@ def test_an_error_that_cannot_be_estimated_has_a_status(monkeypatch):
 
 def test_shooting_by_given_steps_closes_on_them():
     """The same motion by steps half as long; none where the steps are far too long."""
-    from bayesoleo.prediction.dynamics import dynamics_of
-    from bayesoleo.prediction.simulate import record_of
+    from bayesoleo.prediction._inputs import dynamics_of
+    from bayesoleo.prediction._simulate import record_of
 
     model = lag(1e-2, 1.0)
     dynamics = dynamics_of(model, record_of(model, COSINE), backend="numpy")

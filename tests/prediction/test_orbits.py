@@ -6,15 +6,15 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo import system
 from bayesoleo.errors import InputError, ModelError
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.inputs import input_rows
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.schemes.choose import SOLVERS
-from bayesoleo.solvers.shooting.library import shoot_by_library
-from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.transient.state_space import StateSpace
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._inputs import input_rows
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._library_integrator import shoot_by_library
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import SOLVERS
+from bayesoleo.solvers._state_space import StateSpace
 
 DUFFING = system("duffing")
 PLAN = RunPlan("a", 1.1, {"force": motion(0.1, [3.0, 0.0, 0.5])})

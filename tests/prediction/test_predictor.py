@@ -8,12 +8,11 @@ from synthetic_runs import answered, oleo_runs, run, stroke
 
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Condition, Model, Output, Parameter
-from bayesoleo.model.drive import driven_by
-from bayesoleo.prediction.layout import Layout
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.status import Status
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.model._drive import driven_by
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._predictor import Layout, Predictor
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.systems._oleo import thermomechanical_oleo
 
 
 def force_law() -> Model:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from synthetic_runs import answered, oleo_runs
 
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.model.drive import driven_by
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.model._drive import driven_by
 from bayesoleo.posterior import LogDensity
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Harmonics
-from bayesoleo.solvers.status import Status
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Harmonics
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.systems._oleo import thermomechanical_oleo
 
 STEPS, VECTORS = 128, 23
 ORDERS = np.arange(12)

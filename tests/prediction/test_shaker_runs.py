@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from synthetic_runs import harmonics, run, stroke
 
-from bayesoleo.model.drive import driven_by
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.run import RunPredictor
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.status import Status
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.model._drive import driven_by
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import solve_from_guess
+from bayesoleo.systems._oleo import thermomechanical_oleo
 
 #: Label, static position and amplitude in mm, frequency in Hz (Verbeek 1993, table 5.1), with full
 #: and lost amplitudes taken as 125 mm and those that overlap the stop reduced to stay above it.

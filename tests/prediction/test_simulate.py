@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import estimate
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Condition, Model, Output, Parameter, driven_by
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
-from bayesoleo.systems.oleo import thermomechanical_oleo
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._simulate import RunPlan, motion, simulate_run
+from bayesoleo.systems._oleo import thermomechanical_oleo
 
 OSCILLATOR = Model(
     "oscillator",

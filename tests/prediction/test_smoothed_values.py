@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesoleo.prediction.smoothing import exact_signal, smooth_signal
+from bayesoleo.prediction._band_limited import exact_signal, smooth_signal
 
 STEP = 0.02
 TIME = STEP * np.arange(120)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._orbit import Status
 
 MODEL = Model(
     "friction oscillator",

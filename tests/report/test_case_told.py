@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from bayesoleo import schema
-from bayesoleo.report.case import case
-from bayesoleo.report.tables import failed, output_units
+from bayesoleo import _schema as schema
+from bayesoleo._report.page import case
+from bayesoleo._report.tables import failed, output_units
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import itertools
 
 import pytest
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
+from bayesoleo._report import tables as yardstick
+from bayesoleo._report.sentences import headline
 from bayesoleo.effects import catalogue
-from bayesoleo.effects.titles import called, in_sentence, with_titles
-from bayesoleo.report import yardstick
-from bayesoleo.report.sentences import headline
+from bayesoleo.effects._catalogue import called, in_sentence, with_titles
 
 
 def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowest=0.0, **more):

@@ -8,19 +8,20 @@ import re
 import pytest
 import xarray as xr
 
-from bayesoleo import schema
-from bayesoleo.errors import ResultsError
-from bayesoleo.report import render_report, sections, write_report
-from bayesoleo.report.images import Image, encode_formula
-from bayesoleo.report.sentences import headline, reason
-from bayesoleo.report.tables import (
+from bayesoleo import _schema as schema
+from bayesoleo._report import sections
+from bayesoleo._report.page import render_report, write_report
+from bayesoleo._report.sections import Image, encode_formula
+from bayesoleo._report.sentences import headline, reason
+from bayesoleo._report.tables import (
     diagnostics,
     diagnostics_by_parameter,
     expected_text,
     format_short,
     records,
 )
-from bayesoleo.storage import read_tree, write_tree
+from bayesoleo._storage.result_files import read_tree, write_tree
+from bayesoleo.errors import ResultsError
 
 
 @pytest.fixture(scope="module")

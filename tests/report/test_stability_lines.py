@@ -9,11 +9,11 @@ import json
 import pytest
 from rich.console import Console
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
+from bayesoleo._report.page import render_report
+from bayesoleo._report.sentences import stability
+from bayesoleo._report.terminal import print_summary
 from bayesoleo.errors import ResultsError
-from bayesoleo.report import print_summary
-from bayesoleo.report.page import render_report
-from bayesoleo.report.sentences import stability
 
 
 def with_runs(tree, **runs):

@@ -7,7 +7,7 @@ import json
 
 from rich.console import Console
 
-from bayesoleo.report import print_summary
+from bayesoleo._report.terminal import print_summary
 
 
 def printed(summary):

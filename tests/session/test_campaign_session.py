@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import bayesoleo as bo
-from bayesoleo import schema, workflow
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._session.campaign import Campaign
 from bayesoleo.effects import find_effect
-from bayesoleo.session import Campaign
 from tests.session.shown import check_shown
 from tests.small_campaigns import damper
 

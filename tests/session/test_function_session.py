@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import bayesoleo as bo
-from bayesoleo import schema
+from bayesoleo import _schema as schema
 from tests.session.conftest import line
 from tests.session.shown import check_shown
 

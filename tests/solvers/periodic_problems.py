@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from bayesoleo.model import Condition, Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.records import Harmonics
-from bayesoleo.solvers.periodic.solve import Boundary
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.solvers.schemes.mesh import Mesh
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._records import Harmonics
+from bayesoleo.solvers._mesh import Mesh
+from bayesoleo.solvers._periodic import Boundary
+from bayesoleo.solvers._schemes import scheme
 
 
 def harmonics(**coefficients: complex) -> Harmonics:

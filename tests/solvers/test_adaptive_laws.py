@@ -9,13 +9,12 @@ from scipy.integrate import solve_bvp, solve_ivp
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.solvers.adaptive.crossings import Crossings, find_crossings
-from bayesoleo.solvers.adaptive.switched import state_rows
-from bayesoleo.solvers.adaptive.warp import SAME, extrapolate, warp_between
-from bayesoleo.solvers.schemes.mesh import equidistant
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._simulate import RunPlan, motion
+from bayesoleo.solvers._mesh import equidistant
+from bayesoleo.solvers._moving_edges import SAME, extrapolate, warp_between
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._switched import Crossings, find_crossings, state_rows
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

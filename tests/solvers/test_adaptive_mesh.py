@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from periodic_problems import duffing, friction_oscillator, harmonics
 
-from bayesoleo.model.kernels import kernels
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.prediction.solver import periodic_problem
-from bayesoleo.solvers.adaptive.moving_edges import solve_on
-from bayesoleo.solvers.adaptive.refine import solve_adaptive
-from bayesoleo.solvers.adaptive.switched import PeriodicProblem
-from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
-from bayesoleo.solvers.schemes.tableau import tableau
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._kernels import kernels
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._periodic_solver import periodic_problem
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._adaptive_mesh import solve_adaptive
+from bayesoleo.solvers._mesh import Mesh, equidistant, tableau
+from bayesoleo.solvers._moving_edges import solve_on
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._switched import PeriodicProblem
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

@@ -6,8 +6,8 @@ from periodic_problems import coupled, duffing, friction_oscillator, harmonics, 
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.periodic.solve import solve_periodic
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import solve_periodic
 
 pytestmark = pytest.mark.reference
 

@@ -7,10 +7,10 @@ import pytest
 from periodic_problems import harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
-from bayesoleo.solvers.schemes.backward import FIRST, SECOND
-from bayesoleo.solvers.schemes.tableau import tableau
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._mesh import tableau
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import sensitivities, solve_periodic
+from bayesoleo.solvers._schemes import FIRST, SECOND
 
 FORCE, FREQUENCY = harmonics(h0=0.4, h1=0.8 - 0.3j, h3=0.2 + 0.5j), 0.2
 

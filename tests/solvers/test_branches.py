@@ -9,12 +9,12 @@ import pytest
 from periodic_problems import duffing, harmonics, problem, rest
 from scipy.integrate import solve_ivp
 
-from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.branches.autonomous import solve_limit_cycle
-from bayesoleo.solvers.branches.follow import follow
-from bayesoleo.solvers.periodic.solve import Boundary, solve_periodic
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers._branches import follow
+from bayesoleo.solvers._limit_cycles import solve_limit_cycle
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Boundary, solve_periodic
+from bayesoleo.solvers._schemes import scheme
 from bayesoleo.systems import system
 
 N = 96

@@ -6,12 +6,11 @@ from periodic_problems import coupled, duffing, harmonics, problem, relaxation, 
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import Boundary, sensitivities, solve_periodic
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.solvers.schemes.mesh import equidistant
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers._mesh import equidistant
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Boundary, sensitivities, solve_from_guess, solve_periodic
+from bayesoleo.solvers._schemes import scheme
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 ORDER = {"central": 2, "central-velocity": 2, "central-acceleration": 2, "central-euler": 1}

@@ -5,10 +5,10 @@ import pytest
 from periodic_problems import coupled, duffing, harmonics, problem, relaxation, rest
 
 from bayesoleo.errors import InputError
-from bayesoleo.solvers.periodic.solve import solve_periodic
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.solvers.schemes.tableau import tableau
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._mesh import tableau
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import solve_periodic
+from bayesoleo.solvers._schemes import scheme
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 SYSTEMS = {

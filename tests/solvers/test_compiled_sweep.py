@@ -10,15 +10,18 @@ from periodic_problems import (
     friction_oscillator,
     gas_spring,
     harmonics,
+    problem as discretised,
     relaxation,
     rest,
 )
-from periodic_problems import problem as discretised
 
-from bayesoleo.solvers.periodic import arrangement, newton
-from bayesoleo.solvers.periodic import solve as periodic
-from bayesoleo.solvers.periodic.extrapolation import Extrapolation
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers import (
+    _period_arrangement as arrangement,
+    _periodic as periodic,
+    _periodic_newton as newton,
+)
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic_newton import Extrapolation
 
 FORCE = harmonics(h0=0.3, h1=1.0, h3=0.2j)
 #: The longest to compile; the model goes through the default schemes, and others through these.

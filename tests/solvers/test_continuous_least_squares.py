@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesoleo.solvers.segments.constrained import ContinuousLeastSquares
+from bayesoleo.solvers._multiple_shooting import ContinuousLeastSquares
 
 #: Measurements at each node: enough for one node alone.
 K = 7

@@ -7,9 +7,8 @@ import pytest
 from periodic_problems import coupled, duffing, gas_spring, harmonics, problem, relaxation, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
-from bayesoleo.solvers.status import Status, count
+from bayesoleo.solvers._orbit import Status, count
+from bayesoleo.solvers._periodic import sensitivities, solve_from_guess, solve_periodic
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 END_STOP = harmonics(h0=23.0, h1=20.0)

@@ -5,12 +5,11 @@ import pytest
 from periodic_problems import harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion
-from bayesoleo.prediction.stability import count_unstable
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.periodic.solve import Boundary
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._simulate import RunPlan, motion
+from bayesoleo.prediction._stability import count_unstable
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Boundary, solve_from_guess
 
 
 def parameters(*names: str) -> dict[str, Parameter]:

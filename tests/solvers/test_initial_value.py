@@ -8,11 +8,11 @@ from test_state_space import state_space
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.model.switching import analytic_pieces
-from bayesoleo.solvers.shooting.initial_value import Dynamics, solve_initial_value
-from bayesoleo.solvers.shooting.signals import evaluate, periodic_signal, piecewise_signal
-from bayesoleo.solvers.status import Status
+from bayesoleo.model._derivatives import analytic_pieces
+from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers._initial_value import Dynamics, solve_initial_value
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._switching import evaluate, periodic_signal, piecewise_signal
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)

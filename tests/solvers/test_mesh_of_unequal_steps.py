@@ -6,10 +6,10 @@ from periodic_problems import coupled, duffing, harmonics, problem, relaxation, 
 from scipy.integrate import solve_ivp
 
 from bayesoleo.errors import InputError
-from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
-from bayesoleo.solvers.schemes.choose import scheme
-from bayesoleo.solvers.schemes.mesh import Mesh, equidistant
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._mesh import Mesh, equidistant
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import sensitivities, solve_periodic
+from bayesoleo.solvers._schemes import scheme
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 SYSTEMS = {

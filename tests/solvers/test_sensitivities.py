@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from periodic_problems import coupled, duffing, friction_oscillator, harmonics, problem, rest
 
-from bayesoleo.solvers.periodic.solve import sensitivities, solve_periodic
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import sensitivities, solve_periodic
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 FREQUENCY = 0.2

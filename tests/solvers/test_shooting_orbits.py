@@ -2,13 +2,20 @@
 
 import numpy as np
 import pytest
-from periodic_problems import coupled, duffing, friction_oscillator, gas_spring, harmonics, rest
-from periodic_problems import problem as discretised
+from periodic_problems import (
+    coupled,
+    duffing,
+    friction_oscillator,
+    gas_spring,
+    harmonics,
+    problem as discretised,
+    rest,
+)
 from test_initial_value import FORCE, FREQUENCY, dynamics
 
-from bayesoleo.solvers.periodic.continuation import solve_from_guess
-from bayesoleo.solvers.shooting.shoot import solve_shooting
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import solve_from_guess
+from bayesoleo.solvers._shooting import solve_shooting
 from bayesoleo.systems import system
 
 END_STOP = harmonics(h0=23.0, h1=20.0)

@@ -5,9 +5,9 @@ import pytest
 from periodic_problems import coupled, duffing, harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers.periodic.solve import Solution, sensitivities, solve_periodic
-from bayesoleo.solvers.schemes import sparse
-from bayesoleo.solvers.status import Status
+from bayesoleo.solvers import _elimination as sparse
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Solution, sensitivities, solve_periodic
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 

@@ -10,9 +10,9 @@ from periodic_problems import coupled, duffing, friction_oscillator, gas_spring,
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.transient.integrate import _right_side
-from bayesoleo.solvers.transient.state_space import StateSpace
+from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers._library_integrator import _right_side
+from bayesoleo.solvers._state_space import StateSpace
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 FREQUENCY = 0.2

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from periodic_problems import friction_oscillator
 
-from bayesoleo.model.kernels import kernels
-from bayesoleo.solvers.periodic.solve import Boundary
-from bayesoleo.solvers.schemes.collocation import Collocation
-from bayesoleo.solvers.schemes.mesh import equidistant
-from bayesoleo.solvers.schemes.tableau import tableau
-from bayesoleo.solvers.status import Status
-from bayesoleo.solvers.transient.solve import newton, solve_transient
+from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._mesh import equidistant, tableau
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Boundary
+from bayesoleo.solvers._transient import newton, solve_transient
 
 STEPS, TIME = 1024, 40.0
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bayesoleo.model import Dof, Model, Output, Parameter
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.simulate import RunPlan, motion, record_of
-from bayesoleo.solvers.schemes.closure import balance
-from bayesoleo.solvers.status import Status
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.solvers._elimination import balance
+from bayesoleo.solvers._orbit import Status
 
 UNITS = (1e-12, 1e-9, 1.0, 1e9)
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from small_campaigns import damper
 
+from bayesoleo._storage.files import check_writable, path_of
+from bayesoleo._storage.resume import digest, keep_state, kept_state
 from bayesoleo.effects import catalogue, force_effect
 from bayesoleo.errors import InputError, ResultsError
-from bayesoleo.storage import check_writable, path_of
-from bayesoleo.storage.digest import digest
-from bayesoleo.storage.kept import keep_state, kept_state
 
 KEY = {"campaign": "a", "model": "b"}
 
@@ -82,7 +81,7 @@ def test_a_value_that_holds_itself_has_a_digest():
 
 def test_digests_do_not_depend_on_the_process():
     code = (
-        "from bayesoleo.effects import catalogue; from bayesoleo.storage.digest import digest;"
+        "from bayesoleo.effects import catalogue; from bayesoleo._storage.resume import digest;"
         "print(digest((catalogue(), {'a', 'b', 'c'})))"
     )
     done = subprocess.run(

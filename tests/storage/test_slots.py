@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bayesoleo._storage.resume import Slots
 from bayesoleo.errors import ResultsError
-from bayesoleo.storage.slots import Slots
 
 
 def test_pieces_come_back_in_any_order(tmp_path):

@@ -9,7 +9,7 @@ import math
 import jsonschema
 import pytest
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
 from bayesoleo.errors import ResultsError
 
 RUN = {"role": "fit", "rms": 3.0, "repeating": 2.0, "noise": 1.0, "ratio_to_noise": 2.0}

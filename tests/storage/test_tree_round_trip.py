@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bayesoleo import schema
+from bayesoleo import _schema as schema
+from bayesoleo._storage.files import write_text_atomic
+from bayesoleo._storage.result_files import provenance, read_tree, write_tree
 from bayesoleo.errors import ResultsError
-from bayesoleo.storage import provenance, read_tree, write_text_atomic, write_tree
 
 TEXT = st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=12)
 ENDINGS = ["nc", "zarr"]

@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.errors import InputError
 from bayesoleo.model import driven_by
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
 from bayesoleo.systems import system
-from bayesoleo.systems.drop import drop_test
+from bayesoleo.systems._oleo import drop_test
 
 
 def silent_record(model, time) -> Record:

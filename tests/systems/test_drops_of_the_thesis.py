@@ -4,10 +4,10 @@ damping as it is and scaled, and the slow cooling of the gas."""
 import numpy as np
 import pytest
 
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.prediction.records import Record
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
 from bayesoleo.systems import system
-from bayesoleo.systems.drop import drop_test
+from bayesoleo.systems._oleo import drop_test
 
 pytestmark = pytest.mark.slow
 

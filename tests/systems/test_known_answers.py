@@ -8,11 +8,10 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model import driven_by
-from bayesoleo.model.expressions import derivative_symbol, symbol
-from bayesoleo.prediction.branch import follow_branch
-from bayesoleo.prediction.limit_cycle import limit_cycle
-from bayesoleo.prediction.orbits import periodic_orbit
-from bayesoleo.prediction.simulate import RunPlan, motion, simulate_run
+from bayesoleo.model._expressions import derivative_symbol, symbol
+from bayesoleo.prediction._branches import follow_branch, limit_cycle
+from bayesoleo.prediction._orbits import periodic_orbit
+from bayesoleo.prediction._simulate import RunPlan, motion, simulate_run
 from bayesoleo.systems import system, systems
 
 #: What this file knows the answers of; the variants of the oleo share theirs.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesoleo.systems.verbeek import SHAKER_RUNS, TABLE_6_2, TABLE_6_5, TABLE_6_7
+from bayesoleo.systems._oleo import SHAKER_RUNS, TABLE_6_2, TABLE_6_5, TABLE_6_7
 
 
 def test_every_run_has_its_rows():

@@ -8,10 +8,10 @@ import pytest
 import sympy as sp
 from matplotlib.mathtext import MathTextParser
 
-from bayesoleo.effects.units import parse_unit, unit_of
+from bayesoleo.effects._places import parse_unit, unit_of
 from bayesoleo.errors import InputError
 from bayesoleo.model import driven_by
-from bayesoleo.model.expressions import parse, symbol
+from bayesoleo.model._expressions import parse, symbol
 from bayesoleo.systems import describe, system, systems
 
 DIMENSIONLESS = ("van_der_pol", "lorenz", "rossler")

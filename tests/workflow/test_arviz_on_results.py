@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo import schema, workflow
-from bayesoleo.storage import read_tree
-from bayesoleo.workflow import Settings
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._storage.result_files import read_tree
+from bayesoleo._workflow.settings import Settings
 
 plt = pytest.importorskip("matplotlib.pyplot")
 

@@ -12,14 +12,14 @@ import pytest
 import xarray as xr
 from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
 
-from bayesoleo import schema, workflow
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._storage.result_files import read_tree
+from bayesoleo._workflow.predicting import predict
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.assessment import assess
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import BayesoleoError, InputError
-from bayesoleo.forecast import predict
-from bayesoleo.storage import read_tree
 from bayesoleo.systems import system
-from bayesoleo.workflow import Settings
 
 EFFECTS = tuple(
     map(find_effect, ("coulomb_friction", "quintic_stiffness", "mass_error", "constant_force"))

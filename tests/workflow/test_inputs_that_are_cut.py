@@ -5,9 +5,10 @@ import warnings
 import numpy as np
 import pytest
 
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import prepare
 from bayesoleo.errors import DataWarning
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.workflow import Settings, prepare
 
 TIME = 1e-3 * np.arange(6000)
 MODEL = Model(

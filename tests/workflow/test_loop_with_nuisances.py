@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from small_campaigns import CUBIC, FRICTION, damper, damper_campaign
 
-from bayesoleo import schema, workflow
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.effects import find_effect
-from bayesoleo.workflow import Settings
 
 OFFSET, ACCURACY = 1.5, 2.0
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness", "mass_error")))

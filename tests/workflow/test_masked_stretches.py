@@ -10,23 +10,21 @@ import numpy as np
 import pytest
 from small_campaigns import CUBIC, DAMPING, STIFFNESS, damper, damper_campaign, spring_damper_force
 
-from bayesoleo import schema, workflow
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._workflow.predicting import predict
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.assessment import assess
 from bayesoleo.data import load_campaign, reduce_campaign, reduce_run
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._fit import Numerics, without_masked
+from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._score_tests import score_all
+from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import CampaignError
 from bayesoleo.estimation import estimate, sampling_distribution
-from bayesoleo.estimation.problems.campaign_problem import CampaignProblem
-from bayesoleo.forecast import predict
-from bayesoleo.prediction.predictor import Predictor
-from bayesoleo.tracing.deciding.state import fit_state
-from bayesoleo.tracing.fitting.assembly import Assembly
-from bayesoleo.tracing.fitting.fit import Numerics
-from bayesoleo.tracing.fitting.masked import without_masked
-from bayesoleo.tracing.fitting.roles import assign
-from bayesoleo.tracing.scoring.scales import scales_of
-from bayesoleo.tracing.scoring.score import score_all
-from bayesoleo.workflow import Settings
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.prediction._predictor import Predictor
 
 SETTINGS = Settings(jobs=1, steps=64, quick=True)
 TRUTH = {"damping": DAMPING, "stiffness": STIFFNESS, "cubic": CUBIC}

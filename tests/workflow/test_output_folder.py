@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from bayesoleo._workflow.output import FILES, OLDER, RESULTS, ResultFolder
 from bayesoleo.errors import InputError
-from bayesoleo.workflow.output import FILES, OLDER, RESULTS, ResultFolder
 
 
 def written(folder, value=0.0):

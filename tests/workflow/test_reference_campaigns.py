@@ -7,13 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from bayesoleo import schema, workflow
-from bayesoleo.modelfile import load_model
-from bayesoleo.workflow import Settings
-from bayesoleo.workflow.closing import run_loop
-from bayesoleo.workflow.output import ResultFolder
-from bayesoleo.workflow.result import write_result
-from bayesoleo.workflow.stages import Stages
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._workflow.closing import run_loop
+from bayesoleo._workflow.model_files import load_model
+from bayesoleo._workflow.output import ResultFolder, Stages
+from bayesoleo._workflow.result import write_result
+from bayesoleo._workflow.settings import Settings
 
 pytestmark = pytest.mark.reference
 STUDIES = Path(__file__).parents[2] / "studies" / "measured"

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from small_campaigns import damper, damper_campaign, spring_damper_force
 
-from bayesoleo import plots, workflow
+from bayesoleo import _workflow as workflow, plots
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import prior_sensitivity
 

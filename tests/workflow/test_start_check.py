@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo import workflow
-from bayesoleo.data import Campaign
+from bayesoleo import _workflow as workflow
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import StartCheck, about_start
+from bayesoleo.data import CampaignData
 from bayesoleo.errors import DataWarning
 from bayesoleo.model import Model
 from bayesoleo.systems import system
-from bayesoleo.workflow import Settings
-from bayesoleo.workflow.start_check import StartCheck, about_start
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory) -> Campaign:
+def campaign(tmp_path_factory) -> CampaignData:
     return damper_campaign(tmp_path_factory.mktemp("damper")).campaign
 
 
-def told(campaign: Campaign, model: Model, **factors: float) -> list[str]:
+def told(campaign: CampaignData, model: Model, **factors: float) -> list[str]:
     """What is found of the start where channels are multiplied."""
     runs = tuple(
         replace(run, samples={k: factors.get(k, 1.0) * values for k, values in run.samples.items()})

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo import plots, schema, workflow
+from bayesoleo import _schema as schema, _workflow as workflow, plots
+from bayesoleo._report.page import render_report
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
-from bayesoleo.report import render_report
-from bayesoleo.workflow import Settings
 
 RUNS = (("a", 1.0, 0.010, "fit"), ("b", 2.0, 0.010, "fit"), ("c", 1.5, 0.010, "hold-out"))
 SPRINGS = tuple(map(find_effect, ("linear_stiffness", "cubic_stiffness")))

@@ -15,14 +15,15 @@ import pytest
 from small_campaigns import damper, damper_campaign
 from typer.testing import CliRunner
 
-from bayesoleo import schema, workflow
-from bayesoleo.cli import app
-from bayesoleo.cli.shell import UNFINISHED
+from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._cli import app
+from bayesoleo._cli.shell import UNFINISHED
+from bayesoleo._storage.result_files import read_tree
+from bayesoleo._workflow import closing, output, result
+from bayesoleo._workflow.settings import Settings
+from bayesoleo.discovery import _loop as search
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError, UnfinishedError
-from bayesoleo.storage import read_tree
-from bayesoleo.tracing.deciding import loop as search
-from bayesoleo.workflow import Settings, closing, output, result
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness")))
 SETTINGS = Settings(quick=True, jobs=1, effects=EFFECTS, seed=5)
@@ -142,7 +143,7 @@ def test_a_late_stage_that_fails_leaves_the_others(
 
 
 def test_a_figure_that_fails_leaves_the_page(campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr("bayesoleo.plots.records", broken)
+    monkeypatch.setattr("bayesoleo.plots._records", broken)
     with pytest.raises(UnfinishedError, match="figure of the data could not be drawn"):
         workflow.trace(campaign, damper(), SETTINGS, out=tmp_path)
     summary, page = read_back(tmp_path)
@@ -170,7 +171,7 @@ def test_without_a_folder_the_error_carries_what_is_known(campaign, monkeypatch)
 
 
 def test_a_sample_that_fails_leaves_the_estimate(campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr("bayesoleo.workflow.sampling.draw", broken)
+    monkeypatch.setattr("bayesoleo._workflow.estimating.draw", broken)
     with pytest.raises(UnfinishedError, match="posterior"):
         workflow.sample(campaign, damper(), SETTINGS, out=str(tmp_path))
     tree = read_tree(tmp_path / "results.nc")
@@ -277,7 +278,7 @@ sys.path.insert(0, {tests!r})
 from small_campaigns import damper
 from bayesoleo import workflow
 from bayesoleo.effects import find_effect
-from bayesoleo.workflow import Settings
+from bayesoleo._workflow import Settings
 
 def say(text):
     if text.startswith({stage!r}):

@@ -1,0 +1,286 @@
+"""How good an estimate is: ``assess`` tests its residuals, ``predict`` scores what it foresees,
+``replicate`` repeats its experiment.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bayesoleo import _schema as schema
+from bayesoleo._cli import options, shell, shell as tables
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from bayesoleo.assessment._residual_breakdown import Series
+
+
+PANEL = "How good an estimate is"
+REPLICATIONS = "replications.nc"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    shell.add(app, PANEL, assess, predict, replicate)
+
+
+def assess(
+    results: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULTS.nc", show_default=False, help="results.nc of close or trace."
+        ),
+    ],
+    stage: Annotated[
+        str | None,
+        typer.Option(
+            metavar="before|after",
+            show_default="after, where there is one",
+            help="The model as declared, or as extended.",
+        ),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            "--figure",
+            metavar="FILE.png",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw the assessment; one file an output, its name added.",
+        ),
+    ] = None,
+    run: Annotated[
+        str | None,
+        typer.Option(
+            "--run",
+            metavar="LABEL",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw the tests of this run instead, with the residual against every variable.",
+        ),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Test the residuals of a result: signs, normality, phase, variables, outliers, lack of fit.
+
+    One line for each output and run. A star marks what chance alone hardly gives. "over noise" is
+    what repeats from period to period over the noise of that average, "intraclass" the intraclass
+    correlation of one phase in different periods, "corr. time" the autocorrelation time of what
+    does not repeat, in samples.
+
+    \b
+    Examples:
+      bayesoleo assess bayesoleo-shaker/results.nc
+      bayesoleo assess results.nc --stage before --figure before.png
+      bayesoleo assess results.nc --figure tests.png --run a
+    """
+    from bayesoleo._storage.result_files import read_tree
+    from bayesoleo.assessment._assess import assess as test_residuals
+    from bayesoleo.assessment._residual_breakdown import series_of_tree
+
+    if figure is not None:
+        shell.check_writable(figure.parent)
+    series = series_of_tree(read_tree(results), stage)
+    drawn = _drawn(series, figure, run)
+    found = test_residuals(series)
+    if as_json:
+        numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
+        shell.print_json(tables.plain(numbers.to_dict()))
+    else:
+        shell.console().print(str(found), markup=False, soft_wrap=True)
+    if figure is not None:
+        _draw(found.data, drawn, figure)
+
+
+def _drawn(series: list[Series], figure: Path | None, run: str | None) -> list[Series]:
+    """The series whose tests are to be drawn one by one; none for all runs together."""
+    from bayesoleo.errors import ResultsError
+
+    if run is None:
+        return []
+    labels = list(dict.fromkeys(one.run for one in series))
+    if run not in labels:
+        raise ResultsError(
+            "there is no such run", key="--run", value=run, hint=f"there are {', '.join(labels)}"
+        )
+    if figure is None:
+        raise ResultsError("nothing to draw it to", key="--run", hint="give --figure FILE.png")
+    return [one for one in series if one.run == run]
+
+
+def _draw(data: xr.Dataset, drawn: list[Series], figure: Path) -> None:
+    """One file an output."""
+    from bayesoleo import plots
+
+    figures = {one.output: plots.residual_tests(one) for one in drawn}
+    if not figures:
+        outputs = [str(output) for output in data[schema.OUTPUT].values]
+        figures = {output: plots.assessment(data, output) for output in outputs}
+    for output, made in figures.items():
+        made.savefig(figure.with_stem(f"{figure.stem}-{output}"))
+
+
+def predict(
+    results: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULTS.nc",
+            show_default=False,
+            help="results.nc of estimate, sample or close.",
+        ),
+    ],
+    campaign: options.CampaignPath,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            "-m",
+            metavar="MODEL",
+            show_default="that of the result",
+            help="Another model with parameters of the same names, e.g. the specimen on another "
+            "rig. A file is code, and is run.",
+        ),
+    ] = None,
+    runs: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,…", show_default="all", help="Labels of the runs."),
+    ] = None,
+    draws: Annotated[int, typer.Option(min=2, metavar="N", help="Draws of the parameters.")] = 200,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            "--figure",
+            metavar="FILE.png",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw bands and transforms; one file an output, its name added.",
+        ),
+    ] = None,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Predict runs that were not used, with intervals, and score the prediction.
+
+    Parameters are drawn from the posterior of the result, or from the normal distribution about its
+    estimate; what it does not know, such as a parameter of a new run, from its prior. "rms"
+    is what came, "expected" what the prediction thought would; the part of the samples within the
+    interval, and the distance of their probability integral transform from uniform, say whether the
+    prediction knew how good it was.
+
+    \b
+    Examples:
+      bayesoleo predict point/results.nc shaker --runs c,h
+      bayesoleo predict point/results.nc drops --model drop.py:model --figure drops.png
+    """
+    from bayesoleo import _workflow as workflow
+    from bayesoleo._session.results import load_result
+    from bayesoleo._workflow.model_files import load_model
+
+    if figure is not None:
+        shell.check_writable(figure.parent)
+    labels = None if runs is None else [label.strip() for label in runs.split(",")]
+    found = load_result(results).predict(
+        workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet)),
+        model=None if model is None else load_model(model),
+        runs=labels,
+        draws=draws,
+        seed=seed,
+        jobs=jobs,
+    )
+    if as_json:
+        numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
+        shell.print_json(tables.plain(numbers.drop_vars(schema.TIME).to_dict()))
+    else:
+        shell.console().print(str(found), markup=False, soft_wrap=True)
+    if figure is not None:
+        for output in found.data[schema.OUTPUT].values:
+            path = figure.with_stem(f"{figure.stem}-{output}")
+            found.plot(output=str(output)).savefig(path)
+
+
+def replicate(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    out: options.Out = None,
+    replications: Annotated[
+        int,
+        typer.Option(
+            "--replications", "-n", min=2, metavar="N", help="Number of simulated experiments."
+        ),
+    ] = 1000,
+    runs: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,…", show_default="all to be fitted", help="Labels of the runs."),
+    ] = None,
+    true_inputs: Annotated[
+        bool, typer.Option("--true-inputs", help="Leave the measured inputs as they are.")
+    ] = False,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
+    quiet: options.Quiet = False,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
+    steps: options.Steps = None,
+) -> None:
+    """Repeat an experiment by simulation and compare the scatter of the estimates with theory.
+
+    The model is estimated once; its predictions with new noise, of the size that the records show,
+    are estimated again and again. Bias, standard deviation, what linearisation expects, and the
+    least that is possible (Cramér and Rao) are printed. With --out finished blocks are kept, from
+    which the same command goes on where it was stopped, and all of it is in replications.nc.
+
+    \b
+    Examples:
+      bayesoleo replicate shaker --model f16n2d2 --runs d -n 1000 --out scatter
+      bayesoleo replicate shaker --model f16n2d2 --out scatter --scheduler tcp://10.0.0.1:8786
+    """
+    import xarray as xr
+
+    from bayesoleo import _workflow as workflow
+    from bayesoleo._storage.result_files import provenance, write_tree
+    from bayesoleo._workflow.model_files import load_model
+    from bayesoleo.discovery._fit import fit_model
+    from bayesoleo.errors import CampaignError
+    from bayesoleo.estimation._sampling_distribution import sampling_distribution
+
+    if out is not None:
+        shell.check_writable(out)
+    chosen = options.settings(
+        seed=seed, jobs=jobs, drive=drive, scheme=scheme, solver=solver, steps=steps
+    )
+    task = workflow.prepare(campaign, load_model(model), chosen)
+    records = list(task.roles.fitted)
+    if runs is not None:
+        wanted = [label.strip() for label in runs.split(",")]
+        records = [task.reduced.record(label) for label in wanted]
+    if not records:
+        raise CampaignError("no run is left", key="--runs", value=runs)
+    with shell.stoppable(out):
+        fit = fit_model(
+            task.assembly.model(), records, chosen.numerics, progress=shell.teller(quiet)
+        )
+        found = sampling_distribution(
+            fit.problem,
+            fit.point,
+            replications=replications,
+            input_noise=not true_inputs,
+            seed=seed,
+            out=out,
+            jobs=jobs,
+            scheduler=scheduler,
+            progress=shell.progress_shown(quiet),
+        )
+    console = shell.console()
+    console.print(str(found), markup=False, soft_wrap=True)
+    if out is not None:
+        tree = xr.DataTree.from_dict({schema.SAMPLING_DISTRIBUTION: found.data})
+        tree.attrs.update(provenance(seed, command=chosen.command, model=fit.model.name))
+        write_tree(tree, out / REPLICATIONS)
+        console.print(f"result    {out / REPLICATIONS}", markup=False, soft_wrap=True)

@@ -1,0 +1,378 @@
+"""The commands ``close``, ``demo``, ``check`` and ``propose``.
+
+``propose``: which run to make next.
+
+The whole loop: ``close`` on one's own data, ``demo`` on simulated ones, ``check`` beforehand.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bayesoleo import _schema as schema
+from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo.errors import InputError, UnfinishedError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from bayesoleo._workflow.settings import Settings
+    from bayesoleo.model._model import Model
+
+
+PANEL = "The whole loop"
+_LIMIT = re.compile(
+    r"\s*(?P<low>[-+.\deE]*)\s*:\s*(?P<high>[-+.\d]*(?:[eE][-+]?\d+)?)\s*(?P<unit>\D.*)?"
+)
+_EXAMPLE = "write name=low:high unit, such as amplitude=2:60mm, frequency=:10Hz or force=-1:40kN"
+
+
+def add_propose(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    shell.add(app, PANEL, propose)
+
+
+def propose(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    rivals: Annotated[
+        str,
+        typer.Option(
+            metavar="ID,…",
+            show_default=False,
+            rich_help_panel=options.RUNNING,
+            help="Effects to be told apart, by their ids, or id@target; by default those that "
+            "might be what is missing.",
+        ),
+    ] = "",
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--limit",
+            metavar="NAME=LOW:HIGH[UNIT]",
+            show_default=False,
+            rich_help_panel=options.RUNNING,
+            help="What the rig can do: amplitude, frequency, mean, travel, rate, or an output. SI "
+            "without a unit; either side may be left out. May be given several times.",
+        ),
+    ] = None,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    drive: options.Drive = None,
+    effects: options.Effects = None,
+    without: options.Without = "",
+    scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
+    steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            "--figure",
+            metavar="FILE.png",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+            help="Draw the separation over frequency and amplitude.",
+        ),
+    ] = None,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Say which run to make next: the one that best tells apart what might be missing.
+
+    Candidate effects that these runs cannot decide between are estimated, each foresees the runs
+    that the rig can do, with all that is not known of its parameters, and the runs are ranked by
+    what they are expected to tell. The rig can do what it did, unless the campaign or --limit says
+    otherwise. Periodic runs and models with one input only.
+
+    \b
+    Examples:
+      bayesoleo propose shaker --model f16n2d2
+      bayesoleo propose shaker --model f16n2d2 --limit amplitude=2:60mm --limit frequency=:10Hz
+      bayesoleo propose shaker --model f16n2d2 --rivals oil_compressibility,frame_compliance
+    """
+    from bayesoleo import _workflow as workflow, plots
+    from bayesoleo._workflow.model_files import load_model
+
+    chosen = options.settings(
+        seed=seed, jobs=jobs, drive=drive, effects=effects, scheme=scheme, solver=solver,
+        steps=steps, nuisance=nuisance, without=without,
+    )  # fmt: skip
+    limits = dict(_limit(text) for text in limit or [])
+    names = tuple(part.strip() for part in rivals.split(",") if part.strip())
+    declared, callback = load_model(model), shell.teller(quiet)
+    tree = workflow.propose(
+        campaign, declared, chosen, rivals=names, limits=limits, callback=callback
+    )
+    summary = json.loads(tree.attrs[schema.SUMMARY])
+    entries = summary["proposals"]
+    if figure is not None:
+        if schema.PROPOSAL not in tree.children:
+            raise InputError("there is no run to draw", key="--figure", value=figure)
+        plots.proposal(tree).savefig(figure, dpi=150)
+    if as_json:
+        shell.print_json(tables.plain({"proposals": entries}))
+    else:
+        _print_proposals(entries, summary.get("titles", {}))
+
+
+def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -> None:
+    from bayesoleo._report.sentences import proposal_lines, proposal_table
+
+    console = shell.console()
+    if not entries:
+        console.print("Nothing is left to be told apart: fewer than two candidates stand.")
+    for entry in entries:
+        for line in proposal_lines(entry, titles):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        content = proposal_table(entry, titles)
+        if content is not None:
+            console.print()
+            console.print(tables.table(content.head, content.rows, content.words))
+
+
+def _limit(text: str) -> tuple[str, tuple[float, float]]:
+    """Name and range, SI, of an option ``--limit``.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    from bayesoleo.data._campaign_toml import to_limit
+
+    name, _, rest = text.partition("=")
+    found = _LIMIT.fullmatch(rest)
+    if found is None:
+        raise InputError("no limit", key="--limit", value=text, hint=_EXAMPLE)
+    try:
+        low, high = (float(found[side]) if found[side] else None for side in ("low", "high"))
+    except ValueError:
+        raise InputError("no limit", key="--limit", value=text, hint=_EXAMPLE) from None
+    unit = (found["unit"] or "").strip()
+    if not unit:  # SI
+        unit = "Hz" if name.strip() == "frequency" else "1"
+    return name.strip(), to_limit(name.strip(), low, high, unit, "--limit")
+
+
+DEMO_SYSTEM = "f16n2d2"
+FILES = {"report": "report.html", "result": "results.nc", "summary": "summary.json"}
+
+
+def add_loop(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    shell.add(app, PANEL, demo, close, check)
+
+
+def demo(
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="DIR", rich_help_panel=options.OUTPUT, help="Folder to write to."
+        ),
+    ] = Path("bayesoleo-demo"),
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full",
+            rich_help_panel=options.RUNNING,
+            help="Draw to the effective size that close asks for; takes longer.",
+        ),
+    ] = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Simulate a campaign with an effect that the fitted model lacks; close the loop on it.
+
+    A shaker campaign of an oleo (an aircraft's shock strut) is simulated with noise and with one
+    effect more than the model f16n2d2 has. The loop is then closed on it as on measured data: it is
+    not told what is missing. Takes less than a minute on two cores, compilation included.
+
+    \b
+    Written to DIR:
+      campaign/       the simulated records, as a rig would write them
+      report.html     the page to read
+      results.nc      everything, as one tree of labelled arrays
+      summary.json    the figures that matter most
+
+    \b
+    Examples:
+      bayesoleo demo
+      bayesoleo demo --seed 3 --out /tmp/demo
+    """
+    from bayesoleo._workflow.model_files import load_model
+    from bayesoleo._workflow.simulating import demo_campaign
+
+    shell.check_writable(out)
+    chosen = options.settings(seed=seed, jobs=jobs, quick=not full)
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    with shell.stoppable(out):
+        callback("simulating a shaker campaign of an oleo")
+        campaign = _fresh_campaign(out, seed, demo_campaign)
+        model = load_model(DEMO_SYSTEM)
+        _closed(campaign, model, chosen, out, callback, progress)
+
+
+def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
+    """Put a newly simulated campaign in the place of an older one of its kind, as a whole."""
+    from bayesoleo._storage.files import replacing
+
+    target = out / "campaign"
+    with replacing(target) as draft:
+        make(draft, seed)
+        if target.exists() and not _is_demo(target, shell.campaign_name(draft)):
+            hint = "choose another folder with --out"
+            raise InputError("holds other data than an older demo", file=target, hint=hint)
+    return target
+
+
+def _is_demo(folder: Path, name: str) -> bool:
+    try:
+        return shell.campaign_name(folder) == name
+    except InputError:
+        return False
+
+
+def close(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    out: options.Out = None,
+    quick: options.Quick = False,
+    seed: options.Seed = 0,
+    jobs: options.Jobs = None,
+    scheduler: options.Scheduler = None,
+    effective_size: options.EffectiveSize = 1000,
+    max_effects: options.MaxEffects = 4,
+    effects: options.Effects = None,
+    without: options.Without = "",
+    quiet: options.Quiet = False,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
+    steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
+    error_model: options.ErrorModel = "independent",
+    between_runs: options.BetweenRuns = "",
+) -> None:
+    """Close the loop: estimate, find what is missing, add it, compare before and after.
+
+    The records become periodic runs with a noise floor; the parameters are estimated and their
+    posterior is sampled. The residual is held against the noise; every effect of the catalogue is
+    scored, the best one is added if it is significant and helps on the hold-out runs, and the round
+    starts again. Without hold-out runs each run is left out in turn, and the report says so.
+
+    \b
+    Written to DIR, by default bayesoleo-<name of the campaign> in the current folder:
+      report.html     one self-contained page for someone who did not run it
+      results.nc      everything, as one tree of labelled arrays (xarray, ArviZ)
+      summary.json    effects found, parameters with intervals, errors, verdict
+
+    \b
+    Examples:
+      bayesoleo close shaker --model f16n2d2
+      bayesoleo close shaker --model model.py:model --out results --quick
+      bayesoleo close shaker --model f16n2d1 --drive force --seed 7
+      bayesoleo close shaker --model f16n2d2 --effects mine.py:drag
+      bayesoleo close shaker --model f16n2d2 --without humming_force,nonparametric
+    """
+    from bayesoleo._workflow.model_files import load_model
+
+    folder = shell.output_folder(out, campaign)
+    chosen = options.settings(
+        seed=seed,
+        jobs=jobs,
+        scheduler=scheduler,
+        quick=quick,
+        effective_size=effective_size,
+        scheme=scheme,
+        solver=solver,
+        steps=steps,
+        max_effects=max_effects,
+        drive=drive,
+        effects=effects,
+        without=without,
+        nuisance=nuisance,
+        error_model=error_model,
+        between_runs=between_runs,
+    )
+    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
+    declared = load_model(model)
+    with shell.stoppable(folder):
+        _closed(campaign, declared, chosen, folder, callback, progress)
+
+
+def _closed(
+    campaign: Path,
+    model: Model,
+    chosen: Settings,
+    folder: Path,
+    callback: Callable[[str], None],
+    progress: bool,
+) -> None:
+    """Close the loop and print what came out, also where a late stage failed."""
+    from bayesoleo import _workflow as workflow
+
+    try:
+        tree = workflow.close(
+            campaign, model, chosen, out=folder, callback=callback, progress=progress
+        )
+    except UnfinishedError as error:
+        _print_loop(error.tree, folder)
+        raise
+    _print_loop(tree, folder)
+
+
+def check(
+    campaign: options.CampaignPath,
+    model: options.ModelText,
+    drive: options.Drive = None,
+    scheme: options.Scheme = "radau3",
+    solver: options.Solver = "collocation",
+    steps: options.Steps = None,
+    nuisance: options.Nuisance = "",
+    without: options.Without = "",
+    as_json: options.Json = False,
+) -> None:
+    """Read a campaign and a model, say what would be done, and touch nothing.
+
+    Channels, units, conditions, priors and roles are checked against each other as close would, and
+    the model is solved once at its nominal values: turned signs and wrong units show there.
+
+    \b
+    Examples:
+      bayesoleo check shaker --model f16n2d2
+      bayesoleo check shaker --model model.py:model --json
+    """
+    from bayesoleo import _workflow as workflow
+    from bayesoleo._workflow.model_files import load_model
+
+    chosen = options.settings(
+        scheme=scheme, solver=solver, steps=steps, drive=drive, nuisance=nuisance, without=without
+    )
+    plan = workflow.check(campaign, load_model(model), chosen)
+    if as_json:
+        shell.print_json(tables.plain(plan))
+        return
+    console = shell.console()
+    sentences = plan.pop("data_warnings")
+    plan.pop("start")
+    tables.print_mapping(plan, console)
+    for sentence in sentences:
+        console.print(sentence, style="dim", markup=False, soft_wrap=True)
+
+
+def _print_loop(tree: xr.DataTree, folder: Path) -> None:
+    """The result in a few lines, and where it was written."""
+    from bayesoleo._report.terminal import print_summary
+
+    summary = json.loads(tree.attrs[schema.SUMMARY])
+    written = {what: folder / name for what, name in FILES.items()}
+    present = {what: str(path) for what, path in written.items() if path.exists()}
+    print_summary({**summary, "files": present}, shell.console())

@@ -1,0 +1,377 @@
+"""Common parts of all commands: errors, warnings, progress, tables.
+
+Tables in the terminal; labels of users are printed as they are, not as markup.
+
+What all commands share: how errors, warnings and progress are told, and where to write.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from typer.core import TyperGroup
+
+from bayesoleo import _schema as schema
+from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], words: int = 1) -> Table:
+    """A plain table.
+
+    Parameters
+    ----------
+    head : sequence of str
+        Titles of the columns.
+    rows : sequence of sequence
+        Cells; numbers get four digits, ``None`` and NaN a dash.
+    words : int
+        How many columns from the left hold words and are aligned on the left, as are those in which
+        no cell begins with a number.
+    """
+    made = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    for column, title in enumerate(head):
+        # What does not fit goes on in the next line: an ellipsis would take digits away.
+        on_left = column < words or not any(_is_number(row[column]) for row in rows)
+        made.add_column(Text(title), justify="left" if on_left else "right", overflow="fold")
+    for row in rows:
+        made.add_row(*(Text(cell_text(cell)) for cell in row))
+    return made
+
+
+def _is_number(cell: Any) -> bool:
+    text = cell_text(cell).lstrip("−-<± ")
+    return text[:1].isdigit() or text == ""
+
+
+def cell_text(value: Any) -> str:
+    """A value as a table shows it."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {cell_text(item)}" for key, item in value.items()) or "–"
+    if isinstance(value, list | tuple | set):
+        return ", ".join(cell_text(item) for item in value) or "–"
+    return str(value)
+
+
+def print_mapping(content: Mapping[str, Any], console: Console) -> None:
+    """Print nested facts: plain values first, then one table for every list or mapping of records.
+
+    Parameters
+    ----------
+    content : mapping
+        Names to values, to mappings of name to record, or to lists of records, where a record is a
+        mapping.
+    console : rich.console.Console
+        Where to print.
+    """
+    facts = {key: value for key, value in content.items() if _records(value) is None}
+    if facts:
+        width = max(len(key) for key in facts) + 2
+        for key, value in facts.items():
+            label = f"{key.replace('_', ' '):<{width}}"
+            console.print(Text.assemble((label, "dim"), cell_text(value)), soft_wrap=True)
+    for key, value in content.items():
+        rows = _records(value)
+        if rows is not None:
+            head = list(dict.fromkeys(name for row in rows for name in row))
+            cells = [[row.get(name) for name in head] for row in rows]
+            console.print()
+            titles = [name.replace("_", " ") for name in head]
+            console.print(Text(key.replace("_", " "), style="bold"))
+            words = _leading_words(cells)
+            console.print(table(titles, cells, words))
+
+
+def _records(value: Any) -> list[dict[str, Any]] | None:
+    """Rows of a table, where a value is one."""
+    if isinstance(value, Mapping) and value and all(isinstance(v, Mapping) for v in value.values()):
+        return [{"name": name, **row} for name, row in value.items()]
+    if isinstance(value, list | tuple) and value and all(isinstance(v, Mapping) for v in value):
+        return [dict(row) for row in value]
+    return None
+
+
+def _leading_words(rows: Sequence[Sequence[Any]]) -> int:
+    """How many columns from the left hold words."""
+    count = 0
+    for column in zip(*rows, strict=True):
+        if any(isinstance(cell, int | float) for cell in column):
+            break
+        count += 1
+    return count
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: no NumPy scalars, None where a number is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+DEBUG = "BAYESOLEO_DEBUG"
+RESULTS, OLDER = "results.nc", "older"
+
+#: Exit statuses: input that cannot be used; a late stage failed, and what was known before it is
+#: written; stopped by the user (128 + SIGINT).
+UNUSABLE, UNFINISHED, STOPPED = 2, 3, 130
+
+
+class Stopped(BayesoleoError):  # noqa: N818 - the user's wish is not an error
+    """The user stopped a command; the message says what is kept."""
+
+
+class Commands(TyperGroup):
+    """Runs a command so that what goes wrong on purpose is told in one line on standard error."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command of a context.
+
+        Parameters
+        ----------
+        ctx : typer.Context
+            With the arguments as parsed.
+
+        Raises
+        ------
+        typer.Exit
+            With status 2 for input that cannot be used, 3 where a late stage failed, 130 where the
+            user stopped the command.
+        """
+        try:
+            with one_line_warnings():
+                return super().invoke(ctx)
+        except (Stopped, KeyboardInterrupt) as stop:
+            complain(str(stop) or "stopped; nothing was written")
+            raise typer.Exit(STOPPED) from None
+        except UnfinishedError as error:
+            if os.environ.get(DEBUG, "0") not in ("", "0"):
+                raise
+            complain(f"error: {error}")
+            raise typer.Exit(UNFINISHED) from None
+        except BayesoleoError as error:
+            if os.environ.get(DEBUG, "0") not in ("", "0"):
+                raise
+            complain(f"error: {error}")
+            raise typer.Exit(UNUSABLE) from None
+
+
+def add(app: typer.Typer, panel: str, *commands: Callable[..., None]) -> None:
+    """Add commands to an app; the docstring of each is its help.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        To add to.
+    panel : str
+        Under which heading they are listed.
+    *commands : callable
+        In the order of the list.
+    """
+    for command in commands:
+        app.command(rich_help_panel=panel, help=flowing(command.__doc__ or ""))(command)
+
+
+def flowing(text: str) -> str:
+    r"""A docstring whose paragraphs fill the line, except those that start with ``\b``."""
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(p if p.startswith("\b") else " ".join(p.split()) for p in paragraphs)
+
+
+def complain(text: str) -> None:
+    """Print one line on standard error, whatever is in the text."""
+    line = " ".join(text.split())
+    encoding = sys.stderr.encoding or "utf-8"
+    print(line.encode(encoding, "replace").decode(encoding), file=sys.stderr, flush=True)
+
+
+@contextmanager
+def one_line_warnings() -> Iterator[None]:
+    """Show warnings as one line each, without the code that raised them."""
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        complain(f"warning: {message}")
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+@contextmanager
+def stoppable(folder: Path | None) -> Iterator[None]:
+    """Turn an interrupt into a line that says what is kept in a folder.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where the command writes, if it does.
+
+    Raises
+    ------
+    Stopped
+        In place of KeyboardInterrupt.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise Stopped(f"stopped: {kept_in(folder)}") from stop
+
+
+def kept_in(folder: Path | None) -> str:
+    """What a command that was stopped leaves in its folder."""
+    if folder is None or not folder.is_dir():
+        return "nothing was written"
+    older, results = folder / OLDER, folder / RESULTS
+    said = "no result was written"
+    if (older / RESULTS).is_file():
+        said = f"an older result is in {older}, what is known of the new one in {folder}"
+    elif results.is_file() and _unfinished(results):
+        said = f"what is known is in {results}"
+    elif results.is_file():
+        said = f"an older result in {folder} is as it was"
+    kinds = {"draws made so far": "segment-*.npz", "finished rounds": "search.pickle"}
+    kept = [kind for kind, name in kinds.items() if next(folder.rglob(name), None) is not None]
+    if kept:
+        said += f"; {' and '.join(kept)} are kept there, and the same command goes on from them"
+    return said
+
+
+def _unfinished(results: Path) -> bool:
+    from bayesoleo._storage.result_files import read_attributes
+
+    return schema.UNFINISHED in read_attributes(results)
+
+
+def console() -> Console:
+    """Standard output; wide where it is not a terminal, so that tables are not cut."""
+    from rich.console import Console
+
+    wide = None if sys.stdout.isatty() else 160
+    return Console(width=wide, highlight=False, soft_wrap=False)
+
+
+def progress_shown(quiet: bool) -> bool:
+    """Whether progress bars make sense: somebody looks at them."""
+    return not quiet and sys.stderr.isatty()
+
+
+def teller(quiet: bool) -> Callable[[str], None]:
+    """Prints what is being done on standard error, above progress bars.
+
+    Parameters
+    ----------
+    quiet : bool
+        Says nothing.
+    """
+    if quiet:
+        return lambda _: None
+
+    def callback(text: str) -> None:
+        from tqdm import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+
+    return callback
+
+
+def campaign_name(campaign: Path) -> str:
+    """Name of a campaign, as a folder can carry it.
+
+    Parameters
+    ----------
+    campaign : Path
+        Its folder, or its ``campaign.toml``.
+
+    Raises
+    ------
+    CampaignError
+        If the declaration cannot be used.
+    """
+    return re.sub(r"[^\w.-]+", "-", _declared_name(campaign)).strip("-.") or "campaign"
+
+
+def _declared_name(campaign: Path) -> str:
+    from bayesoleo.data._campaign_toml import FILE, read_declaration
+
+    toml = campaign if campaign.suffix == ".toml" else campaign / FILE
+    return read_declaration(toml).name
+
+
+def output_folder(out: Path | None, campaign: Path, ending: str = "") -> Path:
+    """Where to write results of a campaign, checked before any work is done; nothing is made yet.
+
+    Parameters
+    ----------
+    out : Path or None
+        As the user gave it; by default a folder in the current one, with the campaign's name.
+    campaign : Path
+        Its folder, or its ``campaign.toml``.
+    ending : str, optional
+        Of the default's name.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be made there, cannot be written to, or holds results of another
+        campaign.
+    """
+    if out is None:
+        out = Path(f"bayesoleo-{campaign_name(campaign)}{ending}")
+    folder = check_writable(out.expanduser())
+    _check_own(folder, campaign)
+    return folder
+
+
+def _check_own(folder: Path, campaign: Path) -> None:
+    """Raise where the results of another campaign would be lost."""
+    from bayesoleo._storage.result_files import read_attributes
+
+    older = folder / RESULTS
+    if not older.is_file():
+        return
+    name = read_attributes(older).get(schema.CAMPAIGN)
+    if name is not None and name != _declared_name(campaign):
+        raise InputError(
+            "holds results of another campaign",
+            file=older,
+            key=schema.CAMPAIGN,
+            value=name,
+            hint="choose another folder with --out, or remove that file",
+        )
+
+
+def check_writable(folder: Path) -> Path:
+    """See :func:`bayesoleo._storage.files.check_writable`."""
+    from bayesoleo._storage.files import check_writable
+
+    return check_writable(folder)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON, for programs."""
+    import json
+
+    typer.echo(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False))

@@ -1,0 +1,5 @@
+"""How a result is told: a page to hand on, and a few lines in the terminal."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,450 @@
+"""The HTML report: the case in a few sentences, and the page.
+
+The case in a few sentences: what was wrong, where, what it is, how sure that is.
+
+The page: everything a sceptical engineer asks for, in one file that needs no other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._report import sections, sentences, tables
+from bayesoleo._report.sections import encode_formula
+from bayesoleo._report.sentences import begin, proposal_lines, proposal_table, role_shown
+from bayesoleo._report.tables import (
+    FLOOR,
+    error_scale,
+    format_short,
+    parameters,
+    ratio,
+    too_large,
+    words,
+)
+from bayesoleo._storage.files import write_text_atomic
+from bayesoleo.assessment._residual_breakdown import GROUP, ORDERS, RUN, residual_breakdown
+from bayesoleo.effects._catalogue import called, listed
+from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.errors import InputError, ResultsError
+from bayesoleo.plots import _reading as reading
+from bayesoleo.plots._discovery import chosen, format_p, name
+
+#: A harmonic or a coordinate is named if it holds this part of the excess.
+WORTH_NAMING = 0.2
+_CONSTANTS = {RUN: "a constant for each run", GROUP: "a constant for each group",
+              "direction": "the direction of motion"}  # fmt: skip
+
+
+def case(
+    summary: Mapping[str, Any], units: Mapping[str, str], tree: xr.DataTree
+) -> list[tuple[str, str]]:
+    """Questions that a sceptical reader asks, each with its answer in numbers.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``.
+    units : mapping of str to str
+        SI unit of each output.
+    tree : DataTree
+        The result; where the error lives is told if it holds residuals of periodic runs.
+
+    Returns
+    -------
+    list of (str, str)
+        Those that have an answer.
+    """
+    found = [
+        ("Was anything wrong?", _wrong(summary)),
+        ("Where?", _where(tree)),
+        ("What is it?", " ".join(_what(summary))),
+        ("What else could it be?", " ".join(_rivals(summary))),
+        ("How sure is its name?", _sure(summary)),
+        ("How large?", _large(summary)),
+        ("Does it hold on data not used?", _holds(summary, units)),
+        ("What is left?", _left(summary)),
+        ("What would settle it?", " ".join(_next(summary))),
+        ("What could not be tried?", _untried(summary)),
+    ]
+    return [(question, answer) for question, answer in found if answer]
+
+
+def _wrong(summary: Mapping[str, Any]) -> str:
+    errors = _errors(summary["rounds"][0])
+    if not errors:
+        return "No run repeats, so that there is no noise to hold the error against."
+    worst, output, run = max((ratio(error) or 0.0, output, run) for error, output, run in errors)
+    above = len({run for error, _, run in errors if too_large(error)})
+    times = f"{format_short(worst)} times {words(summary)}"
+    what = f"the largest is the error of {output} in run {run}, {times}"
+    if not above:
+        return f"No: no error repeats beyond what chance allows; {what}."
+    of = f"{above} of {len({run for *_, run in errors})} runs"
+    return f"In {of} an error repeats that is larger than chance allows; {what}."
+
+
+def _errors(entry: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], str, str]]:
+    """Errors that have a ratio, with output and run."""
+    return [
+        (error, output, run)
+        for output, runs in entry["error"].items()
+        for run, error in runs.items()
+        if ratio(error) is not None
+    ]
+
+
+def _where(tree: xr.DataTree) -> str:
+    try:
+        data = residual_breakdown(tree)
+    except (InputError, KeyError):
+        return ""
+    texts = []
+    for output in data[schema.OUTPUT].values:
+        one = data.sel({schema.OUTPUT: output}).isel(stage=0)
+        # An excess that noise alone may feign has no place.
+        if not float(one["excess"]) > FLOOR**2 - 1:
+            continue
+        orders = _named(one["power"].values, [*map(str, range(ORDERS)), f"{ORDERS} and above"])
+        places = [str(place) for place in one["coordinate"].values]
+        words = [_CONSTANTS.get(place, f"one function of {place}") for place in places]
+        shares = _named(one["share"].values, words)[:2]
+        text = f"Of what repeats of {output} beyond its noise, "
+        text += ", ".join(f"{share} stands at harmonic {word}" for word, share in orders)
+        text += ("; " if orders else "") + ", ".join(f"{word} explains {s}" for word, s in shares)
+        texts.append(f"{text}." if orders or shares else "")
+    return " ".join(filter(None, texts))
+
+
+def _named(shares: np.ndarray, words: list[str]) -> list[tuple[str, str]]:
+    """Those worth naming, the largest first, with their share."""
+    order = [k for k in np.argsort(-shares) if shares[k] >= WORTH_NAMING]
+    return [(words[k], f"{100 * min(shares[k], 1.0):.0f} %") for k in order]
+
+
+def _what(summary: Mapping[str, Any]) -> Iterator[str]:
+    titles = sentences.titles(summary)
+    for entry in summary["rounds"]:
+        added = chosen(entry)
+        if added is None:
+            continue
+        which = begin(called(name(added), titles))
+        if added["effect"] not in summary["effects"]:
+            yield f"{which} was added first, and removed again."
+            continue
+        p = format_p(added["p_value"])
+        text = f"{which} explains {_share(added)} of the excess"
+        text += (
+            f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"
+            if p
+            else ""
+        )
+        yield f"{text}."
+
+
+#: How sure a name is, by the word of the summary.
+_SURE = {
+    schema.CERTAIN: (
+        "Certain: it was added alone, nothing else is significant beside it, no other effect"
+        " explains as much, and the error is what is expected."
+    ),
+    schema.PROBABLE: (
+        "Probable: it explains the data best of what was tried, which is not all there is."
+    ),
+    schema.LIKENESS: (
+        "A likeness only: more is left than expected, so that something else acts as well, or"
+        " instead."
+    ),
+    schema.NO_CAUSE: (
+        "No cause is named: curves without a name, what varies by run and what repeats with the"
+        " drive take up a part of whatever is missing."
+    ),
+}
+
+
+def _sure(summary: Mapping[str, Any]) -> str:
+    """Whether the effect's name is certain, probable, or one of several; results that were stored
+    without an answer have none."""
+    if "certain" not in summary or not summary["effects"]:
+        return ""
+    sure = sentences.certainty(summary)
+    alike = any(one["indistinguishable_from"] for one in sentences.accepted(summary))
+    if sure == schema.LIKENESS and sentences.only_too_small(summary):
+        return (
+            "A likeness only: an error is smaller than chance allows, so that the noise is not"
+            " what it is held to be."
+        )
+    if sure == schema.PROBABLE and alike:
+        return (
+            "Probable, as one of a class: these data cannot tell it from the effects named above."
+        )
+    return _SURE[str(sure)]
+
+
+def _share(candidate: Mapping[str, Any]) -> str:
+    """Part of the excess; of nearly all of it a digit more, for there rivals differ by it."""
+    digits = 1 if 0.95 <= candidate["gain"] < 0.9995 else 0
+    return f"{100 * candidate['gain']:.{digits}f} %"
+
+
+def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What these data cannot tell from each effect that was added, or how far the next one fell
+    short."""
+    for entry in summary["rounds"]:
+        added = chosen(entry)
+        if added is None or added["effect"] not in summary["effects"]:
+            continue
+        alike, titles = added["indistinguishable_from"], sentences.titles(summary)
+        own = called(name(added), titles)
+        if alike:
+            others = listed([called(other, titles) for other in alike], " or ")
+            yield f"These data cannot tell {own} from {others}."
+        apart = [
+            c
+            for c in entry["candidates"]
+            if c is not added and c["effect"] not in alike and name(c) not in alike
+        ]
+        if apart:
+            second = max(apart, key=lambda c: c["gain"])
+            how = "estimated in its place" if second.get("estimated") else "by its score"
+            of = "the others" if alike else f"the {len(apart)} others instead of {own}"
+            which = called(name(second), titles)
+            yield f"Of {of} {which} comes nearest: {how} it explains {_share(second)}."
+
+
+def _large(summary: Mapping[str, Any]) -> str:
+    """The new parameters as the table shows them."""
+    added = [chosen(entry) or {} for entry in summary["rounds"]]
+    new = {
+        key.split("[")[0]
+        for one in added
+        if one.get("family") != FAMILY  # the coefficients of a curve say nothing one by one
+        for key in one.get("expected", {})
+    }
+    table, texts = parameters(summary), []
+    for row in table.rows:
+        if row[0].split("[")[0] in new:
+            cells = dict(zip(table.head, row, strict=True))
+            interval = cells["95 % interval"]
+            if summary["parameters"][row[0]].get("shared_with"):
+                texts.append(f"{row[0]} {interval}")
+                continue
+            text = f"{row[0]} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
+            known = any(character.isdigit() for character in interval)
+            texts.append(f"{text} (95 %: {interval})" if known else text)
+    most = 6
+    rest = f" and {len(texts) - most} more" if len(texts) > most else ""
+    drawn = any(one.get("family") == FAMILY for one in added)
+    curve = "The curve and its band are drawn below, in the round that added it." if drawn else ""
+    return " ".join(filter(None, [f"{', '.join(texts[:most])}{rest}." if texts else "", curve]))
+
+
+def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    role = role_shown(summary)
+    if not summary["effects"] or role == schema.FIT:
+        return "" if not summary["effects"] else "Nothing could be held out: that is not known."
+    texts = []
+    for output, last in summary["error_after"][role].items():
+        first = summary["error_before"][role].get(output, last)
+        key = "rms" if last["repeating"] is None else "repeating"
+        scale = error_scale(units.get(output, ""), (first, last))
+        before, after = (
+            format_short(scale.factor * e[key]) for e in (first, last) if e[key] is not None
+        )
+        text = f"{output} {before} → {after} {scale.unit}".rstrip()
+        ratios = " → ".join(format_short(ratio(e)) for e in (first, last))
+        texts.append(f"{text} ({ratios} times {words(summary)})" if ratio(last) else text)
+    said = summary.get("hold_out", "")
+    return f"On the {role} runs: {', '.join(texts)}{f' ({said})' if said else ''}."
+
+
+def _left(summary: Mapping[str, Any]) -> str:
+    last = summary["rounds"][-1]
+    errors, text = _errors(last), ""
+    if errors:
+        worst, output, run = max((ratio(e) or 0.0, output, run) for e, output, run in errors)
+        text = f"At most {format_short(worst)} times {words(summary)}, of {output} in run {run}"
+    if last["candidates"]:
+        best = max(last["candidates"], key=lambda candidate: candidate["gain"])
+        lead = "; the" if text else "The"
+        share = f"{100 * best['gain']:.0f} %"
+        which = called(name(best), sentences.titles(summary))
+        text += f"{lead} best remaining candidate, {which}, would explain {share} of it"
+    return f"{text}." if text else ""
+
+
+def _next(summary: Mapping[str, Any]) -> Iterator[str]:
+    for entry in summary.get("proposals", []):
+        yield " ".join(proposal_lines(entry, sentences.titles(summary))[1:2])
+
+
+def _untried(summary: Mapping[str, Any]) -> str:
+    """Candidates of the first round without a score, by reason."""
+    failed = summary["rounds"][0].get("failed", {})
+    if not failed:
+        return ""
+    texts = [f"{count} ({reason})" for reason, count in Counter(failed.values()).most_common()]
+    return f"{len(failed)} candidates have no score: {', '.join(texts)}."
+
+
+def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> list[str]:
+    """Write the report of a result as a self-contained HTML page.
+
+    Parameters
+    ----------
+    tree : DataTree
+        As read by ``read_tree``. Any of its groups may be absent.
+    path : path-like
+        Replaced as a whole or not at all.
+
+    Returns
+    -------
+    list of str
+        Figures that could not be drawn, each with the reason; the page says so too.
+
+    Raises
+    ------
+    ResultsError
+        The tree holds no summary, or the place cannot be written to.
+    """
+    text, failed = _render(tree)
+    write_text_atomic(path, text)
+    return failed
+
+
+def render_report(tree: xr.DataTree) -> str:
+    """The page of :func:`write_report` as text."""
+    return _render(tree)[0]
+
+
+def _render(tree: xr.DataTree) -> tuple[str, list[str]]:
+    """The page, and the figures that it lacks."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("bayesoleo._report", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["first_of"] = next
+    drawing = sections.Drawing()
+    content = _content(tree, drawing)
+    page = environment.get_template("report.html.jinja").render(content)
+    return page, drawing.failed
+
+
+def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
+    """What the template fills in."""
+    summary = _summary(tree)
+    units = tables.output_units(tree, summary)
+    figures = _figures(tree, drawing)
+    rounds = list(_rounds(tree, summary, drawing))
+    proposals = list(_proposals(tree, summary, drawing))
+    return {
+        "summary": summary,
+        "attributes": tree.attrs,
+        "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
+        "headline": sentences.headline(summary),
+        "extended": sentences.added(summary),
+        "unfinished": [*sentences.unfinished(summary), *drawing.failed],
+        "role": sentences.role_shown(summary),
+        "tiles": sentences.tiles(summary, units),
+        "error_by_role": tables.error_by_role(summary, units),
+        "error_by_run": tables.error_by_run(summary, units),
+        "case": case(summary, units, tree),
+        "remainder": sentences.remainder(summary),
+        "proposals": proposals,
+        "stability": sentences.stability(summary),
+        "records": tables.records(tree),
+        "rounds": rounds,
+        "parameters": tables.parameters(summary),
+        "diagnostics": tables.diagnostics(tree),
+        "diagnostics_by_parameter": tables.diagnostics_by_parameter(tree),
+        "point": tables.point_status(tree),
+        "formulas": _formulas(tree),
+        "equations": str(tree.attrs.get(schema.EQUATIONS, "")).strip(),
+        "provenance": tables.provenance(tree),
+        "figures": figures,
+        "residual_title": sections.residual_title(tree),
+        "number": itertools.count(1),
+    }
+
+
+def _summary(tree: xr.DataTree) -> dict[str, Any]:
+    summary = reading.summary(tree)
+    if not summary:
+        hint = "give the results.nc of `bayesoleo close`, or run it once more"
+        raise ResultsError("the result holds no summary to report", key=schema.SUMMARY, hint=hint)
+    schema.validate_summary(summary)
+    return summary
+
+
+def _rounds(
+    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+) -> Iterator[dict[str, Any]]:
+    """Table, figure and decision of every round."""
+    titles = sentences.titles(summary)
+    for number, entry in enumerate(summary["rounds"]):
+        yield {
+            "accepted": _accepted(entry, titles),
+            "reason": sentences.reason(entry, titles),
+            "table": tables.candidates(entry, titles) if entry["candidates"] else None,
+            "failed": tables.failed(entry, titles),
+            "figures": [
+                *drawing.of("the ranking", partial(sections.ranking_figure, tree, number)),
+                *drawing.of("the curve", partial(sections.nonparametric_figure, tree, entry)),
+            ],
+        }
+
+
+def _accepted(entry: dict[str, Any], titles: dict[str, str]) -> str:
+    """What a round added, as it is called; nothing where it added nothing."""
+    if not entry["accepted"]:
+        return ""
+    added = chosen(entry)
+    return called(entry["accepted"] if added is None else name(added), titles)
+
+
+def _proposals(
+    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+) -> Iterator[dict[str, Any]]:
+    """Sentences, table and figure for each set of effects that is left to be told apart."""
+    for entry in summary.get("proposals", []):
+        yield {
+            "lines": proposal_lines(entry, sentences.titles(summary)),
+            "table": proposal_table(entry, sentences.titles(summary)),
+            "figures": drawing.of("the next run", partial(sections.proposal_figure, tree, entry)),
+        }
+
+
+def _figures(
+    tree: xr.DataTree, drawing: sections.Drawing
+) -> dict[str, list[sections.CaptionedFigure]]:
+    makers = {
+        "data": ("the data", sections.data_figures),
+        "fit": ("the fit", sections.fit_figures),
+        "where": ("where the error lives", sections.whereabouts_figure),
+        "residual": ("the residual", sections.residual_figures),
+        "posterior": ("the posterior", sections.posterior_figures),
+        "predictive": ("the posterior's prediction", sections.predictive_figures),
+        "trace": ("the sampler's chains", sections.trace_figures),
+        "error": ("the error of each run", sections.error_figure),
+    }
+    return {name: drawing.of(words, partial(make, tree)) for name, (words, make) in makers.items()}
+
+
+def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:
+    """Every formula as a picture, or as it is written where it cannot be drawn."""
+    texts = json.loads(tree.attrs.get(schema.EQUATIONS_LATEX, "[]"))
+    return [{"latex": text, "image": encode_formula(text)} for text in texts]

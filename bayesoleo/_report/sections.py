@@ -1,0 +1,323 @@
+"""Figures of the report with their captions.
+
+Figures and formulas as addresses that hold the picture itself; a page needs no other file.
+
+Pictures are put in ``<img>`` elements: SVG inside the page would share its ids between figures.
+
+The figures of the page with what is said below each; those without data are left out.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import matplotlib
+import xarray as xr
+from matplotlib import mathtext
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+
+from bayesoleo import _schema as schema, plots
+from bayesoleo._report.sentences import proposal_table
+from bayesoleo._report.tables import FLOOR, words
+from bayesoleo.assessment._residual_breakdown import residual_breakdown
+from bayesoleo.effects._catalogue import called, listed
+from bayesoleo.errors import InputError
+from bayesoleo.plots import _reading as reading
+from bayesoleo.plots._residuals import Against
+
+LARGEST_SVG = 300_000
+"""Bytes above which a figure is stored as pixels instead; a page stays below some megabytes."""
+DPI = 130
+FORMULA_SIZE = 12.0
+
+# Matplotlib's settings are global; two reports may be written at once.
+_settings = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture: its data URI, and its size in points."""
+
+    source: str
+    width: float
+    height: float
+
+
+def encode_figure(figure: Figure) -> Image:
+    """A figure as SVG, or as PNG where that would be too large.
+
+    Parameters
+    ----------
+    figure : Figure
+
+    Returns
+    -------
+    Image
+        The same bytes for the same figure: no date, no random ids.
+    """
+    width, height = (72.0 * side for side in figure.get_size_inches())
+    svg = _short(_save(figure, "svg", metadata={"Date": None, "Creator": None}))
+    if len(svg) <= LARGEST_SVG:
+        return Image(_uri("image/svg+xml", svg), width, height)
+    return Image(_uri("image/png", _save(figure, "png", dpi=DPI)), width, height)
+
+
+def encode_formula(latex: str) -> Image | None:
+    """A formula as SVG, None where Matplotlib's small TeX does not know what is in it.
+
+    Parameters
+    ----------
+    latex : str
+        Without dollar signs.
+
+    Returns
+    -------
+    Image or None
+    """
+    buffer = io.BytesIO()
+    properties = FontProperties(size=FORMULA_SIZE, math_fontfamily="cm")
+    text = f"${' '.join(latex.split())}$"
+    try:
+        with _settings, matplotlib.rc_context({"svg.hashsalt": "bayesoleo"}):
+            mathtext.math_to_image(text, buffer, prop=properties, dpi=72, format="svg")
+    # Whatever it stumbles on, the text is shown instead.
+    except (ValueError, RuntimeError, KeyError, IndexError):
+        return None
+    svg = re.sub(rb"<metadata>.*?</metadata>", b"", buffer.getvalue(), flags=re.DOTALL)
+    size = re.search(rb'<svg[^>]*?width="([\d.]+)pt"[^>]*?height="([\d.]+)pt"', svg)
+    size = size or re.search(rb'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg)
+    if size is None:
+        return None
+    return Image(_uri("image/svg+xml", svg), float(size[1]), float(size[2]))
+
+
+def _save(figure: Figure, kind: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    with _settings, matplotlib.rc_context({"svg.hashsalt": "bayesoleo"}), warnings.catch_warnings():
+        # A label may be in a script that the font lacks; a box in its place is no reason to stop.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(buffer, format=kind, **options)
+    return buffer.getvalue()
+
+
+def _short(svg: bytes) -> bytes:
+    """Coordinates of paths to a hundredth of a point; halves the size of a figure."""
+    text = svg.decode()
+    text = re.sub(r' d="[^"]*"', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text)
+    return text.encode()
+
+
+def _uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+@dataclass(frozen=True)
+class CaptionedFigure:
+    """A figure on the page."""
+
+    image: Image
+    caption: str
+
+
+@dataclass
+class Drawing:
+    """Draws figures; one that fails is left out and named.
+
+    Parameters
+    ----------
+    failed : list of str
+        Sentences about those that failed.
+    """
+
+    failed: list[str] = field(default_factory=list)
+
+    def of(self, what: str, draw: Callable[[], list[CaptionedFigure]]) -> list[CaptionedFigure]:
+        """The figures of one kind; none where one of them fails."""
+        try:
+            return draw()
+        except Exception as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            self.failed.append(f"The figure of {what} could not be drawn. {reason}")
+            return []
+
+
+Draw = Callable[[], Figure]
+
+LOOPS: tuple[Against, ...] = ("velocity", "stroke")
+
+
+def data_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The records."""
+    caption = (
+        "The records as measured, averaged over the periods of each run. All runs of a channel "
+        "share its scale."
+    )
+    return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
+
+
+def fit_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """Measurement and prediction of each output."""
+    entries: list[tuple[Draw, str]] = []
+    for output in reading.outputs(tree):
+        caption = f"Measured {output} and what the model predicts."
+
+        entries.append((partial(plots.fit, tree, output), caption))
+    return _drawn(entries)
+
+
+def whereabouts_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """Where the error lives that repeats; nothing without a periodic run that has any."""
+    try:
+        excess = residual_breakdown(tree)["excess"].values
+    except (InputError, KeyError):
+        return []
+    if not (excess > FLOOR**2 - 1).any():
+        return []
+    caption = (
+        "Where the error lives that repeats beyond its noise, all runs together: at which "
+        "harmonics, and what of it a function of one coordinate explains that is the same in all "
+        "runs - of run and group, a constant for each. Constants point to conditions and sensors, "
+        "a function of velocity to friction and damping, of position to stiffness and gas."
+    )
+    return _drawn([(lambda: plots.residual_breakdown(tree), caption)])
+
+
+def residual_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The residual of each output against phase, velocity and stroke."""
+    if schema.RESIDUAL not in tree.children:
+        return []
+    return _drawn(list(_residuals(tree)))
+
+
+def residual_title(tree: xr.DataTree) -> str:
+    """Title of the section: what the residuals are shown against."""
+    if schema.RESIDUAL not in tree.children:
+        return "Residual"
+    *most, last = ["phase", *(against for against in LOOPS if against in tree[schema.RESIDUAL])]
+    return f"Residual against {', '.join(most)} and {last}" if most else f"Residual against {last}"
+
+
+def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
+    loops = (
+        "A cycle is a loop; where it closes to a line the residual is a function of {}, and "
+        "the line is the shape of what is missing."
+    )
+    for output in reading.outputs(tree):
+        yield (
+            partial(plots.residual, tree, output),
+            f"Residual of {output} against phase, averaged over the periods of each run.",
+        )
+        for against in LOOPS:
+            if against in tree[schema.RESIDUAL]:
+                what = reading.coordinate_name(tree[schema.RESIDUAL].to_dataset(), against)
+                yield (
+                    partial(plots.residual, tree, output, against),
+                    f"Residual of {output} against {what}. {loops.format(what)}",
+                )
+
+
+def ranking_figure(tree: xr.DataTree, number: int) -> list[CaptionedFigure]:
+    """The candidates of one round."""
+    caption = (
+        f"Candidates of round {number + 1}: the share of the excess error that each would "
+        "explain, and the probability of such a share if it were not there."
+    )
+    entry = reading.summary(tree)["rounds"][number]
+    if entry["accepted"]:
+        caption += " These data cannot tell the effects marked ≈ from the accepted one."
+    return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
+
+
+def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
+    """Where on the rig's range the rivals of one round would be told apart."""
+    group = reading.group(tree, schema.PROPOSAL)
+    if group is None or proposal_table(entry) is None:
+        return []
+    rounds = [int(number) for number in group[schema.ROUND].values]
+    if entry["round"] not in rounds:
+        return []
+    titles = reading.summary(tree).get("titles", {})
+    rivals = listed([called(one, titles) for one in entry["rivals"]])
+    caption = (
+        "Standard deviations by which a run would separate the least separated pair of "
+        f"{rivals}, at the mean position that is best for it. Where it is blank the rig cannot go."
+    )
+    return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
+
+
+def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
+    """The shape of an effect without a name, in the round that added it."""
+    if schema.NONPARAMETRIC not in tree.children:
+        return []
+    if entry["accepted"] != tree[schema.NONPARAMETRIC].attrs["effect"]:
+        return []
+    caption = (
+        "The effect that has no name: what it adds to the balance, beside all that the model's own "
+        "terms do, with its 95 % band. Beyond the range shown nothing is known of it."
+    )
+    return _drawn([(lambda: plots.nonparametric_shape(tree), caption)])
+
+
+def error_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The error of each run."""
+    of = words(reading.summary(tree)).replace("its noise", "the noise of its average")
+    caption = (
+        f"Repeating error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
+    )
+    return _drawn([(lambda: plots.error(tree), caption)])
+
+
+def posterior_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """Pairs, and the point against the posterior."""
+    if schema.POSTERIOR not in tree.children:
+        return []
+    pairs = (
+        "Posterior of the parameters, pair by pair; contours hold 39 and 86 % of the draws, as one "
+        "and two standard deviations of a normal density do. Lines: the point estimate."
+    )
+    forest = (
+        "Point estimate and its linearised standard deviation against the posterior. Where both "
+        "agree, the problem is as good as linear within its uncertainty."
+    )
+    entries: list[tuple[Draw, str]] = [(lambda: plots.corner(tree), pairs)]
+    if schema.POINT in tree.children:
+        entries.append((lambda: plots.point_against_posterior(tree), forest))
+    return _drawn(entries)
+
+
+def predictive_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The posterior prediction of each output."""
+    if schema.PERIOD_PREDICTIVE not in tree.children:
+        return []
+    entries: list[tuple[Draw, str]] = []
+    for output in reading.outputs(tree):
+        if schema.average_sd(output) in tree[schema.PERIOD_PREDICTIVE]:
+            caption = (
+                f"Measured {output}, averaged over the periods of each run, about the prediction. "
+                "Dark: what the parameters leave open; light: where 95 % of such averages would "
+                "lie if the run were repeated, with errors as the error model has them."
+            )
+
+            entries.append((partial(plots.predictive, tree, output), caption))
+    return _drawn(entries)
+
+
+def trace_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The chains."""
+    if schema.POSTERIOR not in tree.children:
+        return []
+    caption = "Some walkers of each ensemble, one colour an ensemble: colours must not keep apart."
+    return _drawn([(lambda: plots.trace(tree), caption)])
+
+
+def _drawn(entries: list[tuple[Draw, str]]) -> list[CaptionedFigure]:
+    return [CaptionedFigure(encode_figure(draw()), caption) for draw, caption in entries]

@@ -1,0 +1,449 @@
+"""Sentences of the report: result, certainty, proposed runs.
+
+What the result says, in sentences.
+
+What to measure next, in sentences and as a table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesoleo import _schema as schema
+from bayesoleo._report.tables import (
+    Table,
+    error_scale,
+    format_short,
+    ratio,
+    too_large,
+    too_small,
+    words,
+)
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.effects._catalogue import PROPER, called, listed, titles_for, with_titles
+from bayesoleo.plots._discovery import chosen, format_p, name
+from bayesoleo.plots._style import Scale, engineering
+
+
+def role_shown(summary: Mapping[str, Any]) -> str:
+    """The runs that count: those held out, if there are any."""
+    return schema.HOLD_OUT if summary["error_after"].get(schema.HOLD_OUT) else schema.FIT
+
+
+def headline(summary: Mapping[str, Any]) -> str:
+    """The result as a sentence, which begins with how sure it is."""
+    broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))
+    lead = "Unfinished, the search did not come to its end. " if broken else ""
+    return f"{lead}{_said(summary)}"
+
+
+def _said(summary: Mapping[str, Any]) -> str:
+    sure, found = certainty(summary), added(summary)
+    was = "was" if len(summary["effects"]) == 1 else "were"
+    if sure is None:
+        if summary["verdict"] == schema.NOTHING_MISSING:
+            return (
+                f"Nothing is missing: the model explains the measurements down to {words(summary)}."
+            )
+        lead = "No verdict" if only_too_small(summary) else "Something is missing"
+        return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
+    down = f"the error is then down to {words(summary)}"
+    if sure == schema.CERTAIN:
+        return f"Certain: {found} {was} missing; {down}."
+    if sure == schema.PROBABLE:
+        return f"Probable: {found} {was} missing; {down}.{_class(summary)}"
+    if sure == schema.NO_CAUSE and summary["verdict"] == schema.EFFECT_ADDED:
+        return f"No cause is named: {found} {was} added; {down}.{_class(summary)}"
+    lead = "No cause is named" if sure == schema.NO_CAUSE else "A likeness only"
+    left = f"{_size_left(summary)}{_unexplained(summary)}"
+    return f"{lead}: {found} {was} added, and {left}."
+
+
+def certainty(summary: Mapping[str, Any]) -> str | None:
+    """How sure the names of the added effects are.
+
+    Of results that were stored without an answer it follows from what they hold.
+    """
+    if not summary["effects"]:
+        return None
+    if "certainty" in summary:
+        return str(summary["certainty"])
+    if summary["verdict"] == schema.UNEXPLAINED:
+        return schema.LIKENESS
+    return schema.CERTAIN if summary.get("certain") else schema.PROBABLE
+
+
+def titles(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Titles of effects by id, as far as the summary says them."""
+    return dict(summary.get("titles", {}))
+
+
+def added(summary: Mapping[str, Any]) -> str:
+    """What was added, by title, each with its place where that is known."""
+    effects = list(summary["effects"])
+    places = list(summary.get("targets", [])) or [""] * len(effects)
+    names = [
+        f"{one} @ {place}" if place else one for one, place in zip(effects, places, strict=True)
+    ]
+    return listed([called(name, titles(summary)) for name in names])
+
+
+def _class(summary: Mapping[str, Any]) -> str:
+    """What these data cannot tell from what was added."""
+    texts = []
+    for one in accepted(summary):
+        alike = [called(other, titles(summary)) for other in one["indistinguishable_from"]]
+        if alike:
+            own = "it" if len(summary["effects"]) == 1 else called(name(one), titles(summary))
+            texts.append(f"{own} from {listed(alike, ' or ')}")
+    if texts:
+        return f" These data cannot tell {'; '.join(texts)}."
+    if certainty(summary) == schema.NO_CAUSE or len(summary["effects"]) > 1:
+        return ""
+    return " Nothing else that was tried explains as much, but something that was not may."
+
+
+def accepted(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The candidates that were added and stayed, in order."""
+    found = (chosen(entry) for entry in summary["rounds"])
+    return [one for one in found if one is not None and one["effect"] in summary["effects"]]
+
+
+def _size_left(summary: Mapping[str, Any]) -> str:
+    """How large the error is that remains: of an output over all runs of a role, or in one run
+    where that alone is too large; else which runs have no prediction."""
+    pooled = {
+        f"{output} on the {role} runs": errors
+        for role, outputs in summary["error_after"].items()
+        for output, errors in outputs.items()
+    }
+    single = {
+        f"{output} in run {run}": errors
+        for output, runs in summary["rounds"][-1]["error"].items()
+        for run, errors in runs.items()
+    }
+    if only_too_small(summary):
+        where = min(
+            (one for one in pooled if too_small(pooled[one])),
+            key=lambda one: ratio(pooled[one]) or 0.0,
+        )
+        times = f"{format_short(ratio(pooled[where]))} times {words(summary)}"
+        return f"the error of {where} is {times}, less than chance allows: its noise is overstated"
+    large = [{w: e for w, e in found.items() if too_large(e)} for found in (pooled, single)]
+    unknown = [where for where, errors in single.items() if ratio(errors) is None]
+    known = {where: errors for where, errors in single.items() if ratio(errors) is not None}
+    if known and unknown and not any(large):
+        return f"there is no prediction of {listed(unknown)}"
+    for found in (*large, known):
+        where = max(found, key=lambda one: ratio(found[one]) or 0.0, default="")
+        if where:
+            times = f"{format_short(ratio(found[where]))} times {words(summary)}"
+            return f"the error of {where} is {times}"
+    return "an error is left"
+
+
+def only_too_small(summary: Mapping[str, Any]) -> bool:
+    """Whether no error is too large, but one is smaller than chance allows."""
+    pooled = [e for outputs in summary["error_after"].values() for e in outputs.values()]
+    single = [e for runs in summary["rounds"][-1]["error"].values() for e in runs.values()]
+    return any(map(too_small, pooled)) and not any(map(too_large, (*pooled, *single)))
+
+
+def unfinished(summary: Mapping[str, Any]) -> list[str]:
+    """Which stages did not finish, and why."""
+    return [
+        f"Unfinished stage: {item['stage']}. {begin(item['reason'])}"
+        for item in summary.get(schema.UNFINISHED, [])
+    ]
+
+
+def _unexplained(summary: Mapping[str, Any]) -> str:
+    """What the catalogue has to say to an error that remains, as the end of a sentence."""
+    if only_too_small(summary):
+        return ""
+    last = summary["rounds"][-1]
+    policy = SearchPolicy(**summary.get("policy", {}))
+    open_ = [
+        c
+        for c in last["candidates"]
+        if c["p_value"] is not None
+        and c["p_value"] < policy.significance
+        and c["gain"] >= policy.least_share
+    ]
+    if not last["candidates"]:
+        return ""
+    if not open_:
+        return "; no effect in the catalogue explains it"
+    best = max(open_, key=lambda candidate: candidate["gain"])
+    nearest = called(name(best), titles(summary))
+    if any(c.get("estimated") for c in last["candidates"]):
+        return f"; no further effect was confirmed, the nearest is {nearest}"
+    share = f"{100 * best['gain']:.0f} %"
+    return f"; {nearest} would explain {share} of the excess, and was not tried"
+
+
+def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:
+    """For each output the numbers that matter: the error on the runs not used, before and after."""
+    role = role_shown(summary)
+    two = len(summary["rounds"]) > 1
+    shown = []
+    for output, last in summary["error_after"].get(role, {}).items():
+        first = summary["error_before"].get(role, {}).get(output, last)
+        key = "rms" if last["repeating"] is None else "repeating"
+        scale = error_scale(units.get(output, ""), (first, last))
+        ratios = [format_short(ratio(e)) for e in (first, last)]
+        known = ratio(last) is not None
+        shown.append(
+            {
+                "title": f"{output}, {role} runs",
+                "before": _number(first[key], scale) if two else "",
+                "after": _number(last[key], scale),
+                "unit": scale.unit,
+                "what": "repeating error" if key == "repeating" else "rms error",
+                "ratio": f"{' → '.join(ratios) if two else ratios[1]} × {words(summary)}"
+                if known
+                else "",
+                "change": _change(first[key], last[key]) if two else "",
+            }
+        )
+    return shown
+
+
+def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:
+    """Why a round ended as it did, as a sentence.
+
+    Parameters
+    ----------
+    entry : mapping
+        A round of the summary.
+    known : mapping of str to str, optional
+        Titles of effects by id, for results that were stored with ids.
+    """
+    text = entry["reason"].strip().rstrip(".")
+    ids = [str(c["effect"]) for c in entry["candidates"]]
+    text = with_titles(text, titles_for(ids, known or {}))
+    return f"{text[0].upper()}{text[1:]}." if text else ""
+
+
+def stability(summary: Mapping[str, Any]) -> str:
+    """Whether the periodic solutions are such that a rig can stay on; empty if there are none."""
+    known = {
+        run: max(np.hypot(*pair) for pair in entry["multipliers"])
+        for run, entry in summary.get("stability", {}).items()
+        if entry["multipliers"]
+    }
+    if not known:
+        return ""
+    largest = max(known, key=lambda run: known[run])
+    end = f"largest Floquet multiplier {format_short(known[largest])}, in {largest}"
+    lost = [run for run in known if not summary["stability"][run]["stable"]]
+    jumps = summary["branch_jumps"]["estimate"]
+    text = (
+        f"The periodic solution of {', '.join(lost)} is unstable"
+        if lost
+        else f"The periodic solutions of all {len(known)} runs are stable"
+        if len(known) > 1
+        else "The periodic solution is stable"
+    )
+    went = f" Solutions changed branch or stability {jumps} times on the way." if jumps else ""
+    return f"{text}; {end}.{went}"
+
+
+def remainder(summary: Mapping[str, Any]) -> list[str]:
+    """What is still unexplained, sentence by sentence."""
+    last = summary["rounds"][-1]
+    lines = [_above_floor(output, runs, words(summary)) for output, runs in last["error"].items()]
+    if last["candidates"]:
+        best = max(last["candidates"], key=lambda candidate: candidate["gain"])
+        p = format_p(best["p_value"])
+        share = f"{100 * best['gain']:.1f} %".replace("-", "−")
+        which = called(name(best), titles(summary))
+        text = f"The best remaining candidate, {which}, would explain {share} of the excess"
+        lines.append(f"{text} ({p})." if p else f"{text}.")
+    if last["reason"]:
+        lines.append(f"The search ended: {_small(reason(last, titles(summary)))}")
+    return [line for line in lines if line]
+
+
+def begin(text: str) -> str:
+    """Text as the beginning of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
+def _small(sentence: str) -> str:
+    """A sentence after a colon: with a small first letter, but for names."""
+    return sentence if sentence.split()[0] in PROPER else sentence[0].lower() + sentence[1:]
+
+
+def _above_floor(output: str, runs: Mapping[str, Any], than: str) -> str:
+    """In how many runs the error of an output is larger than chance allows, and the worst."""
+    ratios = {run: ratio(e) or 0.0 for run, e in runs.items() if ratio(e) is not None}
+    if not ratios:
+        return f"No run has a noise floor for {output}: only the rms of the residual is known."
+    worst = max(ratios, key=lambda run: ratios[run])
+    above = sum(too_large(runs[run]) for run in ratios)
+    lead = "No run" if above == 0 else f"{above} of {len(ratios)} runs"
+    verb = "has" if above <= 1 else "have"
+    largest = f"the largest is {format_short(ratios[worst])} times {than}, in {worst}"
+    return f"{lead} {verb} a repeating {output} error beyond what chance allows; {largest}."
+
+
+def _number(value: float | None, scale: Scale) -> str:
+    return format_short(None if value is None else scale.factor * value)
+
+
+def _change(before: float | None, after: float | None) -> str:
+    """How much the error fell or rose."""
+    if not before or after is None:
+        return ""
+    change = 100 * (after / before - 1)
+    return f"{change:+.0f} %".replace("-", "−")
+
+
+#: Pairs of rivals that have a column of their own.
+MOST_PAIRS = 3
+
+
+def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> list[str]:
+    """What one entry of the summary's ``proposals`` says, sentence by sentence.
+
+    Parameters
+    ----------
+    entry : mapping
+        As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
+    """
+    entry = _with_titles(entry, titles or {})
+    lines = [_question(entry)]
+    if entry["runs"]:
+        lines += _answer(entry)
+    elif entry["note"]:
+        lines.append(f"No run can be proposed: {entry['note']}.")
+    else:
+        left_out = ", ".join(entry["left_out"])
+        lines.append(f"No run within the limits of the rig can be foreseen ({left_out or 'none'}).")
+    if entry["runs"] and entry["note"]:
+        lines.append(f"Left out: {entry['note']}.")
+    return lines
+
+
+def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:
+    """The entry with rivals as they are called."""
+
+    def words(names: Sequence[str]) -> list[str]:
+        return [called(one, titles) for one in names]
+
+    def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        return {**found, "pairs": [{**p, "rivals": words(p["rivals"])} for p in found["pairs"]]}
+
+    return {
+        **entry,
+        "rivals": words(entry["rivals"]),
+        "runs": [run(one) for one in entry["runs"]],
+        "repeat": run(entry["repeat"]),
+        "inseparable": [words(pair) for pair in entry["inseparable"]],
+    }
+
+
+def proposal_table(
+    entry: Mapping[str, Any], titles: Mapping[str, str] | None = None
+) -> Table | None:
+    """The runs that would tell most, the best first, and the best one of those made.
+
+    None where there is nothing to choose.
+
+    Parameters
+    ----------
+    entry : mapping
+        As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
+    """
+    if not entry["runs"] or _all_alike(entry):
+        return None
+    entry = _with_titles(entry, titles or {})
+    scale = _scale(entry)
+    unit = f" [{scale.unit}]" if scale.unit else ""
+    pairs = entry["runs"][0]["pairs"]
+    by_pair = len(pairs) <= MOST_PAIRS
+    named = [f"{' / '.join(pair['rivals'])} [σ]" for pair in pairs]
+    head = ["run", "frequency [Hz]", f"mean{unit}", f"amplitude{unit}", "information [bit]"]
+    head += named if by_pair else ["least separated pair [σ]"]
+    shown = [(f"{number}", run) for number, run in enumerate(entry["runs"], start=1)]
+    if entry["repeat"]:
+        shown.append((f"{entry['repeat']['run']} once more", entry["repeat"]))
+    rows = []
+    for label, run in shown:
+        values = [pair["sigma"] for pair in run["pairs"]] if by_pair else [run["sigma"]]
+        place = [scale.factor * run[key] for key in ("mean", "amplitude")]
+        rows.append(
+            [label, *map(format_short, (run["frequency"], *place)), f"{run['information']:.2f}"]
+            + [format_sigma(value) for value in values]
+        )
+    return Table(head, rows, 1, frozenset({0}))
+
+
+def format_sigma(value: float) -> str:
+    """Standard deviations, to a tenth while that matters."""
+    return f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
+
+
+def run_text(run: Mapping[str, Any], scale: Scale) -> str:
+    """A run in words: ``2.00 Hz, mean 120 mm, amplitude 30.0 mm``."""
+    mean, amplitude = (format_short(scale.factor * run[key]) for key in ("mean", "amplitude"))
+    unit = f" {scale.unit}" if scale.unit else ""
+    return f"{format_short(run['frequency'])} Hz, mean {mean}{unit}, amplitude {amplitude}{unit}"
+
+
+def _scale(entry: Mapping[str, Any]) -> Scale:
+    sizes = [max(abs(run["mean"]), run["amplitude"]) for run in entry["runs"]]
+    return engineering(entry["unit"], max(sizes, default=0.0))
+
+
+def _question(entry: Mapping[str, Any]) -> str:
+    names = listed(entry["rivals"])
+    if entry["question"] == "indistinguishable":
+        first, *others = entry["rivals"]
+        return f"These data cannot tell {first}, which was added, from {listed(others)}."
+    if entry["question"] == "open":
+        return f"Each of {names} might be what is missing."
+    return f"To be told apart: {names}."
+
+
+def _answer(entry: Mapping[str, Any]) -> list[str]:
+    best, repeat, apart = entry["runs"][0], entry["repeat"], entry["inseparable"]
+    if _all_alike(entry):
+        return [
+            "No run within the limits of the rig would separate them by one standard deviation:"
+            " they are one law in other words, or differ beyond these limits or in other channels."
+        ]
+    pairs = [pair for pair in best["pairs"] if pair["rivals"] not in apart]
+    weakest = min(pair["sigma"] for pair in pairs)
+    two = len(entry["rivals"]) == 2
+    whom = listed(entry["rivals"], " from ") if two else "each pair of them"
+    if apart:
+        whom = "the others"
+    least = "" if two else "at least "
+    text = f"A run at {run_text(best, _scale(entry))} would separate {whom}"
+    text += f" by {least}{format_sigma(weakest)} standard deviations"
+    if repeat:
+        same = [pair["sigma"] for pair in repeat["pairs"] if pair["rivals"] not in apart]
+        text += f"; no present run, made once more, by more than {format_sigma(min(same))}"
+    lines = [f"{text}."]
+    for pair in apart:
+        lines.append(
+            f"No run within the limits of the rig separates {listed(pair, ' from ')} by one"
+            " standard deviation."
+        )
+    return lines
+
+
+def _all_alike(entry: Mapping[str, Any]) -> bool:
+    """Whether no pair is separated by any run, so that there is nothing to choose."""
+    return len(entry["inseparable"]) == len(entry["runs"][0]["pairs"])

@@ -1,0 +1,264 @@
+"""Results on disk: one DataTree as netCDF or Zarr, with provenance.
+
+Where a result comes from: versions, seed and time, as root attributes.
+
+Write and read a result: one DataTree, as netCDF (one file) or Zarr (a folder).
+
+What comes back equals what was written: NaN padding, text, booleans, units. What xarray remembers
+of an earlier file (chunks, compression, fill values) is dropped, or a tree read from one format
+could not be written as the other.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import warnings
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._storage.files import replacing
+from bayesoleo.errors import MissingExtraError, ResultsError, import_extra
+
+PACKAGES = (
+    "bayesoleo",
+    "numpy",
+    "scipy",
+    "sympy",
+    "numba",
+    "xarray",
+    "emcee",
+    "arviz-stats",
+    "h5netcdf",
+)
+"""Those whose version can change a number in the result."""
+
+
+def provenance(seed: int | None, **more: Any) -> dict[str, Any]:
+    """Root attributes that say where a result comes from.
+
+    Parameters
+    ----------
+    seed : int or None
+        Seed of the random generator; None where nothing was drawn.
+    **more
+        Further attributes, named as in :mod:`bayesoleo._schema` (``campaign=``, ``model=``, …).
+        Dicts and lists become JSON; those that are None are left out, since a file has no place for
+        them.
+
+    Returns
+    -------
+    dict
+        Ready for ``tree.attrs.update``.
+    """
+    attributes: dict[str, Any] = {schema.FORMAT_ATTRIBUTE: schema.FORMAT}
+    for package in PACKAGES:
+        attributes[f"{package}_version"] = package_version(package)
+    attributes["python_version"] = platform.python_version()
+    attributes["platform"] = f"{platform.system()} {platform.machine()}"
+    attributes[schema.CREATED] = datetime.now(UTC).isoformat(timespec="seconds")
+    attributes[schema.SEED] = seed
+    attributes.update(more)
+    return {name: _plain(value) for name, value in attributes.items() if value is not None}
+
+
+def package_version(package: str) -> str:
+    """Installed version; a source tree on the path has none."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _plain(value: Any) -> Any:
+    """A value as an attribute can hold it."""
+    if isinstance(value, dict | list | tuple):
+        return json.dumps(value, ensure_ascii=False)
+    return value if isinstance(value, int | float) else str(value)
+
+
+LARGE = 4096
+"""Arrays with more elements than this are compressed; below it a chunk's overhead eats the gain."""
+
+
+def write_tree(tree: xr.DataTree, path: str | os.PathLike[str]) -> None:
+    """Write a result as a whole or not at all.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Laid out as :mod:`bayesoleo._schema` names it. It is not changed.
+    path : path-like
+        Ends in ``.zarr`` for Zarr; netCDF otherwise. Missing parents are made, an older result is
+        replaced.
+
+    Raises
+    ------
+    ResultsError
+        The place cannot be written to; an older result there is untouched.
+    MissingExtraError
+        The path ends in ``.zarr`` and Zarr is not installed.
+    """
+    if _is_zarr(path):
+        import_extra("zarr", "zarr")
+    storable = _storable(tree)
+    with replacing(path) as draft:
+        if _is_zarr(path):
+            _write_zarr(storable, draft)
+        else:
+            storable.to_netcdf(draft, engine="h5netcdf", encoding=_compression(storable))
+
+
+def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
+    """Read a result into memory and close its file.
+
+    Parameters
+    ----------
+    path : path-like
+        Written by :func:`write_tree`.
+
+    Returns
+    -------
+    DataTree
+
+    Raises
+    ------
+    ResultsError
+        The file is missing, empty, cut short, of another kind or from a later version.
+    MissingExtraError
+        The path ends in ``.zarr`` and Zarr is not installed.
+    """
+    path = Path(path)
+    _check_exists(path)
+    try:
+        tree = _read_zarr(path) if _is_zarr(path) else _read_netcdf(path)
+    except MissingExtraError:
+        raise
+    # A damaged file shows itself as almost anything, depending on where it is damaged.
+    except Exception as error:
+        raise ResultsError(
+            "cannot be read; it is damaged, cut short or not a netCDF or Zarr result",
+            file=path,
+            hint="run the command that wrote it once more, or give the results.nc of another run",
+        ) from error
+    _check_format(tree, path)
+    return tree.map_over_datasets(_clean)
+
+
+def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a netCDF result says of itself, without its arrays; nothing if it cannot be read."""
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as root:
+            return dict(root.attrs)
+    except Exception:  # as above: damage has many faces
+        return {}
+
+
+def _storable(tree: xr.DataTree) -> xr.DataTree:
+    """A copy without remembered encodings and with the marks by which a reader knows the file."""
+    copy = tree.map_over_datasets(_clean)
+    copy.attrs = {
+        schema.FORMAT_ATTRIBUTE: schema.FORMAT,
+        schema.VERSION_ATTRIBUTE: _own_version(),
+        **{name: _attribute(value) for name, value in tree.attrs.items() if value is not None},
+    }
+    return copy
+
+
+def _clean(data: xr.Dataset) -> xr.Dataset:
+    """Without encodings; text as fixed-width strings, which both formats give back alike."""
+    plain = data.drop_encoding()
+    for name, variable in plain.variables.items():
+        if variable.dtype.kind in "OT" and _is_text(variable.values):
+            text = variable.copy(data=variable.values.astype(str))
+            plain = (
+                plain.assign_coords({name: text})
+                if name in plain.coords
+                else plain.assign({name: text})
+            )
+    return plain
+
+
+def _is_text(values: np.ndarray[Any, Any]) -> bool:
+    return values.dtype.kind == "T" or all(isinstance(value, str) for value in values.flat)
+
+
+def _attribute(value: Any) -> Any:
+    """Python's bool has no counterpart in netCDF attributes."""
+    return int(value) if isinstance(value, bool | np.bool_) else value
+
+
+def _compression(tree: xr.DataTree) -> dict[str, dict[str, dict[str, Any]]]:
+    """Encoding of the large numeric arrays, by group."""
+    settings = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {}
+    for node in tree.subtree:
+        variables = node.to_dataset(inherit=False).variables
+        large = {
+            str(name): dict(settings)
+            for name, variable in variables.items()
+            if variable.size > LARGE and variable.dtype.kind in "fiu"
+        }
+        if large:
+            encoding[node.path] = large
+    return encoding
+
+
+def _write_zarr(tree: xr.DataTree, path: Path) -> None:
+    with warnings.catch_warnings():
+        # Zarr 3 has not settled how fixed-width text is written; what we write, we read (tested).
+        warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
+        tree.to_zarr(path, mode="w", consolidated=False)
+
+
+def _read_netcdf(path: Path) -> xr.DataTree:
+    with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
+        return tree.load()
+
+
+def _read_zarr(path: Path) -> xr.DataTree:
+    import_extra("zarr", "zarr")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
+        options: dict[str, Any] = {"engine": "zarr", "decode_times": False, "consolidated": False}
+        with xr.open_datatree(path, **options) as tree:
+            return tree.load()
+
+
+def _check_exists(path: Path) -> None:
+    if not path.exists():
+        hint = "give the results.nc that `bayesoleo close` wrote"
+        raise ResultsError("there is no such file", file=path, hint=hint)
+    if path.is_dir() and not _is_zarr(path):
+        raise ResultsError("is a folder", file=path, hint=f"give {path / 'results.nc'}")
+    if path.is_file() and path.stat().st_size == 0:
+        hint = "run the command that wrote it once more"
+        raise ResultsError("is empty", file=path, hint=hint)
+
+
+def _check_format(tree: xr.DataTree, path: Path) -> None:
+    if schema.FORMAT_ATTRIBUTE not in tree.attrs:
+        hint = "give the results.nc that `bayesoleo close` wrote"
+        raise ResultsError("is not a result of bayesoleo", file=path, hint=hint)
+    found = int(tree.attrs[schema.FORMAT_ATTRIBUTE])
+    if found > schema.FORMAT:
+        hint = "update bayesoleo to read it"
+        raise ResultsError("was written by a later version", file=path, value=found, hint=hint)
+
+
+def _is_zarr(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix == ".zarr"
+
+
+def _own_version() -> str:
+    try:
+        return version("bayesoleo")
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,330 @@
+"""The verbs ``trace``, ``close`` and ``propose``.
+
+Look for what is missing: one round that adds nothing, or the whole loop.
+
+What to measure next: the run that would best tell apart what these runs cannot.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import xarray as xr
+
+from bayesoleo._types import ProgressCallback
+from bayesoleo._workflow.estimating import draw
+from bayesoleo._workflow.output import (
+    POSTERIOR_STAGE,
+    PROPOSALS_STAGE,
+    REPORT_STAGE,
+    SEARCH_STAGE,
+    ResultFolder,
+    Stages,
+    reason_of,
+)
+from bayesoleo._workflow.result import Drawn, report_what_is_there, result_tree, write_result
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import Source, Task, prepare, silent
+from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of
+from bayesoleo.discovery._next_experiment import check_periodic
+from bayesoleo.discovery._open_questions import Question, questions_of
+from bayesoleo.discovery._round import Progress
+from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
+from bayesoleo.model._model import Model
+
+#: What stands in the place of the search's last round while it goes on.
+NOT_YET = "the search had not finished when this was written"
+#: And in that of the posterior until it is sampled.
+NOT_SAMPLED = "the posterior had not been sampled when this was written"
+
+
+def trace(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: str | os.PathLike[str] | None = None,
+    callback: ProgressCallback = silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Hold a fitted model's residual against the noise and rank what might be missing; add nothing.
+
+    Parameters are those of :func:`close`, and so are its errors.
+    """
+    output = ResultFolder.checked(out)
+    task = prepare(campaign, model, settings, progress=progress)
+    stages = Stages(callback)
+    loop, questions = search(task, 0, stages, output)
+    return written(task, loop, None, output, stages, questions)
+
+
+def close(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: str | os.PathLike[str] | None = None,
+    callback: ProgressCallback = silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
+    and after.
+
+    What is known is written as soon as it is known: the estimate, and the result of each round. The
+    same call, with the same campaign, model and settings, goes on after the last finished round.
+
+    Parameters
+    ----------
+    campaign : path-like, Campaign or ReducedCampaign
+        What was measured.
+    model : Model
+        In its own drive.
+    settings : Settings
+        Seed, threads, drive and so on.
+    out : path-like, optional
+        Folder for ``results.nc``, ``report.html``, ``summary.json`` and ``checkpoints``, from which
+        a run that was stopped goes on. It is tried before anything is computed.
+    callback : callable
+        Told what is being done.
+    progress : bool
+        Whether to show bars.
+
+    Returns
+    -------
+    xarray.DataTree
+        The result; its root attribute ``summary`` is the JSON of the summary.
+
+    Raises
+    ------
+    InputError
+        If campaign, model and settings do not fit together, or the folder cannot be written to.
+    UnfinishedError
+        If a stage after the first estimate failed. It carries the tree of what is known, whose
+        summary says in ``unfinished`` what is missing and why; it is written like any other.
+    """
+    output = ResultFolder.checked(out)
+    task = prepare(campaign, model, settings, progress=progress)
+    with output.alone():
+        stages = Stages(callback)
+        loop, questions = search(task, settings.max_effects, stages, output, resume=True)
+        if not settings.quick:
+            _write_found(task, loop, output, stages, questions)
+        callback("sample the posterior")
+        fit, place = loop.final.fit, output.checkpoints
+        drawn = stages.attempt(
+            POSTERIOR_STAGE, lambda: draw(task, fit, place, callback, progress), lambda: None
+        )
+        return written(task, loop, drawn, output, stages, questions)
+
+
+def no_questions() -> tuple[Question, ...]:
+    """Where none could be asked."""
+    return ()
+
+
+def _write_found(
+    task: Task,
+    loop: ClosedLoop,
+    output: ResultFolder,
+    stages: Stages,
+    questions: Sequence[Question],
+) -> None:
+    """Write what was found, with its report, before what may take hours."""
+    so_far = Stages(failed=[*stages.failed, {"stage": POSTERIOR_STAGE, "reason": NOT_SAMPLED}])
+    try:
+        write_result(task, loop, None, output, so_far, questions)
+    except Exception as error:
+        stages.callback(f"what is known so far could not be written: {reason_of(error)}")
+
+
+def written(
+    task: Task,
+    loop: ClosedLoop,
+    drawn: Drawn | None,
+    output: ResultFolder,
+    stages: Stages,
+    questions: Sequence[Question],
+) -> xr.DataTree:
+    """The result, written; if nothing failed on the way to it."""
+    try:
+        tree = write_result(task, loop, drawn, output, stages, questions)
+    except Exception as error:
+        stages.fail(REPORT_STAGE, reason_of(error), error)
+        found = report_what_is_there(output, stages)
+        if found is None:
+            raise
+        tree = found
+    stages.finish(tree, output.folder)
+    output.finish()
+    return tree
+
+
+def search(
+    task: Task, max_effects: int, stages: Stages, output: ResultFolder, *, resume: bool = False
+) -> tuple[ClosedLoop, tuple[Question, ...]]:
+    """The loop of :func:`run_loop`, and the runs that would tell apart what it could not."""
+    loop = run_loop(task, max_effects, stages, output, resume=resume)
+    ask = partial(what_next, task, loop, stages.callback)
+    return loop, stages.attempt(PROPOSALS_STAGE, ask, no_questions)
+
+
+def run_loop(
+    task: Task, max_effects: int, stages: Stages, output: ResultFolder, *, resume: bool = False
+) -> ClosedLoop:
+    """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
+
+    Parameters
+    ----------
+    task : Task
+    max_effects : int
+        Effects added at most.
+    stages : Stages
+        A search that fails after the first estimate is a failed stage: the loop is then what was
+        found before.
+    output : ResultFolder
+        Written to after the estimate and after each round.
+    resume : bool
+        Whether to keep how far the search has come, and to go on from there.
+
+    Raises
+    ------
+    Exception
+        Of any kind, if the model could not be estimated.
+    """
+    settings, titles = task.settings, dict(catalogue_titles())
+    titles |= {effect.id: effect.title for effect in task.settings.effects or ()}
+
+    def callback(text: str) -> None:
+        stages.callback(with_titles(text, titles))
+
+    for effect in settings.searched if settings.effects else ():
+        base = task.assembly.model() if effect.on_channels else task.assembly.native
+        if effect not in catalogue() and not effect.places(base):
+            stages.callback(
+                f"effect {effect.id} has no place in this model: it needs {effect.applies_to}"
+            )
+    known = output.kept(task, callback) if resume else None
+    reached = [] if known is None else [known]
+
+    def keep(progress: Progress) -> None:
+        reached.append(progress)
+        write_so_far(task, progress, output, callback, resume=resume)
+
+    try:
+        return close_loop(
+            task.assembly,
+            task.roles,
+            settings.numerics,
+            effects=settings.searched,
+            seed=settings.seed,
+            max_effects=max_effects,
+            nonparametric=settings.nonparametric,
+            known=known,
+            keep=keep,
+            callback=callback,
+        )
+    except Exception as error:
+        if not reached:
+            raise
+        reason = reason_of(error)
+        stages.fail(SEARCH_STAGE, reason, error)
+        return loop_of(reached[-1].ended(f"the search broke off here: {reason}"), task.roles)
+
+
+def write_so_far(
+    task: Task,
+    progress: Progress,
+    output: ResultFolder,
+    callback: ProgressCallback,
+    *,
+    resume: bool,
+) -> None:
+    """Write what is known; failing at that must not end what goes on."""
+    if output.folder is None:
+        return
+    stages = Stages()
+    stages.fail(SEARCH_STAGE, NOT_YET)
+    try:
+        if resume:
+            output.keep(task, progress)
+        loop = loop_of(progress.ended(NOT_YET), task.roles)
+        output.write(*result_tree(task, loop, None, output, stages))
+    except Exception as error:
+        callback(f"what is known so far could not be written: {reason_of(error)}")
+
+
+def what_next(
+    task: Task,
+    loop: ClosedLoop,
+    callback: ProgressCallback,
+    *,
+    rivals: Sequence[str] = (),
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> tuple[Question, ...]:
+    """The runs that would tell apart what the loop could not.
+
+    Parameters
+    ----------
+    task : Task
+    loop : ClosedLoop
+    callback : callable
+        Told what is being done.
+    rivals : sequence of str, optional
+        Effects of the last round to be told apart; by default those that each round leaves.
+    limits : mapping of str to (float, float), optional
+        Of the rig, SI, before those of the campaign.
+    """
+    rig = {**task.campaign.rig, **(limits or {})}
+    return questions_of(loop, rig, task.settings.numerics, effects=rivals, callback=callback)
+
+
+def propose(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    rivals: Sequence[str] = (),
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    callback: ProgressCallback = silent,
+) -> xr.DataTree:
+    """Rank the runs that a rig can do by how well they would tell candidate effects apart.
+
+    Each of the rivals is estimated from the runs that there are. What it foresees of a new run is
+    uncertain by what these leave unknown of its parameters; the noise is that of the others.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`. No effect is added to the model.
+    rivals : sequence of str, optional
+        Ids of effects, or ``effect@target`` where one has several places. By default those that are
+        significant and explain a part of what is left.
+    limits : mapping of str to (float, float), optional
+        What the rig can do, in place of what the campaign says and its runs suggest:
+        ``amplitude``, ``frequency``, ``mean``, ``travel``, ``rate`` or an output, SI; infinite
+        where there is no limit.
+
+    Returns
+    -------
+    xarray.DataTree
+        As of :func:`trace`, with the group ``proposal``: ``information(round, mean, amplitude,
+        frequency)`` in bits and ``sigma``, the standard deviations that separate the least
+        separated pair. ``summary["proposals"]`` lists the best runs.
+
+    Raises
+    ------
+    InputError
+        If there is no such effect or limit, runs are transient, or the model has several inputs.
+
+    References
+    ----------
+    Box and Hill (1967), Technometrics 9, 57-71; Kolchinsky and Tracey (2017), Entropy 19, 361.
+    """
+    task = prepare(campaign, model, settings)
+    check_periodic(task.reduced.records)  # before anything is estimated for nothing
+    output, stages = ResultFolder(None), Stages(callback)
+    loop = run_loop(task, 0, stages, output)
+    found = what_next(task, loop, callback, rivals=rivals, limits=limits)
+    return stages.finish(write_result(task, loop, None, output, stages, found), None)

@@ -1,0 +1,277 @@
+"""The verbs ``estimate`` and ``sample``.
+
+Estimate the parameters: from all fitted runs together, or from each run by itself.
+
+Sample the posterior from the estimate.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._types import Array, ProgressCallback
+from bayesoleo._workflow.output import POSTERIOR_STAGE, PREDICTIONS_STAGE, ResultFolder, Stages
+from bayesoleo._workflow.result import finish, mark_unfinished
+from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.task import Source, Task, prepare, silent
+from bayesoleo.discovery._fit import ModelFit, fit_model
+from bayesoleo.discovery._inference import at_mode, mixture_at, mode_group, mode_of
+from bayesoleo.discovery._result_tree import point_group, posterior_groups, predictive_groups
+from bayesoleo.estimation._per_run import by_run_dataset
+from bayesoleo.model._model import Model
+from bayesoleo.posterior._comparison import compare
+from bayesoleo.posterior._diagnostics import Samples
+from bayesoleo.posterior._log_density import LogDensity
+from bayesoleo.posterior._sampler import sample as draw_samples
+from bayesoleo.solvers._schemes import COLLOCATION
+
+
+def estimate(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: str | os.PathLike[str] | None = None,
+    callback: ProgressCallback = silent,
+) -> xr.DataTree:
+    """Estimate a model's parameters from the fitted runs: MBE, then the posterior's mode.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    out : path-like, optional
+        Folder for ``results.nc``; it is tried before anything is computed.
+    callback : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.DataTree
+        With the groups of the records and ``point``.
+
+    Raises
+    ------
+    InputError
+        If campaign, model and settings do not fit together, or the folder cannot be written to.
+    UnfinishedError
+        If the mode under another error model was not found; it carries the estimate without it.
+    """
+    output, stages = ResultFolder.checked(out), Stages(callback)
+    task = prepare(campaign, model, settings)
+    fit, more = estimated(task, stages)
+    tree = finish(task, {schema.POINT: point_group(fit), **more}, fit)
+    mark_unfinished(tree, stages.failed)
+    output.write(tree)
+    stages.finish(tree, output.folder)
+    output.finish()
+    return tree
+
+
+def estimated(
+    task: Task, stages: Stages, method: str = "mbe"
+) -> tuple[ModelFit, dict[str, xr.Dataset]]:
+    """The estimate, at the mode under the error model that was chosen if that was found."""
+    settings, callback = task.settings, stages.callback
+    model, runs = task.assembly.model(), task.roles.fitted
+    fit = fit_model(model, runs, settings.numerics, method=method, progress=callback)
+    plain: tuple[ModelFit, dict[str, xr.Dataset]] = (fit, {})
+    return stages.attempt(
+        POSTERIOR_STAGE, lambda: under_error_model(fit, settings, callback), lambda: plain
+    )
+
+
+def under_error_model(
+    fit: ModelFit, settings: Settings, callback: ProgressCallback
+) -> tuple[ModelFit, dict[str, xr.Dataset]]:
+    """The estimate moved to the mode under the error model that was chosen, with what it found."""
+    inference = settings.inference
+    if inference.plain:
+        return fit, {}
+    callback(f"posterior mode, {inference.error_model} errors")
+    density = inference.density(fit, settings.jobs)
+    mode = mode_of(density, fit.point.theta)
+    group = mode_group(density, mode, inference.error_model)
+    return at_mode(fit, density, mode, inference.error_model), {schema.ERROR_MODEL: group}
+
+
+def estimate_each(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    callback: ProgressCallback = silent,
+) -> xr.Dataset:
+    """Estimate a model's parameters from each run by itself, fitted and held-out runs alike.
+
+    Parameters
+    ----------
+    campaign, model, settings
+        See :func:`close`.
+    callback : callable
+        Told what is being done.
+
+    Returns
+    -------
+    xarray.Dataset
+        MBE's estimates by run, see :func:`~bayesoleo.estimation._per_run.by_run_dataset`, with
+        the coordinates ``group`` and ``role`` (run). A parameter that varies by run has one value a
+        run like any other. :func:`bayesoleo.estimation.between_runs` says how much the runs differ.
+    """
+    task = prepare(campaign, model, settings)
+    driven = task.assembly.model()
+    # Alone, every parameter is one of the run's own.
+    shared = {name: replace(item, by_run=False) for name, item in driven.parameters.items()}
+    driven = driven.with_parameters(**shared)
+    points, residuals = {}, {}
+    for record in task.reduced.records:
+        callback(f"run {record.label}")
+        fit = fit_model(driven, [record], settings.numerics)
+        points[record.label] = fit.mbe
+        residuals[record.label] = fit.problem.evaluate(fit.mbe.theta).residual
+    units = [driven.parameters[name].unit for name in fit.problem.names]
+    records = task.reduced.records
+    return by_run_dataset(points, residuals, units).assign_coords(
+        {
+            schema.RUN_GROUP: (schema.RUN, [record.group for record in records]),
+            schema.ROLE: (schema.RUN, [record.role for record in records]),
+        }
+    )
+
+
+#: Starts drawn from the priors that look for other modes than the estimate before sampling.
+STARTS = 4
+#: Points about the estimate and from the priors from which the sampler climbs itself: few, because
+#: an estimate from a start is the better way.
+CLIMBS = 8
+NOT_YET = "the posterior had not been sampled when this was written"
+
+
+def sample(
+    campaign: Source,
+    model: Model,
+    settings: Settings = Settings(),
+    *,
+    out: str | os.PathLike[str] | None = None,
+    callback: ProgressCallback = silent,
+    progress: bool = False,
+) -> xr.DataTree:
+    """Estimate, then sample the posterior from there with emcee.
+
+    Parameters are those of :func:`close`, and so are its errors; the tree has the groups of the
+    records, the point and the posterior. The estimate is written before the posterior is sampled.
+    """
+    output, stages = ResultFolder.checked(out), Stages(callback)
+    task = prepare(campaign, model, settings)
+    with output.alone():
+        fit, groups = estimated(task, stages)
+        groups[schema.POINT] = point_group(fit)
+        tree = finish(task, groups, fit)
+        mark_unfinished(tree, [*stages.failed, {"stage": POSTERIOR_STAGE, "reason": NOT_YET}])
+        output.write(tree)
+        place, seed = output.checkpoints, settings.seed
+        drawn = stages.attempt(
+            POSTERIOR_STAGE, lambda: draw(task, fit, place, callback, progress), lambda: None
+        )
+        if drawn is not None:
+            groups |= drawn_groups(fit, drawn, seed, groups, stages)
+        tree = finish(task, groups, fit)
+        mark_unfinished(tree, stages.failed)
+        output.write(tree)
+        stages.finish(tree, output.folder)
+        output.finish()
+    return tree
+
+
+def no_groups() -> dict[str, xr.Dataset]:
+    """Where a stage failed."""
+    return {}
+
+
+def drawn_groups(
+    fit: ModelFit,
+    drawn: tuple[Samples, LogDensity],
+    seed: int,
+    groups: Mapping[str, xr.Dataset],
+    stages: Stages,
+) -> dict[str, xr.Dataset]:
+    """Of the draws, of what they predict, and how the point compares with them."""
+    samples, density = drawn
+    found: dict[str, xr.Dataset] = {}
+    found |= stages.attempt(
+        POSTERIOR_STAGE, lambda: posterior_groups(fit, samples, seed, density), no_groups
+    )
+    found |= stages.attempt(
+        PREDICTIONS_STAGE, lambda: predictive_groups(fit, samples, density, seed), no_groups
+    )
+    if schema.POSTERIOR in found:
+        found[schema.COMPARISON] = compare({**groups, **found})
+    return found
+
+
+def draw(
+    task: Task,
+    fit: ModelFit,
+    checkpoints: Path | None,
+    callback: ProgressCallback,
+    progress: bool | float,
+) -> tuple[Samples, LogDensity]:
+    """Draws of the posterior, from the checkpoints if there are some."""
+    settings = task.settings
+    density = settings.inference.density(fit, settings.jobs)
+    of = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
+    of += [] if settings.solver == COLLOCATION else [settings.solver]
+    samples = draw_from(
+        density, fit.point.theta, settings, of=of, checkpoints=checkpoints, progress=progress
+    )
+    return samples, density
+
+
+def draw_from(
+    density: LogDensity,
+    theta: Array,
+    settings: Settings,
+    *,
+    of: Sequence[object],
+    checkpoints: Path | None,
+    progress: bool | float,
+) -> Samples:
+    """Draws of a density, from the checkpoints if there are some.
+
+    Parameters
+    ----------
+    density : LogDensity
+    theta : ndarray, shape (l,)
+        The estimate.
+    settings : Settings
+    of : sequence
+        What the density depends on beside the settings; JSON can hold it.
+    checkpoints : Path, optional
+    progress : bool or float
+        Whether to show a bar, at once or after so many seconds.
+    """
+    starts = 0 if settings.quick else STARTS
+    start = mixture_at(density, theta, starts=starts, seed=settings.seed)
+    # Another seed or quality is another run, with a folder of its own.
+    parts = [*of, settings.seed, settings.quick, settings.error_model, settings.between_runs]
+    fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return draw_samples(
+        density,
+        start,
+        effective_size=settings.effective_size,
+        seed=settings.seed,
+        out=None if checkpoints is None else checkpoints / fingerprint[:16],
+        fingerprint=fingerprint,
+        progress=progress,
+        quick=settings.quick,
+        climbs=CLIMBS,
+        scheduler=settings.scheduler,
+    )

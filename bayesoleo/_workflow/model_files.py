@@ -1,0 +1,229 @@
+"""Objects in a user's file, named on the command line as ``file.py:object``: models, effects."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import inspect
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+from bayesoleo import model as declarations
+from bayesoleo.effects._catalogue import catalogue
+from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._gas import undeclared
+from bayesoleo.effects._places import LOOKED_FOR
+from bayesoleo.errors import InputError, ModelError, ModelWarning
+from bayesoleo.model._model import Model, unused
+from bayesoleo.systems._systems import system
+
+DEFAULT_OBJECT, DEFAULT_EFFECTS = "model", "effects"
+_HINT = "write file.py:object"
+
+
+def load_model(text: str | os.PathLike[str]) -> Model:
+    """The model that a text names.
+
+    Parameters
+    ----------
+    text : str or path-like
+        Name of a built-in system, or ``file.py:object``; ``object`` is ``model`` where it is left
+        out. A file is code: it is run here, and only when it is named.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ModelError
+        No such system, file or object; the object is not a model; the file raises something, which
+        is told with its line.
+
+    Warns
+    -----
+    ModelWarning
+        If a model from a file declares what nothing in it uses, and no effect looks for by name.
+
+    Examples
+    --------
+    >>> load_model("gas_spring").name
+    'gas_spring'
+    """
+    text = os.fspath(text)
+    file, colon, name = text.rpartition(":")
+    if text.endswith(".py"):
+        file, name = text, DEFAULT_OBJECT
+    elif not (colon and file.endswith(".py")):
+        return _built_in(text)
+    path = Path(file).expanduser()
+    found = vars(_run(path))
+    name = name or DEFAULT_OBJECT
+    if name not in found:
+        raise ModelError("no such object", file=path, value=name, hint=_models_in(found, path))
+    model = found[name]
+    if not isinstance(model, Model):
+        problem = f"{name} is not a Model but {type(model).__name__}"
+        raise ModelError(problem, file=path, hint=_models_in(found, path))
+    for idle, kind in unused(model).items():
+        if idle in LOOKED_FOR:
+            continue
+        warnings.warn(
+            f"file {path}: {kind} {idle} of model {model.name!r} stands in no equation and no "
+            "output; nothing depends on it unless an effect does",
+            ModelWarning,
+            stacklevel=2,
+        )
+    if missing := undeclared(model):
+        names = dict.fromkeys(name for lacking in missing.values() for name in lacking)
+        warnings.warn(
+            f"file {path}: model {model.name!r} has a gas, but {', '.join(missing)} cannot be "
+            f"tried because it declares no {', no '.join(names)}; what they stand for is said "
+            "under 'Names of a gas spring' in the documentation of effects",
+            ModelWarning,
+            stacklevel=2,
+        )
+    return model
+
+
+def load_effects(text: str) -> tuple[Effect, ...]:
+    """The catalogue, and after it the effects that a text names.
+
+    Parameters
+    ----------
+    text : str
+        ``file.py:object`` with an ``Effect`` or several in a list; ``object`` is ``effects`` where
+        it is left out. Effects of the catalogue may be among them.
+
+    Returns
+    -------
+    tuple of Effect
+
+    Raises
+    ------
+    ModelError
+        No such file or object; the object holds something else, or an id that is taken.
+    """
+    file, _, name = (text, "", "") if text.endswith(".py") else text.rpartition(":")
+    if not file.endswith(".py"):
+        raise ModelError("names no file of effects", value=text, hint=_HINT)
+    path, name = Path(file).expanduser(), name or DEFAULT_EFFECTS
+    found = vars(_run(path))
+    if name not in found:
+        names = [key for key, item in found.items() if isinstance(item, Effect)]
+        hint = f"write {' or '.join(f'{path}:{key}' for key in names)}" if names else None
+        raise ModelError("no such object", file=path, value=name, hint=hint)
+    given = found[name]
+    effects = list(catalogue())
+    for effect in given if isinstance(given, list | tuple) else [given]:
+        if not isinstance(effect, Effect):
+            problem = f"{name} holds {type(effect).__name__}, not an Effect"
+            raise ModelError(problem, file=path, hint="write an Effect or a list of them")
+        if any(effect is known for known in effects):
+            continue
+        if effect.id in {known.id for known in effects}:
+            hint = "choose another id"
+            raise ModelError("there is an effect of this id", file=path, value=effect.id, hint=hint)
+        effects.append(effect)
+    return tuple(effects)
+
+
+def _built_in(text: str) -> Model:
+    try:
+        return system(text)
+    except InputError as error:
+        hint = error.hint
+        if Path(text).exists():
+            hint = "there is a file of that name, but a model file ends in .py"
+        elif any(mark in text for mark in "/\\:"):
+            hint = f"{_HINT}, or the name of a built-in system (bayesoleo systems lists them)"
+        raise ModelError(error.problem, value=text, hint=hint) from None
+
+
+def _models_in(found: dict[str, object], path: Path) -> str:
+    names = [name for name, item in found.items() if isinstance(item, Model)]
+    if not names:
+        return f"the file holds no Model; write {DEFAULT_OBJECT} = Model(...)"
+    return f"write {' or '.join(f'{path}:{name}' for name in names)}"
+
+
+def _run(path: Path) -> ModuleType:
+    """Run a file as a module of its own that stays out of ``sys.modules``."""
+    try:
+        source = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelError("there is no such file", file=path, hint=_HINT) from None
+    except OSError as error:
+        raise ModelError(f"cannot be read: {error.strerror}", file=path) from error
+    # No name that a user's own module could have.
+    name = f"_bayesoleo_model_{hashlib.sha256(bytes(path.resolve())).hexdigest()[:16]}"
+    module = ModuleType(name)
+    module.__file__ = str(path)
+    try:
+        with _importing_beside(path, module):
+            exec(compile(source, str(path), "exec"), module.__dict__)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever the user's code raises, SystemExit too
+        raise _told(error, path) from error
+    return module
+
+
+@contextmanager
+def _importing_beside(path: Path, module: ModuleType) -> Iterator[None]:
+    """While it runs, the file finds what lies beside it, and nothing is written there."""
+    folder, wrote = str(path.resolve().parent), sys.dont_write_bytecode
+    sys.path.append(folder)  # last, so that it hides no installed package
+    sys.modules[module.__name__] = module  # dataclasses look themselves up
+    sys.dont_write_bytecode = True
+    try:
+        yield
+    finally:
+        sys.dont_write_bytecode = wrote
+        sys.modules.pop(module.__name__, None)
+        if folder in sys.path:
+            sys.path.reverse()
+            sys.path.remove(folder)  # the one at the end
+            sys.path.reverse()
+
+
+def _told(error: BaseException, path: Path) -> ModelError:
+    """What went wrong in the file, with its line, in one line."""
+    line = _line(error, path)
+    where = f"line {line}: " if line else ""
+    if isinstance(error, InputError):
+        problem, key, value, hint = error.problem, error.key, error.value, error.hint
+        return ModelError(where + problem, file=path, key=key, value=value, hint=hint)
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    problem = f"{where}{type(error).__name__}: {text}".rstrip(": ")
+    return ModelError(problem, file=path, hint=_keyword(text) or "correct the file")
+
+
+def _keyword(text: str) -> str | None:
+    """The closest keyword of a declaration, where an error says that it does not know one."""
+    found = re.match(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", text)
+    declaration = getattr(declarations, found[1], None) if found else None
+    if found is None or not isinstance(declaration, type):
+        return None
+    keywords = list(inspect.signature(declaration).parameters)
+    close = difflib.get_close_matches(found[2], keywords, 1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"one of: {', '.join(keywords)}"
+
+
+def _line(error: BaseException, path: Path) -> int | None:
+    """Number of the last line of the file that was being run."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return error.lineno
+    lines = [
+        frame.lineno
+        for frame in traceback.extract_tb(error.__traceback__)
+        if frame.filename == str(path)
+    ]
+    return lines[-1] if lines else None

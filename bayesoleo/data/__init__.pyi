@@ -1,0 +1,54 @@
+from ._campaign import (
+    CampaignData as CampaignData,
+    Run as Run,
+    load_campaign as load_campaign,
+)
+from ._campaign_toml import (
+    Channel as Channel,
+)
+from ._data_warnings import (
+    Drift as Drift,
+    data_warnings as data_warnings,
+    drift as drift,
+    frequency_warnings as frequency_warnings,
+    motions_per_period as motions_per_period,
+    periods_per_motion as periods_per_motion,
+    record_drifts as record_drifts,
+)
+from ._fourier import (
+    HarmonicBasis as HarmonicBasis,
+)
+from ._harmonics import (
+    SpectralLine as SpectralLine,
+    foreign_line as foreign_line,
+    significant_harmonics as significant_harmonics,
+)
+from ._noise import (
+    PeriodicAverage as PeriodicAverage,
+    periodic_average as periodic_average,
+)
+from ._reduction import (
+    ReducedCampaign as ReducedCampaign,
+    on_grid as on_grid,
+    reduce_campaign as reduce_campaign,
+    reduce_run as reduce_run,
+)
+from ._registry import (
+    dataset_folder as dataset_folder,
+)
+from ._residual_time_shift import (
+    Frequency as Frequency,
+    PeriodSearch as PeriodSearch,
+    autocovariance as autocovariance,
+    find_frequency as find_frequency,
+    period_search as period_search,
+    residual_time_shift as residual_time_shift,
+)
+from ._sample_quality import (
+    repeating_rounding as repeating_rounding,
+    step_of as step_of,
+)
+from ._write_campaign import (
+    SimulatedRun as SimulatedRun,
+    write_campaign as write_campaign,
+)

@@ -1,0 +1,342 @@
+"""Warnings about reduced records: drift, doubtful frequencies, noise.
+
+Trends over a record: does the mean or the amplitude of a channel move from period to period.
+
+A record that drifts is no periodic equilibrium. Its average over periods is then of a motion that
+never was, and the drift counts as noise (Verbeek 1993 notes the slow drift of the gas pressure).
+
+What deserves a look in reduced records, as sentences: drift, a frequency that is a multiple or a
+part of the true one, a channel in which nothing repeats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, stats
+
+from bayesoleo._types import Array
+from bayesoleo.data._fourier import HarmonicBasis
+from bayesoleo.data._harmonics import foreign_lines
+from bayesoleo.data._noise import average_on, periodic_average
+from bayesoleo.data._sample_quality import clipped, coarse_steps, repeating_rounding
+from bayesoleo.prediction._records import Record
+
+#: Probability of flagging any channel of a run without drift.
+FALSE_ALARM = 1e-3
+#: Least change over the record, in standard deviations of a single sample, that is worth a word.
+LEAST_CHANGE = 0.2
+_BINS = 24
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Trend of one channel over a record.
+
+    Parameters
+    ----------
+    channel : str
+    mean, mean_sd : float
+        Change of the mean from the beginning to the end of the record, and its standard deviation,
+        SI.
+    amplitude, amplitude_sd : float
+        Relative change of the amplitude of the periodic part, and its standard deviation.
+    noise : float
+        Standard deviation of a single sample about the average over periods, SI.
+    swing : float
+        Root mean square of the periodic part about its mean, SI.
+    """
+
+    channel: str
+    mean: float
+    mean_sd: float
+    amplitude: float
+    amplitude_sd: float
+    noise: float
+    swing: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a trend as large, of mean or amplitude, in a record without one."""
+        scores = abs(self.mean) / self.mean_sd, abs(self.amplitude) / self.amplitude_sd
+        return min(1.0, float(2 * 2 * stats.norm.sf(max(scores))))
+
+    @property
+    def change(self) -> float:
+        """Larger change of the two, in standard deviations of a single sample."""
+        return max(abs(self.mean), abs(self.amplitude) * self.swing) / self.noise
+
+
+def drift(values: Array, time_step: float, frequency: float, channel: str = "") -> Drift:
+    """Fit a linear trend to the mean and to the amplitude of a periodic signal.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Over two periods or more.
+    time_step : float
+        Sampling interval, s.
+    frequency : float
+        Hz.
+    channel : str, optional
+        Name of the signal.
+
+    Returns
+    -------
+    Drift
+        Standard deviations allow for the colour of the noise.
+    """
+    signal = np.asarray(values, dtype=float)
+    average = periodic_average(signal, time_step, frequency)
+    swing = average.values - average.values.mean()
+    rms = float(np.sqrt(np.mean(swing**2)))
+    time = (np.arange(signal.size) - 0.5 * (signal.size - 1)) / signal.size
+    shapes = np.stack((time, time * swing))
+    # What the average can absorb of a trend is not left in the residual.
+    columns = np.stack([s - periodic_average(s, time_step, frequency).values for s in shapes])
+    rest = signal - average.values
+    # In units of their own, or the amplitude's column vanishes beside that of the mean.
+    length = np.sqrt(np.mean(columns**2, axis=1, keepdims=True))
+    length[length == 0] = 1.0
+    inverse = np.linalg.pinv(columns / length).T
+    found = inverse @ rest
+    noise = rest - found @ (columns / length)
+    sd = np.array([_coloured_sd(row, noise) for row in inverse])
+    change, error = found / length[:, 0], np.maximum(sd / length[:, 0], 1e-300)
+    return Drift(
+        channel=channel,
+        mean=float(change[0]),
+        mean_sd=float(error[0]),
+        amplitude=float(change[1]),
+        amplitude_sd=float(error[1]),
+        noise=max(average.sigma, 1e-300),
+        swing=rms,
+    )
+
+
+def record_drifts(record: Record) -> tuple[Drift, ...]:
+    """Trend of every channel of a periodic run; none for a transient."""
+    if not record.periodic:
+        return ()
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    return tuple(
+        drift(values, step, record.frequency, name) for name, values in record.samples.items()
+    )
+
+
+def drifting(record: Record) -> tuple[Drift, ...]:
+    """Channels whose trend is larger than chance makes it, and large enough to matter."""
+    found = record_drifts(record)
+    return tuple(
+        item
+        for item in found
+        if item.p_value * len(found) < FALSE_ALARM and item.change > LEAST_CHANGE
+    )
+
+
+def _coloured_sd(weights: Array, noise: Array) -> float:
+    """Standard deviation of ``weights @ noise`` by the noise's own smoothed spectrum."""
+    samples = noise.size
+    transfer = np.abs(fft.rfft(weights)) ** 2
+    spectrum = np.abs(fft.rfft(noise)) ** 2 / samples
+    width = np.ones(min(2 * _BINS + 1, spectrum.size))
+    smooth = np.convolve(spectrum, width, "same")
+    # Bins on the harmonics are empty: the average over periods has taken them.
+    used = np.convolve((spectrum > 1e-12 * spectrum.max(initial=0.0)).astype(float), width, "same")
+    double = np.full(transfer.size, 2.0)
+    double[0] = 1.0
+    if samples % 2 == 0:
+        double[-1] = 1.0
+    return float(np.sqrt(np.sum(double * transfer * smooth / np.maximum(used, 1.0)) / samples))
+
+
+#: Part of the power that harmonics off the multiples may hold, and their power over that of the
+#: noise (twice its variance), which noise exceeds twice in a thousand million: what is below either
+#: is no motion.
+STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
+#: A longer period is taken for the motion's own if no more than this part of what does not repeat
+#: in the declared period is left in it. Of noise all is left. And what does not repeat must be this
+#: part of the channel's deviation: twice the frequency leaves out half of a motion, a start that
+#: has not quite settled a per cent, the rounding of samples without noise nothing.
+LEFT, LEAST = 0.25, 0.05
+#: Multiples of the declared period that are tried.
+LONGER = (2, 3)
+
+
+def motions_per_period(record: Record) -> int:
+    """How often the motion repeats within a declared period: two where the frequency is half.
+
+    Parameters
+    ----------
+    record : Record
+
+    Returns
+    -------
+    int
+        The greatest common divisor of the harmonics that stand above the noise of any channel; one
+        for a transient.
+    """
+    strong: set[int] = set()
+    for harmonics in record.harmonics.values():
+        power, moves = np.abs(harmonics.coefficients) ** 2, harmonics.orders > 0
+        least = STRAY_POWER * float(power[moves].sum())
+        clear = power > np.maximum(least, 2 * STRAY_RATIO * harmonics.variances)
+        strong.update(int(order) for order in harmonics.orders[moves & clear])
+    return int(np.gcd.reduce(sorted(strong))) if strong else 1
+
+
+def periods_per_motion(record: Record) -> tuple[int, str]:
+    """After how many declared periods the motion repeats: two where the frequency is double.
+
+    Parameters
+    ----------
+    record : Record
+
+    Returns
+    -------
+    periods : int
+        One for a transient, and where the record is too short to tell or has stretches left out.
+    channel : str
+        Which shows it best; empty where it is one.
+    """
+    if not record.periodic or record.kept is not None:
+        return 1, ""
+    step = record.frequency * (record.time[-1] - record.time[0]) / (record.time.size - 1)
+    for count in LONGER:
+        # Two of the longer periods at least, or there is nothing to compare.
+        if record.periods < 2 * count:
+            continue
+        basis = HarmonicBasis(record.time.size, step / count)
+        left = {
+            name: average_on(basis, values).sigma / record.signal_noise[name]
+            for name, values in record.samples.items()
+            if record.signal_noise[name] > LEAST * np.std(values)
+        }
+        name = min(left, key=lambda name: left[name], default="")
+        if name and left[name] ** 2 < LEFT:
+            return count, name
+    return 1, ""
+
+
+def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = None) -> list[str]:
+    """Sentences about records that are usable but deserve a look.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Reduced runs.
+    units : mapping of str to str, optional
+        SI unit of each channel, for the numbers.
+
+    Returns
+    -------
+    list of str
+        Each names the run, what was found and what to write.
+    """
+    known = {} if units is None else units
+    periods = [_about_period(record) for record in records]
+    found = [sentence for sentences in periods for sentence in sentences]
+    found += [
+        _sentence(record, item, _unit(known, item.channel))
+        for record in records
+        for item in drifting(record)
+    ]
+    for record, doubts in zip(records, periods, strict=True):
+        # Lines between the harmonics of a wrong frequency are harmonics of the true one.
+        found += [] if doubts else _about_channels(record, known)
+    return found
+
+
+def _unit(units: Mapping[str, str], channel: str) -> str:
+    """What follows a number; nothing where the channel is one."""
+    unit = units.get(channel, "(SI)")
+    return f" {unit}" if unit else ""
+
+
+def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
+    """What channels show beside what is measured: foreign lines, cut-off ends, coarse steps."""
+    where = f"run {record.label}: "
+    found = [
+        f"{where}{line.channel} has a line at {line.frequency:.4g} Hz with the amplitude "
+        f"{line.amplitude:.3g}{_unit(units, line.channel)}, which is no harmonic of "
+        f"{record.frequency:.4g} Hz: something periodic besides the drive; it counts as noise"
+        for line in foreign_lines(record)
+    ]
+    found += [
+        f"{where}{item.channel} is cut off at its {item.end} value, {item.value:.4g}"
+        f"{_unit(units, item.channel)}, for {100 * item.share:.2g} % of the samples; "
+        "mask these stretches"
+        for item in clipped(record)
+    ]
+    for channel, step in coarse_steps(record).items():
+        stays = repeating_rounding(step, record.signal_noise[channel])
+        unit = _unit(units, channel)
+        what = (
+            f"where samples fall on the same phases in every period an error of "
+            f"{stays:.2g}{unit} of rounding repeats itself"
+            if record.periodic
+            else "rounding counts as noise, which is none where the channel rests"
+        )
+        found.append(
+            f"{where}{channel} goes in steps of {step:.3g}{unit}, "
+            f"{step / max(record.signal_noise[channel], 1e-300):.2g} times the noise of a sample; "
+            f"{what}"
+        )
+    return found
+
+
+def frequency_warnings(records: Sequence[Record]) -> list[str]:
+    """Those about what repeats and when, without which everything else that is found is doubtful.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Reduced runs.
+
+    Returns
+    -------
+    list of str
+    """
+    return [sentence for record in records for sentence in _about_period(record)]
+
+
+def _about_period(record: Record) -> list[str]:
+    """What is doubtful about the period of one run."""
+    found = []
+    times = motions_per_period(record)
+    if times > 1:
+        found.append(
+            f"run {record.label}: the motion repeats {times} times in a declared period, as if "
+            f"that were {times} periods; write frequency = {times * record.frequency:.4g}"
+        )
+    count, channel = periods_per_motion(record)
+    if count > 1:
+        found.append(
+            f"run {record.label}: {channel} repeats after {count} declared periods only, and "
+            f"what differs between them counts as noise; write frequency = "
+            f"{record.frequency / count:.4g}"
+        )
+        return found
+    return found + [
+        f"run {record.label}: nothing in {name} repeats at {record.frequency:.4g} Hz above its "
+        "noise; look at the record, leave the run out, or declare it as kind = 'transient'"
+        for name, harmonics in record.harmonics.items()
+        if not (harmonics.orders > 0).any()
+    ]
+
+
+def _sentence(record: Record, item: Drift, unit: str) -> str:
+    by_mean = abs(item.mean) / item.mean_sd >= abs(item.amplitude) / item.amplitude_sd
+    if by_mean:
+        size, sd = item.mean, item.mean_sd
+        what = f"mean moves by {size:.3g} ± {sd:.1g}{unit}"
+    else:
+        size, sd = 100 * item.amplitude, 100 * item.amplitude_sd
+        what = f"amplitude changes by {size:.3g} ± {sd:.1g} %"
+    return (
+        f"run {record.label}: {item.channel} drifts, its {what} over the record, "
+        f"{item.change:.2g} times the noise of a sample; cut the run with start or stop, "
+        "or count the drift as noise"
+    )

@@ -1,0 +1,417 @@
+"""Noise of a record: averages over periods, local averages, spectrum between the harmonics.
+
+Noise of a signal that does not repeat: what a local polynomial cannot foresee.
+
+Averages over periods, and the noise that does not repeat.
+
+The average is least squares on all harmonics of the frequency that the samples of one period
+determine. Folding by linear interpolation instead smooths the noise and understates it by a fifth
+where samples per period are not whole.
+
+What a transient's residual keeps over neighbouring samples, and its noise.
+
+A transient repeats nothing that could be averaged over periods. What the model lacks is smooth on
+the scale of the samples and noise is not, so that averages over a few neighbours say the same: they
+are the noise's standard error where nothing is missing, and larger where something is.
+
+The spectrum of a periodic run's noise, from the lines between its harmonics.
+
+What repeats has lines at the harmonics only. A record of P periods has P - 1 lines between two of
+them, and these hold noise alone. Averaged over neighbours they say what noise there is *at* the
+harmonics, flat or not.
+
+References
+----------
+Pintelon and Schoukens (2012), System Identification: A Frequency Domain Approach, sections 2.5
+and 3.5; Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114, for degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from bayesoleo._types import Array, Complex, ComplexArray, Float
+from bayesoleo.data._fourier import HarmonicBasis
+from bayesoleo.errors import InputError
+
+#: Highest order of differences tried; beyond it white noise would be all that is left of any
+#: sensible sampling.
+HIGHEST_DIFFERENCE = 8
+
+
+def innovation_noise(values: Array) -> float:
+    """Standard deviation of white noise on a smooth signal (variate differences, Tintner 1940).
+
+    Differences of order d remove a local polynomial of degree d - 1 and leave noise with variance
+    ``binomial(2 d, d)`` times that of a sample. The order grows until the estimate stops falling.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+
+    Returns
+    -------
+    float
+        In the signal's unit.
+    """
+    difference, estimate = np.diff(values, 2), np.inf
+    for order in range(2, HIGHEST_DIFFERENCE + 1):
+        latest = float(np.sqrt(np.mean(difference**2) / comb(2 * order, order)))
+        # Two per cent is within the scatter of the estimate for a few thousand samples.
+        if difference.size < 8 or latest > 0.98 * estimate:
+            break
+        estimate = latest
+        difference = np.diff(difference)
+    return min(estimate, latest)
+
+
+@dataclass(frozen=True)
+class PeriodicAverage:
+    """The repeating part of a signal, and what is left.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        The average over periods at each sample, in the signal's unit.
+    coefficients : ndarray of complex, shape (K + 1,)
+        Of ``Re sum_k c_k exp(2 pi i k f (t - t_0))``, all orders 0..K.
+    samples, number : int
+        Number N of samples and M = 2K + 1 of real coefficients.
+    repeating : float
+        Root mean square of ``values``.
+    sigma : float
+        Standard deviation of a single sample about the average, ``sqrt(RSS / (N - M))``.
+    noise : float
+        Standard error of the average, root mean square over the period: ``sigma * sqrt(M / N)``.
+    """
+
+    values: Float[Array, " samples"]
+    coefficients: Complex[ComplexArray, " harmonics"]
+    samples: int
+    number: int
+    repeating: float
+    sigma: float
+    noise: float
+
+    @property
+    def ratio(self) -> float:
+        """``repeating / noise``: about one where nothing repeats but noise."""
+        return self.repeating / self.noise
+
+    def on_phase(self, points: int) -> Array:
+        """The average at phases ``0, 1/points, ...`` of one period, counted from the first sample.
+
+        Parameters
+        ----------
+        points : int
+            Number of phases.
+
+        Returns
+        -------
+        ndarray, shape (points,)
+            In the signal's unit.
+        """
+        orders = np.arange(self.coefficients.size)
+        folded = np.zeros(points, dtype=complex)
+        # Orders that differ by ``points`` agree on the grid, so they add up in one bin.
+        np.add.at(folded, orders % points, self.coefficients)
+        return (np.fft.ifft(folded) * points).real
+
+
+def periodic_average(values: Array, time_step: float, frequency: float) -> PeriodicAverage:
+    """Average a signal over its periods by least squares on all harmonics 0..K.
+
+    ``K = (floor(samples per period) - 1) // 2``; samples per period need not be whole.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times over two periods or more.
+    time_step : float
+        Sampling interval, s.
+    frequency : float
+        Fundamental frequency, Hz.
+
+    Returns
+    -------
+    PeriodicAverage
+        The average, its standard error and the noise of a single sample.
+
+    Raises
+    ------
+    InputError
+        If the signal is shorter than it takes to tell repeating from not repeating.
+    """
+    signal = np.asarray(values, dtype=float)
+    check_length(signal.size, time_step * frequency)
+    return average_on(HarmonicBasis(signal.size, time_step * frequency), signal)
+
+
+def average_on(basis: HarmonicBasis, values: Array) -> PeriodicAverage:
+    """Like :func:`periodic_average`, with a basis made before; it serves all channels of a run.
+
+    Parameters
+    ----------
+    basis : HarmonicBasis
+        All harmonics at the samples.
+    values : ndarray, shape (N,)
+        Signal.
+    """
+    coefficients = basis.coefficients(values)
+    fitted = basis.evaluate(coefficients)
+    free = basis.samples - basis.size
+    sigma = float(np.sqrt(np.sum((values - fitted) ** 2) / free))
+    return PeriodicAverage(
+        values=fitted,
+        coefficients=coefficients,
+        samples=basis.samples,
+        number=basis.size,
+        repeating=float(np.sqrt(np.mean(fitted**2))),
+        sigma=sigma,
+        noise=sigma * float(np.sqrt(basis.size / basis.samples)),
+    )
+
+
+def check_length(samples: int, step: float) -> None:
+    """Raise unless the samples hold two periods of four samples or more.
+
+    Parameters
+    ----------
+    samples : int
+        Number of samples.
+    step : float
+        Cycles per sample.
+
+    Raises
+    ------
+    InputError
+        With the number of periods found.
+    """
+    if not 0 < step <= 0.25:
+        raise InputError(
+            "a period needs four samples or more", value=step, hint="give the frequency in Hz"
+        )
+    # One sample short of two periods is what a record from 0 to 2 T without its end point holds.
+    if (samples + 1) * step < 2:
+        raise InputError(
+            "fewer than two periods", value=round(samples * step, 3), hint="record two or more"
+        )
+
+
+#: Averages of a run, and samples in one at least.
+MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
+
+
+@dataclass(frozen=True)
+class LocalAverage:
+    """Averages over blocks of neighbouring samples, in the terms of a periodic average.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        The average of each sample's block, in the signal's unit.
+    samples, number : int
+        Number N of samples and M of blocks.
+    repeating : float
+        Root mean square of ``values``.
+    sigma : float
+        Standard deviation of a single sample's noise, from differences of neighbours.
+    noise : float
+        Standard error of a block's average, root mean square over the blocks.
+    """
+
+    values: Array
+    samples: int
+    number: int
+    repeating: float
+    sigma: float
+    noise: float
+
+    @property
+    def ratio(self) -> float:
+        """``repeating / noise``: about one where nothing is left but noise."""
+        return self.repeating / self.noise
+
+    @property
+    def free(self) -> float:
+        """Degrees of freedom of ``sigma`` squared: neighbouring differences share samples.
+
+        Those of order d are correlated so that their mean square varies as that of
+        ``1 / (binomial(4 d, 2 d) / binomial(2 d, d)**2)`` as many independent ones.
+        """
+        order = HIGHEST_DIFFERENCE
+        shared = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
+        return max(self.samples / shared, 1.0)
+
+    def on_phase(self, points: int) -> Array:
+        """A transient has no phase: not a number, shape (points,)."""
+        return np.full(points, np.nan)
+
+
+def local_average(values: Array, sigma: float | None = None) -> LocalAverage:
+    """Average a signal over neighbouring samples.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+    sigma : float, optional
+        Standard deviation of a sample's noise, where it is known; by default from differences of
+        neighbours.
+    """
+    signal = np.asarray(values, dtype=float)
+    number = int(_blocks(signal.size)[-1]) + 1
+    means = local_means(signal)
+    if sigma is None:
+        sigma = innovation_noise(signal)
+    return LocalAverage(
+        values=means,
+        samples=signal.size,
+        number=number,
+        repeating=float(np.sqrt(np.mean(means**2))),
+        sigma=sigma,
+        noise=sigma * float(np.sqrt(number / signal.size)),
+    )
+
+
+def local_means(values: Array) -> Array:
+    """Mean over each sample's block of neighbours.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., N)
+
+    Returns
+    -------
+    ndarray, shape (..., N)
+    """
+    block = _blocks(values.shape[-1])
+    starts = np.flatnonzero(np.diff(block, prepend=-1))
+    sums = np.add.reduceat(values, starts, axis=-1)
+    means: Array = (sums / np.bincount(block))[..., block]
+    return means
+
+
+def _blocks(samples: int) -> NDArray[np.int64]:
+    """Number of the block that each sample lies in, shape (N,)."""
+    size = max(FEWEST_SAMPLES, samples // MOST_AVERAGES)
+    number = max(samples // size, 1)
+    return np.minimum(np.arange(samples) // size, number - 1)
+
+
+#: Lines that are averaged lie within this many periods' worth of lines, or this part of the
+#: frequency, whichever is wider: one harmonic on either side where noise may be steep.
+HARMONICS, PART = 1.0, 0.25
+#: The same of the mean. Slow noise is largest there and falls on either side alike, so that lines
+#: of a whole harmonic would say half of it; elsewhere what is steep is rather said too large.
+AT_MEAN = 0.5
+
+
+@dataclass(frozen=True)
+class NoiseSpectrum:
+    """Noise by spectral line of a run.
+
+    Parameters
+    ----------
+    level : ndarray, shape (N // 2 + 1,)
+        Variance of a single sample that white noise of this line's strength would have, by line.
+    lines : int
+        Lines from one harmonic to the next: the number of periods.
+    samples : int
+        Number N of samples.
+    """
+
+    level: Array
+    lines: int
+    samples: int
+
+    @cached_property
+    def weights(self) -> Array:
+        """Real coefficients that each line stands for: two, and one at the ends."""
+        found = np.full(self.level.size, 2.0)
+        found[0] = 1.0
+        if self.samples % 2 == 0:
+            found[-1] = 1.0
+        return found
+
+    @property
+    def noise(self) -> float:
+        """Standard error of the average over periods, root mean square over the period."""
+        return float(np.sqrt(self._at_harmonics().sum() / self.samples))
+
+    @property
+    def coefficients(self) -> float:
+        """Number of equally noisy coefficients that the average's noise scatters like."""
+        power = self._at_harmonics()
+        weights = np.where(power > 0, self.weights, 1.0)
+        return float(power.sum() ** 2 / np.sum(power**2 / weights))
+
+    @property
+    def free(self) -> float:
+        """Degrees of freedom of :attr:`noise` squared."""
+        return self.freedom(np.where(self._harmonic(), self.weights, 0.0))
+
+    def _harmonic(self) -> NDArray[np.bool_]:
+        return np.asarray(np.arange(self.level.size) % self.lines == 0)
+
+    def _at_harmonics(self) -> Array:
+        return np.where(self._harmonic(), self.weights * self.level, 0.0)
+
+    def power(self, signal: Array) -> Array:
+        """Weight of each line in the variance of ``signal @ noise``, shape (N // 2 + 1,)."""
+        transform = scipy.fft.rfft(signal)
+        power: Array = self.weights * np.abs(transform) ** 2 / self.samples
+        return power
+
+    def freedom(self, power: Array) -> float:
+        """Degrees of freedom of ``power @ level``: few lines have said what the level is."""
+        used = ~self._harmonic()
+        low, high = _windows(self.level.size, self.lines)
+        counts = np.maximum(_between(used.astype(float), low, high), 1.0)
+        spread = np.zeros(self.level.size + 1)
+        np.add.at(spread, low, power / counts)
+        np.add.at(spread, high, -power / counts)
+        measured = np.where(used, np.cumsum(spread)[:-1] * self.level, 0.0)
+        scatter = float(np.sum(2.0 * measured**2 / self.weights))
+        return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
+
+
+def noise_spectrum(rest: Array, periods: int) -> NoiseSpectrum:
+    """Spectrum of noise.
+
+    Parameters
+    ----------
+    rest : ndarray, shape (N,)
+        What of a signal does not repeat, over whole periods.
+    periods : int
+        Their number, at least two.
+    """
+    size = rest.size
+    power = np.abs(scipy.fft.rfft(rest)) ** 2 / size
+    used = (np.arange(power.size) % periods != 0).astype(float)
+    low, high = _windows(power.size, periods)
+    level = _between(power * used, low, high) / np.maximum(_between(used, low, high), 1.0)
+    return NoiseSpectrum(level, periods, size)
+
+
+def _windows(size: int, periods: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First line of each line's neighbourhood, and the first beyond it."""
+    line = np.arange(size)
+    half = np.maximum(HARMONICS * periods, PART * line).astype(np.int64)
+    half[:1] = max(1, int(AT_MEAN * periods))
+    high = np.minimum(line + half + 1, size)
+    return np.maximum(line - half, 0), high
+
+
+def _between(values: Array, low: NDArray[np.int64], high: NDArray[np.int64]) -> Array:
+    """Sums of values from ``low`` to before ``high``."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    sums: Array = total[high] - total[low]
+    return sums

@@ -1,0 +1,450 @@
+"""Alternative searches: other first effects, and backward elimination.
+
+Backward elimination: effects that are no longer worth their unknowns beside the others.
+
+References
+----------
+Schwarz (1978), Annals of Statistics 6(2), 461-464; Burnham and Anderson (2002), Model Selection
+and Multimodel Inference, section 2.5: dispersion.
+
+Whether another first effect may lead as far as the one that was taken: one effect ahead, on the
+fitted runs alone.
+
+A search carried to its end takes minutes; what the best second effect leaves beside the first tells
+in seconds whether it can come out better.
+
+Other first effects carried forward, and final models compared.
+
+The effect that explains most by itself is not always part of the best model of several; and of two
+that are missing each alone may predict other runs worse than none. Where the search ended with more
+than one effect, left more than noise, or added no cause but what varies from run to run, the first
+effects that were nearly as good as the one that was taken are followed to their ends too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._assembly import AddedEffect, Roles
+from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._hold_out_confirmation import (
+    confirmed,
+    fall_on_hold_out,
+    judged,
+    speak_against,
+    with_error,
+)
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, score_candidates
+from bayesoleo.discovery._refit import (
+    Refit,
+    compare,
+    fall_from,
+    inflation_along,
+    quick_fit,
+    refit,
+    schwarz_price,
+)
+from bayesoleo.discovery._round import Progress, Round
+from bayesoleo.discovery._score_basis import Base, squared_distance
+from bayesoleo.discovery._state import State, fit_state, state_of
+from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._nonparametric import FAMILY
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What is lost without one effect, everything else estimated anew.
+
+    Parameters
+    ----------
+    step : AddedEffect
+        The effect.
+    rise : float
+        Of the weighted sum of squares on the fitted runs.
+    size : int
+        Unknowns that leave with it.
+    scale : float
+        Variance of the samples' noise along what the effect changes, over that of white noise,
+        times the dispersion of what the model leaves.
+    price : float
+        What one unknown must be worth, in units of the scale.
+    """
+
+    step: AddedEffect
+    rise: float
+    size: int
+    scale: float
+    price: float
+
+    @property
+    def worth(self) -> float:
+        """Rise beyond the price of the unknowns, in units of the scale; NaN is never below."""
+        return self.rise / self.scale - self.price * self.size
+
+    def __str__(self) -> str:
+        error = float(np.sqrt(self.scale * (4.0 * max(self.rise, 0.0) + 2.0 * self.size)))
+        unknowns = "its unknown is" if self.size == 1 else f"its {self.size} unknowns are"
+        return (
+            f"without it the weighted squared error on fitted runs rises by"
+            f" {with_error(self.rise, error)}, and {unknowns} worth"
+            f" {self.price * self.size * self.scale:.3g} (Schwarz 1978)"
+        )
+
+
+def eliminated(
+    state: State, roles: Roles, numerics: Numerics, notes: list[str], callback: ProgressCallback
+) -> State:
+    """The state without effects that the last one made superfluous.
+
+    Each earlier effect is left out in turn and everything else estimated anew; the one that is
+    missed least goes first, as long as one is not worth its unknowns.
+
+    Parameters
+    ----------
+    state : State
+        With an effect just added.
+    roles : Roles
+    numerics : Numerics
+    notes : list of str
+        Told what was taken out, and why.
+    callback : callable
+        Told what is being done.
+    """
+    while len(state.assembly.steps) > 1:
+        base = state.base()
+        earlier = state.assembly.steps[:-1]
+        doubted = [step for step in earlier if not plainly_needed(state, base, step)]
+        if not doubted:
+            return state
+        callback("look whether the earlier effects are still needed")
+        losses = [loss_without(state, base, step, numerics) for step in doubted]
+        least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
+        if not least.worth < 0.0:
+            return state
+        effect = least.step.effect.id
+        callback(f"remove {effect}: {least}")
+        notes.append(f"{effect} was removed again, a later effect made it superfluous: {least}")
+        state = fit_state(state.assembly.without(least.step), roles, numerics, progress=callback)
+    return state
+
+
+def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
+    """Whether an effect's amplitudes are so far from their null that no fit without it is asked
+    for: by Wald's statistic, which is smaller than the fall of the sum of squares where they differ
+    by much (Hauck and Donner 1977, JASA 72, 851-853)."""
+    point, names = state.fit.point, state.fit.problem.names
+    index = [k for k, name in enumerate(names) if name.split("[")[0] in step.amplitudes]
+    covariance = point.covariance[np.ix_(index, index)]
+    if not index or not point.status.ok or not np.isfinite(covariance).all():
+        return False
+    distance = squared_distance(point.theta[index], covariance)
+    return bool(distance > base.policy.plainly_needed * schwarz_price(base) * len(index))
+
+
+def loss_without(state: State, base: Base, step: AddedEffect, numerics: Numerics) -> Loss:
+    """What is lost without one effect of a model, everything else estimated anew."""
+    without = state.assembly.without(step).model()
+    fit = quick_fit(base, without, base.fit.values, numerics)
+    share, changes = compare(base, fit)
+    names = [n for n in base.fit.problem.names if n not in fit.problem.names]
+    measured = inflation_along(base, base.fit, names, changes)
+    # The logarithm is of as many samples as would say the same independently.
+    scale = (measured or (1.0, 0))[0] * dispersion(base)
+    price = max(schwarz_price(base) - float(np.log(scale)), 1.0)
+    return Loss(step, -share * base.fall_back, len(names), scale, price)
+
+
+def dispersion(base: Base) -> float:
+    """Mean square of what a model leaves of periodic runs over that of the noise, at least one; of
+    transients the inflation is measured on all that is left."""
+    if not all(record.periodic for record in base.fit.records) or not base.excess > base.feigned:
+        return 1.0
+    return 1.0 + base.excess / max(base.noise, 1e-300)
+
+
+def leads_as_far(
+    progress: Progress,
+    first: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect] | None,
+    callback: ProgressCallback,
+) -> bool:
+    """Whether a first effect with the best second one beside it leaves about as little as the first
+    two that were added, unknowns counted, or as the noise.
+
+    Parameters
+    ----------
+    progress : Progress
+        A finished search.
+    first : Ranked
+        Estimated in its first round.
+    roles : Roles
+    numerics : Numerics
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    callback : callable
+        Told what is being done.
+    """
+    result = first.refit
+    assert result is not None
+    callback(f"look how far {first.effect} leads as the first effect instead")
+    fitted = replace(roles, held_out=(), strategy="none")
+    state = state_of(result.assembly, result.fit, fitted)
+    if state.at_floor:
+        return True
+    reference = progress.first.base()
+    seconds = _best_seconds(state, numerics, effects)
+    if any(second.reached for second in seconds):
+        return True
+    tried = (result, *seconds)
+    falls = [fall_from(reference, one.fit) for one in tried]
+    worths = [_worth(reference, fall, one.fit) for fall, one in zip(falls, tried, strict=True)]
+    present = _with_two(progress).fit
+    fall = fall_from(reference, present)
+    left = replace(reference, excess=reference.excess - max(fall, *falls))
+    best = int(np.argmax(worths))
+    # Of what is compared: a rival that moves the mean alone may lie in far more noise.
+    scale = dispersion(left) * max(result.inflation, tried[best].inflation)
+    return (
+        worths[best] > _worth(reference, fall, present) - numerics.policy.equal_likelihood * scale
+    )
+
+
+def _best_seconds(
+    state: State, numerics: Numerics, effects: Sequence[Effect] | None
+) -> list[Refit]:
+    """The effects that score best beside a first one, estimated."""
+    base = state.base()
+    scores, _ = score_candidates(base, state.assembly, effects, numerics.jobs)
+    named = [score for score in scores if score.option.candidate.family != FAMILY]
+    chosen = sorted(named, key=lambda score: -score.fall)[: numerics.policy.seconds]
+    return thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+
+
+def _with_two(progress: Progress) -> State:
+    """The model with the first two effects that were added, or the final one if it has fewer."""
+    after = [entry.after for entry in progress.rounds if entry.after is not None]
+    return after[1] if len(after) > 1 else progress.state
+
+
+def _worth(reference: Base, fall: float, fit: ModelFit) -> float:
+    return fall - schwarz_price(reference) * len(fit.problem.names)
+
+
+def best_of_beam(
+    progress: Progress,
+    roles: Roles,
+    numerics: Numerics,
+    follow: Callable[[Progress, int], Progress],
+    effects: Sequence[Effect] | None,
+    max_effects: int,
+    callback: ProgressCallback,
+) -> Progress:
+    """The best final model that the best few first effects lead to.
+
+    Parameters
+    ----------
+    progress : Progress
+        A finished search.
+    roles : Roles
+    numerics : Numerics
+    follow : callable (progress, most) -> Progress
+        Carries a search on to its end, with so many effects at most.
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    max_effects : int
+        Effects added at most.
+    callback : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Progress
+        Finished. Effects of other final models that are about as likely stand in the classes of
+        those that are in their place here.
+    """
+    best = progress
+    for first in followed(progress, numerics.policy):
+        if (first.effect, first.target) in best.state.assembly.added:
+            continue
+        if not leads_as_far(progress, first, roles, numerics, effects, callback):
+            continue
+        callback(f"follow {first.effect} as the first effect instead")
+        other = _followed(progress, first, roles, numerics, follow, max_effects, callback)
+        if other is not None and other.state.assembly.added:
+            best = _better(best, other, numerics.policy, callback)
+    return best
+
+
+def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
+    """First effects that were nearly as good as the one that was taken, the best first.
+
+    None where one effect alone led down to the noise. Those that the data could not tell from it
+    are looked at in its place by the review.
+    """
+    opening, final = progress.rounds[0], progress.state
+    taken = opening.accepted
+    curve = any(step.effect.family == FAMILY for step in final.assembly.steps)
+    alone = taken is not None and not taken.absorbs and len(final.assembly.added) < 2 and not curve
+    if final.at_floor and (taken is None or alone):
+        return []
+    pool = [
+        (item.refit.worth, item)
+        for item in opening.ranking
+        if item.refit is not None
+        and np.isfinite(item.refit.share)
+        and item.p_value < policy.significance
+        and not item.absorbs
+        and item.score.option.candidate.family != FAMILY
+    ]
+    most = max((worth for worth, _ in pool), default=0.0)
+    clear = final.at_floor and not curve and not _absorbs(progress)
+    behind = policy.followed_behind_clear if clear else policy.followed_behind
+    seen = set(final.assembly.added)
+    alike = set() if taken is None else {taken.effect, *taken.same}
+    chosen: list[Ranked] = []
+    for worth, item in sorted(pool, key=lambda one: -one[0]):
+        names = {item.effect, f"{item.effect} @ {item.target}"}
+        if worth > (1.0 - behind) * most and (item.effect, item.target) not in seen:
+            if not names & alike:
+                chosen.append(item)
+            alike |= names | set(item.same)
+    return chosen[: policy.followed]
+
+
+def _followed(
+    progress: Progress,
+    first: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    follow: Callable[[Progress, int], Progress],
+    max_effects: int,
+    callback: ProgressCallback,
+) -> Progress | None:
+    opening, result = progress.rounds[0], first.refit
+    assert result is not None
+    after, reason = confirmed(opening.before, first, result, roles, numerics, callback)
+    provisional = after is None
+    if after is None:
+        if result.share < numerics.policy.fair_share or not result.excludes_null():
+            return None
+        after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+        reason += "; it is taken on trial, to be confirmed together with the next one"
+    present = len(progress.state.assembly.added)
+    few = progress.state.at_floor and not (opening.accepted and opening.accepted.absorbs)
+    most = max(present, 2) if few else min(max(present + 1, 2), max_effects)
+    begun = Round(
+        opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
+    )
+    # Of the notes only that on the roles holds for the other search too.
+    notes = tuple(note for note in progress.notes if note == roles.description)
+    found = follow(Progress(progress.first, after, (begun,), notes), most)
+    if provisional and not _together_confirmed(found):
+        return None
+    return found
+
+
+def _together_confirmed(found: Progress) -> bool:
+    """Whether effects of which the first was refused by itself are confirmed together."""
+    if len(found.state.assembly.added) < 2:
+        return False
+    return fall_on_hold_out(*judged(found.first, found.state), _inflation(found)).confirms
+
+
+def _better(
+    best: Progress, other: Progress, policy: SearchPolicy, callback: ProgressCallback
+) -> Progress:
+    """The better of two finished searches, with the other's effects in its classes if it is about
+    as likely."""
+    gap, scale = likelihood_gap(best, other)
+    if set(best.state.assembly.added) == set(other.state.assembly.added):
+        return best
+    if (best.state.at_floor and not other.state.at_floor) or speak_against(
+        best.state, other.state, _inflation(best)
+    ):
+        return best
+    curve = any(step.effect.family == FAMILY for step in best.state.assembly.steps)
+    symptom = _absorbs(best) and not _absorbs(other)
+    equal = policy.equal_likelihood
+    if gap > scale * (policy.decisive if curve else -equal if symptom else equal):
+        return _with_notes(best, other, gap, callback)
+    if abs(gap) <= equal * scale and not curve:
+        return _with_classes(best, other)
+    return best
+
+
+def _absorbs(found: Progress) -> bool:
+    """Whether a model has effects that take up a part of whatever is missing, and name no cause."""
+    return any(step.effect.family in ABSORBING_FAMILIES for step in found.state.assembly.steps)
+
+
+def _with_notes(
+    best: Progress, other: Progress, gap: float, callback: ProgressCallback
+) -> Progress:
+    """The other search, which says what it stands instead of."""
+    names, present = (
+        " and ".join(effect for effect, _ in one.state.assembly.added) or "no effect"
+        for one in (other, best)
+    )
+    callback(f"take {names} instead of {present}")
+    way = f"falls by {gap:.3g}" if gap > 0 else f"rises by {-gap:.3g} only, and they name causes"
+    told = (
+        f"instead of {present} the model has {names}: with unknowns counted (Schwarz 1978) the"
+        f" weighted squared error on fitted runs {way}"
+    )
+    return replace(other, notes=(*other.notes, told))
+
+
+def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
+    """By how much less the other final model leaves, unknowns counted, and the scale of that.
+
+    The scale is the dispersion of what the better one leaves times the inflation by the noise's
+    colour: one of them is a squared standard deviation.
+    """
+    base = one.first.base()
+    price, falls, worth = schwarz_price(base), [], []
+    for state in (one.state, other.state):
+        fall = fall_from(base, state.fit)
+        falls.append(fall)
+        worth.append(fall - price * len(state.fit.problem.names))
+    left = replace(base, excess=base.excess - max(falls))
+    return worth[1] - worth[0], dispersion(left) * max(map(_inflation, (one, other)))
+
+
+def _inflation(found: Progress) -> float:
+    """Largest variance of an added effect's unknowns over that in white noise."""
+    refits = [item.accepted.refit for item in found.rounds if item.accepted is not None]
+    return max((result.inflation for result in refits if result is not None), default=1.0)
+
+
+def _with_classes(best: Progress, other: Progress) -> Progress:
+    """With the other model's effects in the classes of those that are in their place.
+
+    Effects that both models have stand in each other's place; the rest as they were added.
+    """
+    ours, theirs = best.state.assembly.added, other.state.assembly.added
+    left = [key for key in ours if key not in theirs]
+    more = [key for key in theirs if key not in ours]
+    rounds = list(best.rounds)
+    for k, key in enumerate(more):
+        if not left:
+            break
+        place = left[min(k, len(left) - 1)]
+        for number, item in enumerate(rounds):
+            accepted = item.accepted
+            if accepted is None or (accepted.effect, accepted.target) != place:
+                continue
+            name = key[0] if key[0] != place[0] else f"{key[0]} @ {key[1]}"
+            if name in accepted.same:
+                continue
+            new = replace(accepted, same=(*accepted.same, name))
+            ranking = tuple(new if one is accepted else one for one in item.ranking)
+            rounds[number] = replace(item, ranking=ranking, accepted=new)
+    return replace(best, rounds=tuple(rounds))

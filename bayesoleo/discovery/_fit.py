@@ -1,0 +1,477 @@
+"""Fits of an assembled model to runs, with masks and checks from other starts.
+
+Samples that do not count: they weigh nothing, and are bridged where whole periods are needed.
+
+An estimate that ended where nobody expected it is looked for again from other starts.
+
+The equations of several resonances or contacts have several answers, and the nominal values may lie
+next to a wrong one. Such an answer gives itself away: it stands on a limit of a prior's support, or
+where the priors have next to no mass. Only then are other starts worth their time.
+
+Fit an assembled model to runs: MBE, then the posterior's mode, on a mesh fine enough not to
+matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+from scipy import stats
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array
+from bayesoleo.data._noise import PeriodicAverage
+from bayesoleo.data._sample_quality import bridged
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._estimate import estimate, polish
+from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.estimation._point_estimate import PointEstimate
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._predictor import Predictor, RunPrediction
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._run_errors import motion_error, outputs_of
+from bayesoleo.prediction._stability import Stability
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
+
+
+def weights(record: Record) -> Array:
+    """One for every sample that counts, zero for the others, shape (N,)."""
+    return np.ones(record.time.size) if record.kept is None else record.kept.astype(float)
+
+
+def counted(record: Record) -> int:
+    """Number of samples that count."""
+    return record.time.size if record.kept is None else int(record.kept.sum())
+
+
+def without_masked(record: Record, residual: Array) -> Array:
+    """A residual with what the other samples say where it does not count, shape (N,).
+
+    Of a periodic run that is the average over its other periods: least squares on all harmonics
+    then is that of the samples that count. Of a transient it is a straight line.
+    """
+    if record.kept is None or not np.isfinite(residual).all():
+        return residual
+    cycles = (record.time[-1] - record.time[0]) / (record.time.size - 1) * record.frequency
+    step = float(cycles) if record.periodic else None
+    return cast(Array, bridged(residual[None], ~record.kept, step)[0])
+
+
+def of_those_counted(record: Record, average: PeriodicAverage) -> PeriodicAverage:
+    """The average of a bridged residual, its noise that of the samples which count.
+
+    What was bridged lies on the average: it adds nothing to the squares, and nothing is known by
+    it.
+    """
+    if record.kept is None:
+        return average
+    count, all_ = counted(record), average.samples
+    sigma = average.sigma * np.sqrt((all_ - average.number) / (count - average.number))
+    noise = float(sigma * np.sqrt(average.number / count))
+    return replace(average, sigma=float(sigma), noise=noise, samples=count)
+
+
+def doubtful(problem: CampaignProblem, point: PointEstimate, policy: SearchPolicy) -> bool:
+    """Whether an estimate stands where its priors hardly allow it, or did not converge."""
+    if point.on_limit or not point.status.ok:
+        return True
+    scale = PriorScale.of(problem.priors, problem.names)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        away = np.where(
+            scale.logarithmic, np.log(point.theta / scale.mean), point.theta - scale.mean
+        )
+    return bool(np.any(np.abs(away / scale.spread) > stats.norm.isf(policy.doubtful_prior / 2)))
+
+
+def from_other_starts(
+    problem: CampaignProblem,
+    mbe: PointEstimate,
+    point: PointEstimate,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    resolution: float,
+    policy: SearchPolicy,
+) -> tuple[PointEstimate, PointEstimate]:
+    """The best of an estimate and those from starts drawn from the priors.
+
+    The search ends with the first answer that is better and that the priors allow.
+
+    Parameters
+    ----------
+    problem : CampaignProblem
+    mbe, point : PointEstimate
+        MBE's estimate from the declared start, and the mode reached from it.
+    tolerance, max_iterations, resolution
+        As in :func:`~bayesoleo.estimation.estimate`.
+    policy : SearchPolicy
+
+    Returns
+    -------
+    mbe, point : PointEstimate
+        Those that were given, where no other start leads to a mode that is clearly more likely.
+    """
+    options = {"tolerance": tolerance, "max_iterations": max_iterations, "resolution": resolution}
+    least = policy.better_optimum
+    for start in promising(problem, problem.start, policy):
+        first = estimate(problem, "mbe", start=start, **options)  # type: ignore[arg-type]
+        if not first.status.ok:
+            continue
+        found = polish(problem, first, **options)  # type: ignore[arg-type]
+        if found.status.ok and (not point.status.ok or found.objective > point.objective + least):
+            mbe, point = first, found
+            if not doubtful(problem, point, policy):
+                break
+    return mbe, point
+
+
+def promising(problem: CampaignProblem, theta: Array, policy: SearchPolicy) -> list[Array]:
+    """The most likely of many draws from the priors.
+
+    Parameters
+    ----------
+    problem : CampaignProblem
+        Its solver starts from where it stands.
+    theta : ndarray, shape (l,)
+        Where unknowns of single runs stay.
+    policy : SearchPolicy
+        How many are drawn and kept.
+
+    Returns
+    -------
+    list of ndarray, shape (l,)
+        Those that could not be solved are left out.
+    """
+    rng, shared = np.random.default_rng(0), problem.predictor.model.parameters
+    draws = np.repeat(np.asarray(theta, dtype=float)[None], policy.prior_draws, axis=0)
+    for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
+        if name in shared:
+            draws[:, k] = prior.sample(rng, policy.prior_draws)
+    sums = problem.misfit(draws).sum_of_squares.sum(axis=1)
+    counts = problem.counts.sum(axis=0)
+    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
+    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[: policy.prior_starts]
+    return [draws[k] for k in order if np.isfinite(cost[k])]
+
+
+#: What is said of a mesh that did not do, or of which nothing is known.
+TOO_COARSE = (
+    "the mesh is too coarse: {} steps leave an error that moves a parameter by {:.2g} of its"
+    " standard deviations, where at most {:g} are allowed; the motion's own estimated error is {}"
+    " of its swing. Estimates and intervals are not those of the equations: allow more steps"
+    " (--steps), or make the model less steep"
+)
+UNKNOWN_SHIFT = (
+    "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
+    " the estimates"
+)
+#: Error of a motion over its swing below which its estimate resolves nothing more.
+RESOLVED = 1e-3
+#: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
+#: iterations gain a digit each, and what is below no figure shows.
+RESOLUTION = 1e-3
+#: Steps for each harmonic of the inputs, and limits.
+STEPS_PER_HARMONIC = 4
+FEWEST_STEPS, MOST_STEPS = 128, 8192
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """How models are solved.
+
+    Parameters
+    ----------
+    scheme : str
+        Discretisation.
+    solver : str
+        Of periodic runs, see :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+    steps : int or None
+        Steps of the mesh; ``None`` refines until the estimate no longer moves.
+    jobs : int or None
+        Threads.
+    backend : str
+        ``numba`` or ``numpy``.
+    scheduler : str or None
+        Other processes or machines for fits that do not depend on each other; see
+        :func:`bayesoleo._dask.connected`.
+    policy : SearchPolicy
+        By which fits are judged and compared.
+    """
+
+    scheme: str = DEFAULT_SCHEME
+    steps: int | None = None
+    jobs: int | None = None
+    backend: str = "numba"
+    scheduler: str | None = None
+    solver: str = COLLOCATION
+    policy: SearchPolicy = SearchPolicy()
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """A fitted model.
+
+    Parameters
+    ----------
+    model : Model
+        Driven.
+    problem : CampaignProblem
+        Over the runs that were fitted.
+    mbe, point : PointEstimate
+        The estimate by MBE, or by the method asked for, and the posterior's mode reached from it.
+    predictions : list of RunPrediction
+        At the mode, with sensitivities, one a fitted run.
+    steps : int
+        Steps of the mesh.
+    numerics : Numerics
+        As asked for.
+    shift : float
+        Largest movement of a parameter by halving the mesh's steps, or by what lies between their
+        points, in posterior standard deviations; NaN where it is not known.
+    motion_error : float
+        Estimated largest error of a fitted run's motion over its swing; NaN where it is not known.
+    """
+
+    model: Model
+    problem: CampaignProblem
+    mbe: PointEstimate
+    point: PointEstimate
+    predictions: list[RunPrediction]
+    steps: int
+    numerics: Numerics
+    shift: float
+    motion_error: float = float("nan")
+
+    @property
+    def doubts(self) -> list[str]:
+        """Where the estimate is that of the steps rather than of the equations."""
+        if not self.model.dofs:
+            return []
+        if not np.isfinite(self.shift):
+            return [UNKNOWN_SHIFT.format(self.steps)]
+        largest = self.policy.mesh_shift
+        if self.shift > largest:
+            least = f"{self.motion_error:.1g}" if np.isfinite(self.motion_error) else "unknown"
+            return [TOO_COARSE.format(self.steps, self.shift, largest, least)]
+        return []
+
+    @property
+    def policy(self) -> SearchPolicy:
+        """By which it is judged."""
+        return self.numerics.policy
+
+    @property
+    def predictor(self) -> Predictor:
+        """Of the fitted runs."""
+        return self.problem.predictor
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The fitted runs."""
+        return self.predictor.records
+
+    @property
+    def stability(self) -> Stability | None:
+        """Of the fitted runs' periodic solutions, jumps on the way to both points included."""
+        return self.point.following(self.mbe).stability
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Estimates by unknown."""
+        return dict(zip(self.problem.names, map(float, self.point.theta), strict=True))
+
+    @property
+    def shared(self) -> dict[str, float]:
+        """Estimates of the parameters that all runs have in common."""
+        return {name: value for name, value in self.values.items() if name in self.model.parameters}
+
+
+def first_steps(model: Model, records: Sequence[Record]) -> int:
+    """Steps to start from: a few for each significant harmonic of the inputs, a power of two."""
+    highest = max(
+        (
+            int(record.harmonics[name].orders[-1])
+            for record in records
+            for name in model.inputs
+            if name in record.harmonics
+        ),
+        default=1,
+    )
+    wanted = max(FEWEST_STEPS, STEPS_PER_HARMONIC * highest)
+    return int(min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted)))))
+
+
+def fit_model(
+    model: Model,
+    records: Sequence[Record],
+    numerics: Numerics,
+    *,
+    start: Array | None = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 50,
+    share: Predictor | None = None,
+    check_mesh: bool = True,
+    method: str = "mbe",
+    progress: Callable[[str], None] | None = None,
+) -> ModelFit:
+    """Estimate a model's parameters from runs.
+
+    Parameters
+    ----------
+    model : Model
+        Driven.
+    records : sequence of Record
+        Runs, periodic or transient.
+    numerics : Numerics
+        Scheme, steps, threads.
+    start : ndarray, shape (l,), optional
+        Where to start; by default at the nominal values, and from draws of the priors as well where
+        these lead to an estimate that the priors hardly allow.
+    tolerance : float
+        Relative step at which the estimators stop.
+    max_iterations : int
+        Of each estimator.
+    share : Predictor, optional
+        Of the same runs; what does not depend on the model is taken from it.
+    check_mesh : bool
+        Whether to find out what halving the steps would move. Of a model that is only compared
+        with others on one mesh nobody asks that, and it costs as much as a third of the estimate.
+    method : str
+        Estimator that leads to the posterior's mode, as in :func:`bayesoleo.estimation.estimate`.
+    progress : callable, optional
+        Told what is being done.
+
+    Returns
+    -------
+    ModelFit
+        Its ``point.status`` says whether to trust it.
+
+    References
+    ----------
+    Verbeek (1993), eqs. 3.17, 3.19 and 3.23.
+    """
+    callback, policy = progress or (lambda _: None), numerics.policy
+    steps = numerics.steps or first_steps(model, records)
+    while True:
+        problem = _problem(model, records, numerics, steps, share)
+        callback(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
+        mbe = estimate(
+            problem,
+            method,
+            start=start,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            resolution=RESOLUTION,
+        )
+        callback("posterior mode")
+        point = polish(
+            problem,
+            mbe,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            resolution=RESOLUTION,
+        )
+        if start is None and doubtful(problem, point, policy):
+            callback("the estimate stands where the priors hardly allow it: other starts")
+            mbe, point = from_other_starts(
+                problem,
+                mbe,
+                point,
+                tolerance=tolerance,
+                max_iterations=max_iterations,
+                resolution=RESOLUTION,
+                policy=policy,
+            )
+        problem.freeze(point.theta)
+        predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
+        # Without dofs there is no mesh.
+        shift, error = 0.0, 0.0
+        if model.dofs:
+            shift = error = float("nan")
+            if check_mesh:
+                shift, error = _mesh_shift(problem, point, predictions, policy)
+        fine = not shift > policy.mesh_shift
+        if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
+            return ModelFit(model, problem, mbe, point, predictions, steps, numerics, shift, error)
+        # One-step collocation gains more than a factor of four by halving, so one look ahead
+        # usually suffices.
+        steps, start = 2 * steps, point.theta
+
+
+def _problem(
+    model: Model, records: Sequence[Record], numerics: Numerics, steps: int, share: Predictor | None
+) -> CampaignProblem:
+    predictor = Predictor(
+        model,
+        records,
+        steps=steps,
+        scheme=numerics.scheme,
+        solver=numerics.solver,
+        backend=numerics.backend,
+        jobs=numerics.jobs,
+        share=share,
+    )
+    return CampaignProblem(predictor)
+
+
+def _mesh_shift(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    policy: SearchPolicy,
+) -> tuple[float, float]:
+    """Shift of the estimate that the discretisation causes, in standard deviations, and the largest
+    error of a motion over its swing."""
+    coarse = problem.predictor
+    halved = _halved(problem, point)
+    if halved is None:
+        return float("nan"), float("nan")
+    shift = _shift(problem, point, predictions, halved)
+    found = thread_map(lambda run: motion_error(run, RESOLVED), coarse.runs, coarse.jobs)
+    error = float(np.max([one.error for one in found]))  # NaN where one is not known
+    better = [outputs_of(run, one) for run, one in zip(coarse.runs, found, strict=True)]
+    known = [y for y in better if y is not None and np.isfinite(y).all()]
+    if len(known) < len(better):
+        return shift, error
+    missed = _shift(problem, point, predictions, known)
+    clearly = missed > max(policy.missed_factor * shift, policy.mesh_shift)
+    return (missed if clearly else shift), error
+
+
+def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | None:
+    """Outputs ``(ny, N)`` of every run on half the steps; None where one has no solution."""
+    coarse = problem.predictor
+    theta = problem.full(point.theta[None])[0]
+    fine = Predictor(
+        coarse.model,
+        coarse.records,
+        steps=2 * coarse.steps,
+        scheme=coarse.scheme,
+        solver=coarse.solver,
+        backend=coarse.backend,
+        jobs=coarse.jobs,
+        share=coarse,
+    )
+    if any(status is not Status.CONVERGED for status in fine.set_anchor(theta)):
+        return None
+    return [fine.simulate(theta[None], r).y[0] for r in range(len(fine.runs))]
+
+
+def _shift(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    better: list[Array],
+) -> float:
+    """Largest shift ``(J' W J)^-1 J' W delta`` over its standard deviation, by better outputs."""
+    names = problem.predictor.layout.names
+    gradient = np.zeros(len(names))
+    for run, y in zip(predictions, better, strict=True):
+        gradient += np.einsum("ylN,yN->l", run.sensitivity, (y - run.y) / point.variance[:, None])
+    free = np.array([names.index(name) for name in problem.names])
+    return float(np.max(np.abs(point.covariance @ gradient[free]) / point.sd, initial=0.0))

@@ -1,0 +1,326 @@
+"""Confirmation of an effect by runs that were not used.
+
+By how much an effect lowers the squared error on runs that were not used, and how sure that is.
+
+References
+----------
+McCullagh and Nelder (1989), Generalized Linear Models, section 4.5: dispersion. Theiler et al.
+(1992), Physica D 58, 77-94: a remainder with the same spectrum and random phases.
+
+Whether runs that were not used confirm an effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from bayesoleo._types import Array, ProgressCallback
+from bayesoleo.discovery._assembly import Roles, in_halves
+from bayesoleo.discovery._fit import Numerics, weights
+from bayesoleo.discovery._hold_out_error import Prediction, crossed
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import Ranked
+from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.prediction._run_errors import input_columns
+
+
+@dataclass(frozen=True)
+class Fall:
+    """Fall of the weighted sum of squares on runs that were not used.
+
+    Parameters
+    ----------
+    value : float
+        Sum over the runs, less the charge for parameters that were estimated on them.
+    error : float
+        Standard error if the effect is not there: of the noise, what is left, and the parameters of
+        the model without it.
+    expected : float
+        What it would be on average if the effect is exactly right.
+    spread : float, optional
+        Standard error if the effect is there, its own parameters' included; by default the same.
+    policy : SearchPolicy
+    """
+
+    value: float
+    error: float
+    expected: float
+    spread: float | None = None
+    policy: SearchPolicy = SearchPolicy()
+
+    @property
+    def scatter(self) -> float:
+        """Standard error if the effect is there."""
+        return self.error if self.spread is None else self.spread
+
+    @property
+    def confirms(self) -> bool:
+        """Whether the fall exceeds its error as often as is asked for, and what one unknown that is
+        not there would explain as often."""
+        enough = self.policy.confirming_errors
+        return bool(self.value > max(enough * self.error, enough**2))
+
+    @property
+    def speaks_against(self) -> bool:
+        """Whether the squared error rises by more than its error, as often as is asked for."""
+        enough = self.policy.confirming_errors
+        return bool(-self.value > enough * max(self.error, self.scatter))
+
+    @property
+    def undecided(self) -> bool:
+        """Whether these runs are unlikely to confirm even an effect that is real."""
+        missed = stats.norm.isf(self.policy.missed_confirmation)
+        least = self.policy.confirming_errors * self.error + missed * self.scatter
+        return bool(self.expected < least)
+
+    @property
+    def _weight(self) -> float:
+        return self.expected / self.scatter**2 if self.scatter > 0 else 0.0
+
+    def and_by(self, other: Fall) -> Fall:
+        """Both together, each weighted by what it would show of a real effect: by the expected fall
+        over the variance, which gives the test with most power. The larger weight is one. Runs
+        that the effect does not change, or that could not be solved, say nothing."""
+        weights = np.array([one._weight for one in (self, other)])
+        first, second = weights / max(weights.max(), 1e-300)
+        return Fall(
+            float(first * self.value + second * other.value),
+            float(np.hypot(first * self.error, second * other.error)),
+            float(first * self.expected + second * other.expected),
+            float(np.hypot(first * self.scatter, second * other.scatter)),
+            self.policy,
+        )
+
+    def __str__(self) -> str:
+        return with_error(self.value, self.error)
+
+
+def with_error(value: float, error: float) -> str:
+    """A value with its standard error, to as many digits as the error leaves."""
+    if not (np.isfinite(value) and np.isfinite(error) and error > 0):
+        return f"{value:.3g} ± {error:.2g}"
+    last = int(np.floor(np.log10(error))) - 1  # two digits of the error
+    if max(abs(value), error) < 1e6 and last > -6:
+        digits = max(0, -last)
+        step = 10.0**last
+        return f"{round(value / step) * step:.{digits}f} ± {round(error / step) * step:.{digits}f}"
+    return f"{value:.3g} ± {error:.2g}"
+
+
+def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fall:
+    """Fall of the weighted sum of squares on held-out runs, and its standard error.
+
+    With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``. Noise with the
+    covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
+    ``4 d' w (1/w + B B') w d`` with ``d = b - a``; coloured noise multiplies the first part by the
+    inflation. What the model still leaves, beyond the noise, adds to it, and so do the errors of
+    the parameters: ``4 d' w J S J' w d`` with their sensitivities and covariance. Runs that could
+    not be solved in both states do not count.
+
+    Parameters
+    ----------
+    before, after : State
+        Without and with the effect.
+    inflation : float
+        Variance of the output's noise along what the effect changes, over that of white noise.
+
+    Returns
+    -------
+    Fall
+        Each parameter that only the model with the effect estimates on the runs themselves is
+        charged with what it takes of their noise on average.
+    """
+    fall = expected = variance = 0.0
+    pulls = [np.zeros(len(state.fit.problem.names)) for state in (before, after)]
+    charged = sum(p.re_estimated for p in after.held_out)
+    charged -= sum(p.re_estimated for p in before.held_out)
+    for old, new in zip(before.held_out, after.held_out, strict=True):
+        if not (old.status.ok and new.status.ok):
+            continue
+        parts = _of_run(before, after, old, new, inflation)
+        fall, expected, variance = fall + parts[0], expected + parts[1], variance + parts[2]
+        pulls[0] += _pull(before, old, before, new.y - old.y)
+        pulls[1] += _pull(after, new, before, new.y - old.y)
+    error, spread = (
+        float(np.sqrt(variance + 4.0 * inflation * _known_to(state, pull)))
+        for state, pull in zip((before, after), pulls, strict=True)
+    )
+    return Fall(fall - inflation * charged, error, expected, spread, before.policy)
+
+
+def _pull(state: State, prediction: Prediction, measured: State, change: Array) -> Array:
+    """By unknown of a fit, how its error moves the fall in one run: ``J' w d``, shape (l,)."""
+    predictor, names = prediction.predictor, state.fit.problem.names
+    found, layout = np.zeros(len(names)), predictor.layout.names
+    sensitivity = predictor.predict(prediction.vector)[0].sensitivity
+    if not np.isfinite(sensitivity).all():
+        return found
+    counts, label = weights(prediction.record), prediction.record.label
+    for b, output in enumerate(predictor.outputs):
+        weight = measured.hold_errors.at(output, label).average.sigma ** -2
+        along = sensitivity[b] @ (weight * change[b] * counts)
+        for k, name in enumerate(names):
+            # What is estimated on the run itself follows what is wrong with the others.
+            if name in layout and name in state.fit.model.parameters:
+                found[k] += along[layout.index(name)]
+    return found
+
+
+def _known_to(state: State, pull: Array) -> float:
+    """Variance of what the errors of a fit's parameters do along a direction."""
+    covariance = state.fit.point.covariance
+    if not np.isfinite(covariance).all():
+        return 0.0
+    return max(float(pull @ covariance @ pull), 0.0)
+
+
+def _of_run(
+    before: State, after: State, old: Prediction, new: Prediction, inflation: float
+) -> tuple[float, float, float]:
+    """Fall in one run, what it is on average if the effect is right, and its variance."""
+    predictor, record = old.predictor, old.record
+    columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
+    fall = expected = noise = remainder = 0.0
+    moved: Array | float = 0.0
+    for b, output in enumerate(new.predictor.outputs):
+        entry = before.hold_errors.at(output, record.label)
+        weight = entry.average.sigma**-2
+        counts = weights(record)
+        left = (record.samples[output] - new.y[b]) * counts
+        change = (new.y[b] - old.y[b]) * counts
+        size = weight * float(change @ change)
+        fall += weight * float(np.sum(((left + change) ** 2 - left**2) * counts))
+        expected += size
+        pulled = weight * entry.input_scale * (columns[b] @ change)
+        moved = moved + pulled
+        own = inflation * size + float(np.sum(np.square(pulled)))
+        noise += inflation * size
+        if record.periodic and not after.at_floor:
+            ratio = after.hold_errors.at(output, record.label).ratio_to_expected
+            spread = max(ratio**2 - 1.0, 0.0) * own
+            remainder += min(spread, weight**2 * surrogate_variance(change, left))
+    return fall, expected, 4.0 * (noise + float(np.sum(np.square(moved))) + remainder)
+
+
+def surrogate_variance(change: Array, left: Array) -> float:
+    """Variance of ``change @ s`` over remainders ``s`` with the spectrum of ``left`` and random
+    phases.
+
+    What still repeats scatters a fall: a curve that happens to run along it proves nothing. It is
+    taken to be spread as the noise is, but never to have more power than it shows where the effect
+    has any.
+
+    Parameters
+    ----------
+    change, left : ndarray, shape (N,)
+    """
+    power = np.abs(np.fft.rfft(change)) ** 2 * np.abs(np.fft.rfft(left)) ** 2
+    power[1 : (change.size + 1) // 2] *= 2.0  # each line stands for its conjugate too
+    return float(power.sum() / change.size**2)
+
+
+def confirmed(
+    state: State,
+    item: Ranked,
+    result: Refit,
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
+) -> tuple[State | None, str]:
+    """The state with an estimated effect in, if runs that were not used confirm it, and why."""
+    if not np.isfinite(result.share):
+        return None, f"{item.effect} could not be estimated"
+    policy = numerics.policy
+    if result.share < (policy.least_share if result.reached else policy.fair_share):
+        share = f"{100 * result.share:.0f} % of the excess, {_on_fitted(result)}"
+        return None, f"{item.effect} would explain only {share}"
+    if not result.excludes_null():
+        return (
+            None,
+            f"the posterior of {item.effect} does not exclude its null: {_on_fitted(result)}",
+        )
+    callback(f"confirm {item.effect} on runs that were not used")
+    after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+    if not after.hold_errors.entries:
+        return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
+    fall = fall_on_hold_out(*judged(state, after), result.inflation)
+    if fall.error == 0.0:
+        return None, f"{item.effect} cannot be confirmed: it changes no hold-out run that is solved"
+    where = f"hold-out runs: the weighted squared error falls by {fall}"
+    # Halves of a run share whatever is odd in it. They show that a parameter of its own repeats,
+    # which is no news where that leaves more than noise.
+    alike = item.absorbs and not result.reached
+    able = fall.undecided and not fall.speaks_against and not alike
+    halves = in_halves(roles) if able else None
+    if halves is not None:
+        # What happens at the end of the stroke shows only in runs that get there.
+        callback(
+            f"runs held out hardly show {item.effect}: confirm it on the other half of the periods"
+        )
+        pair = _on_halves(state, after, halves, numerics)
+        other = fall_on_hold_out(*pair, result.inflation)
+        fall = fall.and_by(other)
+        where += f", which hardly shows it, and by {other} on the second half of fitted ones"
+    if not fall.confirms:
+        errors, alarms = policy.confirming_errors, 100 * policy.false_confirmation
+        asked = f"{errors:.2f} standard errors are asked for (false alarms {alarms:g} %)"
+        return None, f"{item.effect} does not lower the error on {where}; {asked}"
+    return after, f"{_explains(item)} and lowers the error on {where}"
+
+
+def speak_against(one: State, other: State, inflation: float) -> bool:
+    """Whether runs that were not used speak against another model instead of one.
+
+    Parameters
+    ----------
+    one, other : State
+    inflation : float
+        Variance of the noise along what tells them apart, over that of white noise.
+    """
+    if not one.hold_errors.entries:
+        return False
+    return fall_on_hold_out(*judged(other, one), inflation).confirms
+
+
+def _on_fitted(result: Refit) -> str:
+    """By how much an estimate lowers the error on the runs that it was made from."""
+    # The fall is a non-central chi-square, of variance 2 k + 4 times its non-centrality.
+    error = float(np.sqrt(result.inflation * (4.0 * max(result.fall, 0.0) + 2.0 * result.size)))
+    fall = with_error(result.fall, error)
+    return f"lowering the weighted squared error on fitted runs by {fall}"
+
+
+def _on_halves(
+    before: State, after: State, halves: Roles, numerics: Numerics
+) -> tuple[State, State]:
+    """Both models estimated on the first half of each fitted run and held against the second."""
+    quick = replace(numerics, steps=after.fit.steps)
+    old, new = (
+        fit_state(state.assembly, halves, quick, start=state.fit.point.theta)
+        for state in (before, after)
+    )
+    return judged(old, new)
+
+
+def judged(before: State, after: State) -> tuple[State, State]:
+    """Both states as an effect is judged by them: where it brings parameters of single runs, with
+    each half of a run predicted by what the other half says, alike before and after."""
+    pairs = []
+    for old, new in zip(before.held_out, after.held_out, strict=True):
+        if new.re_estimated > old.re_estimated:
+            across = crossed(old) if old.re_estimated else old, crossed(new)
+            if across[0] is not None and across[1] is not None:
+                old, new = across[0], across[1]
+        pairs.append((old, new))
+    return (
+        replace(before, held_out=[old for old, _ in pairs]),
+        replace(after, held_out=[new for _, new in pairs]),
+    )
+
+
+def _explains(item: Ranked) -> str:
+    return f"{item.effect} explains {100 * item.gain:.0f} % of the excess"

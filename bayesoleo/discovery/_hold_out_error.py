@@ -1,0 +1,274 @@
+"""Noise of a record, and the prediction of hold-out runs.
+
+The noise of a record: the same whatever the model, and never more than the residual bears out.
+
+What the noise of an input does to a prediction is computed by sending its spectrum through the
+model. A model that differentiates its input makes much of it, and the spectrum between the input's
+harmonics may hold a rig's real motion, to which the output answers, or a converter's steps, instead
+of noise. So it counts only as far as the residual has the power for it, band by band: a residual is
+the sum of what the model lacks and of noise, and nowhere smaller than either.
+
+Predict runs that were not used: shared parameters stay, by-run parameters are estimated on the
+run itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo._types import Array, Float
+from bayesoleo.data._noise import innovation_noise
+from bayesoleo.discovery._assembly import RecordNoise, halves
+from bayesoleo.discovery._fit import ModelFit, without_masked
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._estimate import estimate
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._orbit import Status
+
+#: Columns whose overlap says how many independent coefficients a band holds.
+MOST_COLUMNS = 128
+
+
+def borne_out(
+    columns: Array,
+    residuals: Sequence[Array],
+    *,
+    drawn: bool = False,
+    policy: SearchPolicy = SearchPolicy(),
+) -> float:
+    """Largest factor, at most one, by which the input's noise may be what the residual holds.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (ny, k, N)
+        Change of the outputs by one standard deviation of each input coefficient.
+    residuals : sequence of ndarray, shape (N,)
+        What the average over periods (or neighbouring samples) leaves of each output.
+    drawn : bool
+        Whether columns are draws of an error with as many coefficients as samples, as those of a
+        transient's input are, instead of one coefficient each.
+    policy : SearchPolicy
+
+    Returns
+    -------
+    float
+        One factor for all outputs of the run, because it is the input's; what it leaves in doubt by
+        chance is left in.
+    """
+    least = 1.0
+    for block, residual in zip(columns, residuals, strict=True):
+        if block.shape[0] == 0 or not (block.any() and np.isfinite(residual).all()):
+            continue
+        lines = scipy.fft.rfft(block, axis=1)
+        power, there = np.sum(np.abs(lines) ** 2, axis=0), np.abs(scipy.fft.rfft(residual)) ** 2
+        for band in _bands(power, policy.noise_bands):
+            coefficients = _of_lines(power[band]) if drawn else _coefficients(lines[:, band])
+            level = policy.noise_false_alarm / policy.noise_bands
+            low = float(stats.chi2.ppf(level, coefficients)) / coefficients
+            ratio = float(there[band].sum() / power[band].sum())
+            least = min(least, ratio / max(low, 1e-300))
+    return float(np.sqrt(least))
+
+
+def _bands(power: Array, count: int) -> list[slice]:
+    """Stretches of lines with about the same part of the power each."""
+    total = np.cumsum(power)
+    edges = np.searchsorted(total, np.arange(1, count) / count * total[-1]) + 1
+    ends = np.unique(np.concatenate([[0], edges, [power.size]]))
+    found = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    return [band for band in found if power[band].sum() > 0.01 * total[-1]]
+
+
+def _of_lines(power: Array) -> float:
+    """The same where each line has two of its own."""
+    return max(2.0 * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
+
+
+def _coefficients(lines: NDArray[np.complex128]) -> float:
+    """Number of equally large independent coefficients that a band's power scatters like."""
+    size = np.sum(np.abs(lines) ** 2, axis=1)
+    chosen = np.argsort(-size)[:MOST_COLUMNS]
+    gram = (lines[chosen] @ lines[chosen].conj().T).real
+    return max(float(np.trace(gram) ** 2 / np.sum(gram**2)), 1.0)
+
+
+def sample_noise(
+    record: Record,
+    output: str,
+    residual: Array,
+    before: RecordNoise | None = None,
+    *,
+    policy: SearchPolicy = SearchPolicy(),
+) -> float:
+    """Standard deviation of the noise of a transient's sample, SI.
+
+    Differences of neighbours see whatever is not smooth as noise, be it the record's or what a
+    model predicts. Both the record and the residual hold the noise: it is no more than the smaller.
+
+    Parameters
+    ----------
+    record : Record
+    output : str
+    residual : ndarray, shape (N,)
+        Of the present model.
+    before : RecordNoise, optional
+        Where it was measured before.
+    policy : SearchPolicy
+    """
+    shown = innovation_noise(residual)
+    if before is not None:
+        known = before.sigma
+        return shown if shown < policy.clearly_less_noise * known else known
+    return min(shown, innovation_noise(without_masked(record, record.samples[output])))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Outputs of one run at an estimate.
+
+    Parameters
+    ----------
+    record : Record
+        The run.
+    y : ndarray, shape (ny, N)
+        Predicted outputs at the raw samples, SI; NaN where the solve failed.
+    theta : mapping of str to float
+        Unknowns of that run.
+    re_estimated : int
+        Number of by-run parameters estimated on the run itself.
+    status : Status
+    predictor : Predictor
+        Of this run, anchored at ``theta``.
+    """
+
+    record: Record
+    y: Float[Array, "outputs samples"]
+    theta: dict[str, float]
+    re_estimated: int
+    status: Status
+    predictor: Predictor
+
+    @property
+    def vector(self) -> Array:
+        """Unknowns in the predictor's order, shape (l,)."""
+        return np.array([self.theta[name] for name in self.predictor.layout.names])
+
+
+def predict_fitted(fit: ModelFit) -> list[Prediction]:
+    """Predictions of the runs that were fitted."""
+    found = []
+    for run, solved in zip(fit.predictions, fit.predictor.runs, strict=True):
+        record = solved.record
+        mine = {
+            name: v
+            for name, v in fit.values.items()
+            if name in fit.model.parameters or name.endswith(f"[{record.label}]")
+        }
+        predictor = _single(fit, record)
+        if record.periodic:  # stay on the branch of the fit
+            predictor.runs[0].anchor = solved.anchor
+        prediction = Prediction(record, run.y, mine, 0, run.status, predictor)
+        predictor.set_anchor(prediction.vector)
+        found.append(prediction)
+    return found
+
+
+def predict_held_out(fit: ModelFit, records: Sequence[Record]) -> list[Prediction]:
+    """Predictions of runs that were not fitted."""
+    return [_held_out(fit, record) for record in records]
+
+
+def _single(fit: ModelFit, record: Record) -> Predictor:
+    numerics = fit.numerics
+    return Predictor(
+        fit.model,
+        [record],
+        steps=fit.steps,
+        scheme=numerics.scheme,
+        solver=numerics.solver,
+        backend=numerics.backend,
+        jobs=numerics.jobs,
+        share=fit.predictor,
+    )
+
+
+def _held_out(fit: ModelFit, record: Record) -> Prediction:
+    predictor = _single(fit, record)
+    problem = CampaignProblem(predictor).holding(fit.shared)
+    own = len(problem.names)
+    # What is known of a nuisance parameter counts; of any other, only what the run says.
+    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
+    theta = estimate(problem, method).theta if own else np.empty(0)
+    full = problem.full(theta[None])[0]
+    status = predictor.set_anchor(full)[0]
+    samples = predictor.simulate(full[None], 0)
+    names = predictor.layout.names
+    return Prediction(
+        record,
+        samples.y[0],
+        dict(zip(names, map(float, full), strict=True)),
+        own,
+        status if status is not Status.CONVERGED else Status(int(samples.status[0])),
+        predictor,
+    )
+
+
+def crossed(prediction: Prediction) -> Prediction | None:
+    """Predict each half of a held-out run with what was estimated on its other half.
+
+    No sample is then compared with parameters that it took part in estimating.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Of a run with parameters of its own.
+
+    Returns
+    -------
+    Prediction or None
+        The same with other outputs; ``None`` where a run has no halves that repeat, or one of them
+        could not be solved.
+    """
+    record = prediction.record
+    if not record.periodic or record.periods < 2 or not prediction.status.ok:
+        return None
+    parts = [replace(part, label=record.label) for part in halves(record)]
+    outputs = []
+    for estimated, predicted in zip(reversed(parts), parts, strict=True):
+        vector = _own_estimate(prediction, estimated)
+        predictor = _like(prediction, predicted)
+        if vector is None or predictor.set_anchor(vector)[0] is not Status.CONVERGED:
+            return None
+        samples = predictor.simulate(vector[None], 0)
+        if samples.status[0] != Status.CONVERGED.value:
+            return None
+        outputs.append(samples.y[0])
+    return replace(prediction, y=np.concatenate(outputs, axis=1), re_estimated=0)
+
+
+def _like(prediction: Prediction, record: Record) -> Predictor:
+    old = prediction.predictor
+    return Predictor(
+        old.model, [record], steps=old.steps, scheme=old.scheme, solver=old.solver,
+        backend=old.backend, jobs=1,
+    )  # fmt: skip
+
+
+def _own_estimate(prediction: Prediction, record: Record) -> Array | None:
+    """All unknowns, those of the run estimated on part of it."""
+    predictor = _like(prediction, record)
+    shared = {n: v for n, v in prediction.theta.items() if n in predictor.model.parameters}
+    problem = CampaignProblem(predictor).holding(shared)
+    start = np.array([prediction.theta[name] for name in problem.names])
+    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
+    point = estimate(problem, method, start=start)
+    return problem.full(point.theta[None])[0] if point.status.ok else None

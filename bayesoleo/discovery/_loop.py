@@ -1,0 +1,432 @@
+"""The closed loop, and its verdict.
+
+What a search comes to in one word, and how sure the names are that it gives.
+
+An effect counts as found where the model predicts all runs down to what is expected, or where
+effects of physics explain nine tenths of what was missing. What varies by run, what repeats with
+the drive and curves without a name take up a part of whatever is missing; what they explain is no
+evidence that a cause was found.
+
+The closed loop: fit, look for what is missing, add it, compare, until nothing more is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from bayesoleo import _schema as schema
+from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._alternatives import best_of_beam, eliminated
+from bayesoleo.discovery._assembly import Added, AddedEffect, Assembly, Roles
+from bayesoleo.discovery._error_table import least_noise
+from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
+from bayesoleo.discovery._review import reviewed
+from bayesoleo.discovery._round import Progress, Round, examine
+from bayesoleo.discovery._state import State, better_start, fit_state
+from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._nonparametric import FAMILY
+
+#: Families of effects that name no cause.
+NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
+
+
+def verdict_of(
+    rounds: Sequence[Round], first: State, final: State, *, policy: SearchPolicy = SearchPolicy()
+) -> str:
+    """One of the three verdicts of the summary.
+
+    Parameters
+    ----------
+    rounds : sequence of Round
+        In order.
+    first, final : State
+        The model as declared, and with all effects.
+    policy : SearchPolicy
+        Its ``explained`` is the part of the excess that effects of physics must explain where more
+        than is expected is left.
+    """
+    if _as_expected(final):
+        return schema.EFFECT_ADDED if final.assembly.added else schema.NOTHING_MISSING
+    if final.too_quiet:
+        return schema.UNEXPLAINED  # by a noise that is too large all is explained
+    found = explained_by_physics(rounds, first, final) > policy.explained
+    return schema.EFFECT_ADDED if found else schema.UNEXPLAINED
+
+
+def certainty_of(final: State, certain: bool) -> str | None:
+    """How sure the names of the added effects are; None where none was added.
+
+    Parameters
+    ----------
+    final : State
+        With all effects.
+    certain : bool
+        Whether the data leave no doubt of its only effect.
+    """
+    steps = final.assembly.steps
+    if not steps:
+        return None
+    if all(step.effect.family in NO_CAUSE for step in steps):
+        return schema.NO_CAUSE
+    if not _as_expected(final):
+        return schema.LIKENESS
+    return schema.CERTAIN if certain else schema.PROBABLE
+
+
+def _as_expected(final: State) -> bool:
+    """Whether all errors are what is expected: less than chance allows is a fault of the noise, and
+    proves nothing."""
+    return final.at_floor and not final.too_quiet
+
+
+def explained_by_physics(rounds: Sequence[Round], first: State, final: State) -> float:
+    """Part of the excess that effects of physics explain, of those that stayed.
+
+    Each effect gets what the error fell by in the round that added it.
+    """
+    added = final.assembly.added
+    whole = max(excess(first), 1e-300)
+    if all(step.effect.family not in NO_CAUSE for step in final.assembly.steps):
+        return (excess(first) - excess(final)) / whole if added else 0.0
+    # A round that replaced an effect begins without it, not where the round before it ended.
+    return sum(
+        (excess(item.before) - excess(item.after)) / whole
+        for item in rounds
+        if item.after is not None and _is_physics(item, added)
+    )
+
+
+def _is_physics(item: Round, added: Sequence[Added]) -> bool:
+    """Whether a round added an effect of physics that stayed."""
+    found = item.accepted
+    if found is None or (found.effect, found.target) not in added:
+        return False
+    return found.score.option.candidate.family not in NO_CAUSE
+
+
+def excess(state: State) -> float:
+    """Squared ratio to what is expected beyond one, of held-out runs where there are any."""
+    table = state.hold_errors if state.hold_errors.entries else state.fit_errors
+    return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
+
+
+#: How a note begins that names parameters.
+ON_LIMIT = "at the limit of their prior's support"
+#: How a note begins of a declared model that was estimated from another start than its own.
+OTHER_OPTIMUM = "from its declared values the model's estimate ended in a lesser optimum, lower"
+
+#: How a note begins of parameters whose sign is not the declared one.
+OTHER_SIGN = "of the other sign than declared"
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Everything that happened.
+
+    Parameters
+    ----------
+    rounds : tuple of Round
+        The last one accepts nothing.
+    first, final : State
+        The model as declared, and with all effects that were added.
+    roles : Roles
+    notes : tuple of str
+        What a reader should know.
+    complete : bool
+        Whether the search came to its end.
+    policy : SearchPolicy
+        By which it decided.
+    """
+
+    rounds: tuple[Round, ...]
+    first: State
+    final: State
+    roles: Roles
+    notes: tuple[str, ...]
+    complete: bool = True
+    policy: SearchPolicy = SearchPolicy()
+
+    @property
+    def added(self) -> tuple[tuple[str, str], ...]:
+        """Effects of the final model with their targets."""
+        return tuple(self.final.assembly.added)
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Ids of the effects in the final model, in the order in which they were added."""
+        return tuple(effect for effect, _ in self.final.assembly.added)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Where each of them sits."""
+        return tuple(target for _, target in self.final.assembly.added)
+
+    @property
+    def verdict(self) -> str:
+        """One of the three verdicts of the summary."""
+        return verdict_of(self.rounds, self.first, self.final, policy=self.policy)
+
+    @property
+    def certainty(self) -> str | None:
+        """How sure the names of the added effects are, in one word; None where none was added."""
+        return certainty_of(self.final, self.certain)
+
+    @property
+    def certain(self) -> bool:
+        """Whether the data leave no doubt of the one effect that was added.
+
+        It explains everything by itself - at the floor, nothing else significant - the data can
+        tell it from all others of the catalogue, and it is large enough that one which merely
+        resembles it would have left a significant remainder. Runs that were not used must have
+        confirmed it.
+        """
+        if not self.complete or self.final.too_quiet or not self.final.hold_errors.entries:
+            return False
+        accepted = [item.accepted for item in self.rounds if item.accepted]
+        accepted = [item for item in accepted if (item.effect, item.target) in self.added]
+        if len(self.added) != 1 or not accepted or not self.final.at_floor:
+            return False
+        found, last = accepted[-1], self.rounds[-1]
+        estimate = found.beside or found.refit
+        if found.same or estimate is None:
+            return False
+        if found.score.option.candidate.family == FAMILY:
+            return False  # a function without a name has none to be certain of
+        level, same = self.policy.significance, self.policy.same_cosine
+        if any(item.p_value < level for item in last.ranking):
+            return False
+        local = -np.expm1(np.log1p(-level) / last.tests)
+        fall = estimate.fall / estimate.inflation
+        return bool((1.0 - same) * fall > stats.chi2.isf(local, 1))
+
+
+def close_loop(
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    effects: Sequence[Effect] | None = None,
+    seed: int = 0,
+    max_effects: int = 4,
+    nonparametric: bool = True,
+    known: Progress | None = None,
+    keep: Callable[[Progress], None] = lambda _: None,
+    callback: ProgressCallback = lambda _: None,
+) -> ClosedLoop:
+    """Fit a model, and add the effects that it lacks one after the other.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        The declared model and its drive.
+    roles : Roles
+        Runs to fit and to hold out.
+    numerics : Numerics
+        Scheme, mesh, threads.
+    effects : sequence of Effect, optional
+        Instead of the catalogue.
+    seed : int
+        For the correction for the search.
+    max_effects : int
+        Effects added at most.
+    nonparametric : bool
+        Whether a smooth function may be added where no named effect explains what is left.
+    known : Progress, optional
+        Of the same search, stopped before: it goes on from there.
+    keep : callable
+        Given the progress once the model is estimated, and after each round.
+    callback : callable
+        Told what is being done.
+
+    Returns
+    -------
+    ClosedLoop
+    """
+    if known is None:
+        known = _begun(assembly, roles, numerics, callback)
+        keep(known)
+    search = SearchOptions(
+        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback
+    )
+    known = searched(known, search)
+
+    def follow(other: Progress, most: int) -> Progress:
+        quiet = replace(search, max_effects=most, nonparametric=False, keep=lambda _: None)
+        return searched(other, quiet)
+
+    roles = _with_noise(roles, known)
+    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
+    return loop_of(known, roles)
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How a search is done; see :func:`close_loop`."""
+
+    roles: Roles
+    numerics: Numerics
+    effects: Sequence[Effect] | None
+    seed: int
+    max_effects: int
+    nonparametric: bool
+    keep: Callable[[Progress], None]
+    callback: ProgressCallback
+
+
+def searched(known: Progress, search: SearchOptions) -> Progress:
+    """A search carried on to its end, its final effects looked at again."""
+    for left in reversed(range(search.max_effects + 1)):
+        known = _rounds(known, search)
+        roles = _with_noise(search.roles, known)
+        known = reviewed(
+            known, roles, search.numerics, search.effects, search.callback, replacing=left > 0
+        )
+        if known.finished:
+            break
+        search.keep(known)
+    return known
+
+
+def _rounds(known: Progress, search: SearchOptions) -> Progress:
+    """A search carried on until a round accepts nothing."""
+    numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
+    roles = _with_noise(search.roles, known)
+    while not known.finished:
+        rounds, state, notes = known.rounds, known.state, list(known.notes)
+        callback(f"round {len(rounds) + 1}: {_ratios(state)}")
+        limit = _limit(state.assembly.steps, len(rounds), max_effects)
+        outcome = examine(
+            state,
+            roles,
+            numerics,
+            effects=search.effects,
+            seed=search.seed,
+            limit=limit,
+            callback=callback,
+        )
+        if outcome.after is None and search.nonparametric and max_effects > 0:
+            opening = rounds[0] if rounds else outcome
+            room = len(state.assembly.steps) < max_effects
+            outcome = with_nonparametric(
+                outcome, opening, roles, numerics, room=room, callback=callback
+            )
+        if outcome.after is not None:
+            state = eliminated(outcome.after, roles, numerics, notes, callback)
+            noise = least_noise(roles.measured, state.errors.record_noise)
+            roles = replace(roles, measured=noise)
+        known = known.after(outcome, state, notes)
+        search.keep(known)
+    return known
+
+
+def _with_noise(roles: Roles, known: Progress) -> Roles:
+    """Runs with their noise as the models of a search have found it: what one that goes on has
+    found counts as well."""
+    for found in (known.first, known.state):
+        noise = least_noise(roles.measured, found.errors.record_noise)
+        roles = replace(roles, measured=noise)
+    return roles
+
+
+def _begun(
+    assembly: Assembly, roles: Roles, numerics: Numerics, callback: ProgressCallback
+) -> Progress:
+    """The declared model, estimated."""
+    notes = [] if roles.strategy == "declared" else [roles.description]
+    state = fit_state(assembly, roles, numerics, progress=callback)
+    if not state.at_floor:
+        callback("more is left than expected: try other starts")
+        start = better_start(state.fit, numerics)
+        if start is not None:
+            before = state.fit.point.objective
+            state = fit_state(assembly, roles, numerics, start=start, progress=callback)
+            notes.append(
+                f"{OTHER_OPTIMUM} by {state.fit.point.objective - before:.3g} in log density: look"
+                " whether the declared values and priors are what is meant"
+            )
+    return Progress(state, state, notes=tuple(notes))
+
+
+def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
+    """What a search has found, with what a reader should know of its final model.
+
+    Parameters
+    ----------
+    progress : Progress
+        Ended; see :meth:`Progress.ended`.
+    roles : Roles
+    """
+    progress = progress.with_same_noise()
+    state = progress.state
+    notes = [*progress.notes, *_warnings(state.fit), *_turned(progress.first.fit, state.fit)]
+    notes += nonparametric_notes(progress.rounds)
+    notes += [f"could not be predicted: run {text}" for text in state.unsolved]
+    notes += state.too_quiet
+    if not state.at_floor:
+        notes.append(
+            "intervals count independent noise only: while an error remains that repeats, they are"
+            " too narrow"
+        )
+    return ClosedLoop(
+        progress.rounds,
+        progress.first,
+        state,
+        roles,
+        tuple(notes),
+        not progress.broken,
+        state.policy,
+    )
+
+
+def _limit(steps: Sequence[AddedEffect], rounds: int, max_effects: int) -> str:
+    """Why a round may only rank; empty where it may add an effect."""
+    added = len(steps)
+    if max_effects == 0:
+        return "effects were to be ranked only, and none added"
+    if any(step.effect.family == FAMILY for step in steps):
+        return "an effect without a name was added: what is left may be what its splines leave"
+    if added >= max_effects:
+        return f"as many effects as allowed, {max_effects}, have been added"
+    if rounds > 2 * max_effects:
+        return f"effects were added and removed again for {rounds} rounds"
+    return ""
+
+
+def _ratios(state: State) -> str:
+    parts = [
+        f"{role} {output} {values['ratio_to_expected']:.2f}"
+        for role, table in state.by_role.items()
+        for output, values in table.items()
+    ]
+    return "ratio to what is expected: " + ", ".join(parts)
+
+
+def _turned(first: ModelFit, final: ModelFit) -> list[str]:
+    """Parameters that came out with the other sign than they were declared with."""
+    turned, least = [], final.policy.opposite_sign
+    for name, value, sd in zip(final.problem.names, final.point.theta, final.point.sd, strict=True):
+        declared = first.model.parameters.get(name)
+        if declared is not None and declared.value * value < 0 and abs(value) > least * sd:
+            turned.append(f"{name} = {value:.3g}")
+    if not turned:
+        return []
+    return [f"{OTHER_SIGN}: {', '.join(turned)}; look at the signs of equations and channels"]
+
+
+def _warnings(fit: ModelFit) -> list[str]:
+    found = []
+    if not fit.point.status.ok:
+        found.append(
+            f"the estimate of the final model did not converge: {fit.point.status.message}"
+        )
+    if fit.point.on_limit:
+        found.append(f"{ON_LIMIT}: {', '.join(fit.point.on_limit)}")
+    found += fit.doubts
+    return found

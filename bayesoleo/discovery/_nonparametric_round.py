@@ -1,0 +1,303 @@
+"""The end of a round that found no name: let a smooth function of one or two quantities explain
+what is left, and say which named effects come closest to it.
+
+Named effects go first, one after the other. Two answers compete with what was found so far: the
+function beside the named effects, if they left something, and the function *instead* of them. A
+named effect may have been no more than the nearest to what is in the data, and several together may
+come down to the noise where one law of the same quantities is what they are a part of. The weighted
+sum of squares decides, less the logarithm of the number of averaged values for each unknown
+(Schwarz 1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the
+runs that were not used decide, as for every effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy import stats
+
+from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._assembly import AddedEffect, Roles
+from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._hold_out_confirmation import confirmed, speak_against
+from bayesoleo.discovery._nonparametric_quantities import ranges
+from bayesoleo.discovery._nonparametric_search import CurveSearch, Tried, closest, search
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked
+from bayesoleo.discovery._refit import Refit, fall_from, refit
+from bayesoleo.discovery._round import Round
+from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._score_basis import Base
+from bayesoleo.discovery._state import State
+from bayesoleo.effects._nonparametric import FAMILY, Axis
+
+Merit = Callable[..., float]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """A function added to one of two models, after estimation."""
+
+    state: State
+    search: CurveSearch
+    refit: Refit
+    ranking: tuple[Ranked, ...]
+    instead: bool
+    merit: float
+
+
+def with_nonparametric(
+    outcome: Round,
+    first: Round,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    room: bool = True,
+    callback: ProgressCallback,
+) -> Round:
+    """A round that accepted nothing, with a nonparametric effect where one explains what is left.
+
+    Parameters
+    ----------
+    outcome : Round
+        Accepted nothing.
+    first : Round
+        Of the same loop: its model has none of the effects that were added.
+    roles : Roles
+        Runs.
+    numerics : Numerics
+        Scheme, threads.
+    room : bool
+        Whether one more effect may be added; else one may only stand instead of others.
+    callback : callable
+        Told what is being done.
+
+    Returns
+    -------
+    Round
+        Where a function is confirmed it is the accepted effect, first in the ranking. Where it
+        stands instead of effects added before, the new state has none of them.
+    """
+    state, policy = outcome.before, numerics.policy
+    steps = state.assembly.steps
+    named = len(steps) > len(first.before.assembly.steps)
+    nonparametric = sum(step.effect.family == FAMILY for step in steps)
+    if nonparametric >= policy.curves or (not named and (state.at_floor or not room)):
+        return outcome
+    if not room and len(steps) < policy.fewest_replaced:
+        return outcome  # named ones had no chance to come together
+    # At the floor nothing is left that a function could explain but noise.
+    beside = room and not state.at_floor
+    alone = _stands_by_itself(first, policy)
+    instead = named and (not alone or _several_in_one_balance(steps, policy))
+    if not (beside or instead):
+        return outcome
+    callback("look for an effect without a name")
+    chances = []
+    if not state.at_floor:
+        found = _Chance.at(state, outcome, numerics)
+        outcome = replace(outcome, nonparametric=found.search)
+        if found.search.p_value >= policy.significance:
+            return outcome
+        if beside:
+            chances.append(found)
+    if instead:
+        # The present model moves as was measured; one with less in it may not get as far.
+        also = ranges(state.fit, state.assembly, first.before.assembly.native)
+        chances.append(_Chance.at(first.before, first, numerics, also))
+    return _decided(outcome, chances, roles, numerics, callback)
+
+
+def _decided(
+    outcome: Round,
+    chances: Sequence[_Chance],
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
+) -> Round:
+    """The round with the best function in that the runs not used confirm, or why there is none."""
+    reasons, common = [outcome.reason], chances[-1].base
+    # One name that leaves noise alone is no sum of names that a single law may be behind: then the
+    # more likely of the two stands.
+    alone = outcome.before.at_floor and len(outcome.before.assembly.steps) == 1
+    policy = numerics.policy
+    favour = 0.0 if alone else policy.decisive
+    merit = partial(_merit, present=outcome.before.fit, reference=common, favour=favour)
+    for k in range(policy.curves_tried):
+        answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
+        for answer in _better(answers, merit):
+            accepted, reason = _accepting(outcome, answer, roles, numerics, callback)
+            if accepted.accepted is not None:
+                return accepted
+            reasons.append(reason)
+    return replace(outcome, reason="; ".join(reasons))
+
+
+def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
+    """Answers that are better than what was found so far, the best first.
+
+    What was found so far competes too: a function that explains less does not replace it. All are
+    judged by the same noise. What an answer leaves of a transient counts as noise that is not
+    white, and what a worse one leaves is no noise: so by that of the answer that leaves least.
+    """
+    least = min((item.refit.inflation for item in answers), default=1.0)
+    merits = [merit(item.refit, instead=item.instead, inflation=least) for item in answers]
+    order = sorted(range(len(answers)), key=lambda k: -merits[k])
+    return [answers[k] for k in order if merits[k] > 0]
+
+
+def _stands_by_itself(first: Round, policy: SearchPolicy) -> bool:
+    """Whether the first effect explained nearly all of the excess alone; one that takes up a part
+    of whatever is missing does so only where it left nothing but noise."""
+    found = first.accepted
+    if found is None or found.gain < policy.own_right:
+        return False
+    return not found.absorbs or (found.refit is not None and found.refit.reached)
+
+
+def _several_in_one_balance(steps: Sequence[AddedEffect], policy: SearchPolicy) -> bool:
+    """Whether names came together in a balance, where one function of its quantities may be what
+    all of them are a part of."""
+    places = [step.target for step in steps if step.effect.family not in ABSORBING_FAMILIES]
+    return any(places.count(place) >= policy.fewest_replaced for place in places)
+
+
+@dataclass(frozen=True)
+class _Chance:
+    """A model, and the functions that may be added to it."""
+
+    state: State
+    base: Base
+    search: CurveSearch
+    outcome: Round
+    instead: bool
+
+    @classmethod
+    def at(
+        cls,
+        state: State,
+        outcome: Round,
+        numerics: Numerics,
+        also: Mapping[str, Axis] | None = None,
+    ) -> _Chance:
+        """The functions that a model's remainder asks for; `also` stands for one without names."""
+        base = state.base()
+        found = search(base, state.assembly, numerics.jobs, also)
+        return cls(state, base, found, outcome, also is not None)
+
+    def answers(self, k: int, merit: Merit, numerics: Numerics) -> list[_Answer]:
+        """The function that does best but for ``k`` others, estimated; none where there are fewer.
+
+        The score says which, by the same measure as estimates are judged. It says how fine, too,
+        where the model is near to the data; a model without the names is far from them, and a step
+        from there describes a curve badly: pieces are cut finer as long as the estimate explains
+        significantly more.
+        """
+        price = float(np.log(max(self.base.noise, 2.0)))
+        leading = self.search.leading(numerics.policy.curves_tried)
+        chosen = sorted(leading, key=lambda item: item.rank * price - item.fall)[k : k + 1]
+        found: list[_Answer] = []
+        for item in chosen:
+            for one in self.search.finenesses(item) if self.instead else (item,):
+                answer = self._estimated(one, merit, numerics)
+                if found and not _is_better(answer, found[0]):
+                    break
+                found = [answer]
+        return found
+
+    def _estimated(self, item: Tried, merit: Merit, numerics: Numerics) -> _Answer:
+        scales = scales_of(
+            self.state.fit, self.state.assembly.drive, tuple(self.state.assembly.native.dofs)
+        )
+        result = refit(self.base, item.score(self.base, self.state.assembly, scales), numerics)
+        worth = merit(result, instead=self.instead, inflation=result.inflation)
+        return _Answer(self.state, self.search, result, self.outcome.ranking, self.instead, worth)
+
+
+def _is_better(fine: _Answer, coarse: _Answer) -> bool:
+    """Whether finer pieces explain significantly more, and come near to what was found so far."""
+    least = min(fine.refit.inflation, coarse.refit.inflation)
+    gained = (fine.refit.fall - coarse.refit.fall) / least
+    more = fine.refit.size - coarse.refit.size
+    p_value = float(stats.chi2.sf(gained, more))
+    return _goes_on(coarse.merit, fine.merit, p_value, fine.refit.policy)
+
+
+def _goes_on(coarse: float, fine: float, p_value: float, policy: SearchPolicy) -> bool:
+    """Whether to go on to finer pieces, by merits and the probability of the fall by noise."""
+    if not np.isfinite(coarse):
+        return True
+    if fine <= 0.0:
+        return fine - coarse > policy.finer_gain * max(-coarse, 0.0)
+    return p_value < policy.finer
+
+
+def _merit(
+    own: Refit,
+    *,
+    instead: bool,
+    inflation: float,
+    present: ModelFit,
+    reference: Base,
+    favour: float,
+) -> float:
+    """What a function is worth beyond what was found so far; one that stands instead of names needs
+    none of them, and is favoured by so much."""
+    gained = fall_from(reference, own.fit) - fall_from(reference, present)
+    values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
+    more = len(own.fit.problem.names) - len(present.problem.names)
+    # What noise of one colour leaves scatters together: of so many values as many less are news.
+    merit = gained / inflation - more * float(np.log(values))
+    return merit + favour if instead else merit
+
+
+def _accepting(
+    outcome: Round, answer: _Answer, roles: Roles, numerics: Numerics, callback: ProgressCallback
+) -> tuple[Round, str]:
+    """The round with the answer accepted, if it is confirmed, and why."""
+    result = answer.refit
+    near = closest(result.contribution, [item.score for item in answer.ranking])
+    gain = min(max(result.share, 0.0), 1.0) if np.isfinite(result.share) else 0.0
+    told_apart = {" @ ".join(it.score.option.key) for it in answer.ranking if _told(result, it)}
+    same = tuple(
+        name.split(" @ ")[0]
+        for name, cosine in near
+        if cosine > 0 and cosine**2 > numerics.policy.same_cosine and name not in told_apart
+    )
+    item = Ranked(result.score, answer.search.p_value, gain, True, same, result, near)
+    after, reason = confirmed(answer.state, item, result, roles, numerics, callback)
+    if after is None:
+        return outcome, reason
+    if outcome.before.at_floor and not after.at_floor:
+        return outcome, f"{item.effect} leaves more than the effects that have names"
+    if answer.instead and speak_against(outcome.before, after, result.inflation):
+        return outcome, f"{item.effect} predicts runs that were not used worse than the names do"
+    if answer.instead:
+        before = [step.effect.id for step in outcome.before.assembly.steps]
+        reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
+    ranking = (item, *outcome.ranking)
+    return replace(outcome, ranking=ranking, accepted=item, after=after, reason=reason), reason
+
+
+def _told(own: Refit, other: Ranked) -> bool:
+    """Whether the data tell a function from a name that does nearly the same: by the name's
+    estimate where there is one."""
+    if other.refit is not None:
+        return not own.resembles(other.refit)
+    return own.outdoes(other.score)
+
+
+def nonparametric_notes(rounds: Sequence[Round]) -> list[str]:
+    """What is to be said of effects that were added without a name."""
+    found = []
+    for entry in rounds:
+        item = entry.accepted
+        if item is None or item.score.option.candidate.family != FAMILY:
+            continue
+        near = ", ".join(f"{effect} (cosine {cosine:.2f})" for effect, cosine in item.closest)
+        text = f"{item.effect} @ {item.target} is no named effect"
+        found.append(text + (f"; the named ones most like it: {near}" if near else ""))
+    return found

@@ -1,0 +1,412 @@
+"""Refit of a model with an added effect, and the weight of evidence for it.
+
+Variance of an estimate from the scatter between a few stretches of the data.
+
+References
+----------
+Bell and McCaffrey (2002), Bias reduction in standard errors for linear regression with multi-stage
+samples, Survey Methodology 28(2), 169-181; Pustejovsky and Tipton (2018), J. Business and Economic
+Statistics 36(4), 672-683.
+
+Estimate an extended model, starting where its score says, and weigh what it gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesoleo._types import Array
+from bayesoleo.discovery._assembly import Assembly
+from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._score_basis import Base, replicate, squared_distance
+from bayesoleo.discovery._score_tests import Score, inflation_of
+from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.model._model import Model
+from bayesoleo.model._parameters import Parameter
+from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._predictor import Layout, RunPrediction
+
+
+def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[float, float]:
+    """Variance of one estimate and its degrees of freedom.
+
+    The estimate moves by ``a @ e`` with the noise ``e``; stretch ``g`` of the data pulls it by
+    ``a_g @ r_g``, where the residual ``r = (I - H) e`` is smaller than the noise because the
+    estimate has followed it. Each squared pull is divided by the part of it that white noise would
+    have left, which makes the sum unbiased there; and the sum is known as well as a chi-square
+    variate of the same mean and variance (Satterthwaite 1946).
+
+    Parameters
+    ----------
+    pulls : ndarray, shape (G,)
+        ``a_g @ r_g`` by stretch.
+    sizes : ndarray, shape (G,)
+        ``a_g @ a_g``.
+    overlap : ndarray, shape (G, G)
+        ``a_g @ H_gh @ a_h``.
+    """
+    left = np.diag(sizes) - overlap
+    own = np.diag(left)
+    used = own > 1e-9 * sizes
+    if used.sum() < 2:
+        return float(np.sum(pulls**2)), 0.0
+    # A stretch that is fitted exactly says nothing; the others speak for it.
+    factor = np.where(used, sizes / np.where(used, own, 1.0), 0.0)
+    factor *= sizes.sum() / sizes[used].sum()
+    expected = float(factor @ own)
+    scatter = float(factor @ left**2 @ factor)
+    return float(factor @ pulls**2), expected**2 / scatter
+
+
+@dataclass(frozen=True)
+class Refit:
+    """An extended model after estimation.
+
+    Parameters
+    ----------
+    score : Score
+        Of the candidate.
+    assembly : Assembly
+        With the effect and its priors in it, at the estimate.
+    fit : ModelFit
+        On the fitted runs.
+    share : float
+        Part of the present excess that it explains after estimation.
+    contribution : ndarray, shape (n,)
+        What it changes in the prediction, thinned, in noise units.
+    remaining : float
+        Sum of squares that it leaves beyond the noise's, and what of that noise alone could feign.
+    inflation : float
+        Variance of the new amplitudes over what white noise gives, where noise is coloured.
+    freedom : int
+        Degrees of freedom that it was measured with; zero where it is the score's.
+    fall : float
+        Of the weighted sum of squares.
+    reached : bool
+        Whether noise alone could leave what it leaves.
+    price : float
+        By which an unknown has to lower the sum to be worth it: the logarithm of the number of
+        samples (Schwarz 1978).
+    policy : SearchPolicy
+    """
+
+    score: Score
+    assembly: Assembly
+    fit: ModelFit
+    share: float
+    contribution: Array
+    remaining: float
+    inflation: float
+    freedom: int
+    fall: float
+    reached: bool
+    price: float
+    policy: SearchPolicy = SearchPolicy()
+
+    def resembles(self, other: Refit) -> bool:
+        """Whether the data cannot tell two estimated effects apart.
+
+        The noise says how sure a difference is: effects may do different things and be as likely,
+        if they are small (Burnham and Anderson 2002, section 2.6), and nearly the same and not, if
+        they are large. Where one of them leaves more than noise a likelihood promises too much, and
+        effects that do nearly the same are not told apart either.
+        """
+        if not (np.isfinite(self.share) and np.isfinite(other.share)):
+            return False
+        gap = self.worth - other.worth
+        policy = self.policy
+        scale = policy.equal_likelihood * max(self.inflation, other.inflation)
+        if -policy.not_taken_odds * scale < gap < scale:
+            return True
+        lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
+        if (self.reached and other.reached) or lengths == 0:
+            return False
+        cosine = float(self.contribution @ other.contribution) / float(lengths)
+        low, high = sorted((self.remaining, other.remaining))
+        alike = cosine > 0 and cosine**2 > policy.same_cosine
+        return alike and high < policy.equal_remainder * low
+
+    @property
+    def unusual(self) -> bool:
+        """Whether an amplitude lies on the side of its null where causes hardly are."""
+        usual = self.score.option.candidate.usual
+        return any(
+            usual.get(name.split("[")[0], 0) * value < 0
+            for name, value in zip(self.fit.problem.names, self.fit.point.theta, strict=True)
+        )
+
+    def outdoes(self, other: Score) -> bool:
+        """Whether noise alone is left, and an effect that was only scored explains less of it."""
+        mine, its = (one.fall - self.price * one.size for one in (self.score, other))
+        scale = self.policy.equal_likelihood * max(self.inflation, other.inflation)
+        return self.reached and mine - its > scale
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns that the effect adds."""
+        return self.score.size
+
+    @property
+    def worth(self) -> float:
+        """Fall of the sum beyond the price of the unknowns."""
+        return self.fall - self.price * self.size
+
+    def excludes_null(self) -> bool:
+        """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
+
+        One amplitude: the probability of its own side of zero is at least the policy's
+        ``excluded_null``; several: zero lies outside their joint region. Where the likelihood
+        falls by twice the price of all unknowns without the effect, the null is excluded whatever
+        the curvature at the estimate says: far from the null, where amplitude and shape make up for
+        each other, a distance in standard deviations shrinks again (Hauck and Donner 1977, JASA 72,
+        851-853).
+        """
+        level, price = self.policy.excluded_null, self.policy.excluded_price * self.price
+        if self.fall / self.inflation > price * self.size:
+            return True
+        names = [name for name in self.fit.problem.names if name in self.score.names]
+        index = [self.fit.problem.names.index(name) for name in names]
+        value = self.fit.point.theta[index]
+        # Coloured noise, measured by its scatter between periods, widens the white covariance.
+        white = self.fit.point.covariance[np.ix_(index, index)]
+        covariance = white * self.inflation
+        if not np.isfinite(covariance).all():
+            return False
+        free = self.freedom or np.inf
+        if len(index) == 1:
+            return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
+        distance = squared_distance(value, covariance)
+        if self.freedom:
+            return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
+        return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
+
+
+def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
+    """Estimate the model extended by a candidate.
+
+    Parameters
+    ----------
+    base : Base
+        What the candidate was scored against.
+    score : Score
+        Gives starts and the scale of priors.
+    numerics : Numerics
+        The mesh is the present fit's.
+    """
+    assembly = score.option.assembly.with_values(base.fit.shared)
+    assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
+    model = assembly.model()
+    expected = dict(zip(score.names, map(float, score.expected), strict=True))
+    fit = quick_fit(base, model, base.fit.values | expected, numerics)
+    share, changes = compare(base, fit)
+    contribution = np.concatenate(
+        [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]
+    )
+    if not np.isfinite(share):
+        share = -np.inf  # what cannot be solved at its estimate explains nothing
+    remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
+    grown = assembly.with_values(fit.shared)
+    measured = inflation_along(base, fit, score.names, changes)
+    inflation, freedom = (score.inflation, score.freedom) if measured is None else measured
+    fall = share * base.fall_back
+    reached = base.excess - fall < base.feigned
+    price = schwarz_price(base)
+    return Refit(
+        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price,
+        base.policy,
+    )  # fmt: skip
+
+
+def schwarz_price(base: Base) -> float:
+    """By how much an unknown has to lower the sum of squares: the logarithm of the samples."""
+    return float(np.log(sum(run.residual.size for run in base.runs)))
+
+
+def inflation_along(
+    base: Base, fit: ModelFit, names: Sequence[str], changes: Sequence[Array]
+) -> tuple[float, int] | None:
+    """Variance of an effect's unknowns over white noise's, and its degrees of freedom; None where
+    nothing finite is known of it.
+
+    Parameters
+    ----------
+    base : Base
+        What the effect is held against.
+    fit : ModelFit
+        With the effect in.
+    names : sequence of str
+        Its unknowns.
+    changes : sequence of ndarray, shape (m,)
+        What it changes in each run, in noise units.
+
+    Notes
+    -----
+    Periodic runs: as for a score, along what the estimate changes. An effect that a step from the
+    null describes badly, like a lag where friction switches, leaves a remainder there that is no
+    noise; its estimate does not. What a model leaves of a transient is seldom white, and at the
+    null, where effects are scored, it is mostly the effect itself; so it is measured on what the
+    estimate leaves. An unknown moves by the sum of its influence times the residual (Huber 1967):
+    its variance is that of the stretches' sums.
+    """
+    if all(record.periodic for record in fit.records):
+        if not all(np.isfinite(change).all() for change in changes):
+            return None
+        return inflation_of(base, changes)
+    free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
+    own = [k for k, name in enumerate(fit.problem.names) if name in names]
+    parts = [
+        _stretches(run, predicted, replicate(record, fit.policy), fit, free, own)
+        for run, predicted, record in zip(
+            fit.predictor.runs, fit.predictions, fit.records, strict=True
+        )
+    ]
+    pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
+    if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
+        return None
+    worst, freedom = 1.0, 0
+    for k, row in enumerate(own):
+        overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
+        variance, degrees = clustered_variance(pulls[k], sizes[k], overlap)
+        ratio = variance / fit.point.covariance[row, row]
+        if degrees > 0 and ratio > worst:
+            worst, freedom = ratio, max(1, int(degrees))
+    return worst, freedom
+
+
+def _stretches(
+    run: RunPredictor,
+    predicted: RunPrediction,
+    stretch: NDArray[np.int64],
+    fit: ModelFit,
+    free: NDArray[np.int64],
+    own: list[int],
+) -> tuple[Array, Array, Array]:
+    """By new unknown and stretch: pull ``a @ r``, ``a @ a`` and ``a @ J``, in noise units."""
+    unit = np.sqrt(fit.point.variance)[:, None]
+    columns = predicted.sensitivity[:, free] / unit[:, None] * weights(run.record)
+    influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
+    residual = (run.measured - predicted.y) / unit
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1])
+
+    def summed(values: Array) -> Array:
+        return np.add.reduceat(values, edges, axis=-1)
+
+    pulls = summed(np.einsum("kyn,yn->kn", influence, residual))
+    sizes = summed(np.einsum("kyn,kyn->kn", influence, influence))
+    mixed = summed(np.einsum("kyn,yln->kln", influence, columns))
+    return pulls, sizes, np.moveaxis(mixed, 1, 2)
+
+
+def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> dict[str, Parameter]:
+    """Parameters of the effect with starts and priors from its score."""
+    present = assembly.model().parameters
+    changed: dict[str, Parameter] = {}
+    for name in score.option.candidate.parameters:
+        own = [
+            abs(v)
+            for key, v in zip(score.names, score.expected, strict=True)
+            if key.split("[")[0] == name
+        ]
+        if score.option.candidate.family == FAMILY:
+            own = [abs(v) for v in score.expected]  # a curve's coefficients are of one size
+        size = max(max(own), 1e-30)
+        width = policy.prior_width * size
+        sign = score.option.candidate.sign.get(name, 0)
+        value = float(score.expected[score.names.index(name)]) if name in score.names else 0.0
+        prior: Normal | TruncatedNormal = Normal(0.0, width)
+        if sign:
+            low, high = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
+            prior = TruncatedNormal(0.0, width, low, high)
+            value = value if value * sign > 0 else sign * 1e-3 * size
+        changed[name] = replace(present[name], value=value, prior=prior)
+    for name, value in score.shapes.items():
+        prior_of_shape = LogNormal(value, policy.shape_spread)
+        changed[name] = replace(present[name], value=value, prior=prior_of_shape)
+    return changed
+
+
+def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Numerics) -> ModelFit:
+    """Estimate a model to compare it with the present one, on the same runs and mesh.
+
+    Parameters
+    ----------
+    base : Base
+        Of the present model.
+    model : Model
+        Driven; its nominal values are where shared unknowns start.
+    known : mapping of str to float
+        Starts of unknowns of single runs, as far as they are known.
+    numerics : Numerics
+    """
+    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
+    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
+    return fit_model(
+        model,
+        base.fit.records,
+        quick,
+        start=_start(base, known, model),
+        tolerance=1e-4,
+        max_iterations=15,
+        share=base.fit.predictor,
+        check_mesh=False,
+    )
+
+
+def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
+    """Nominal values, and of unknowns of single runs those that are known."""
+    layout = Layout.of(model, [record.label for record in base.fit.records])
+    start = layout.start(model)
+    for k, name in enumerate(layout.names):
+        if "[" in name and name in known:
+            start[k] = known[name]
+    priors = layout.priors(model)
+    for k, prior in enumerate(priors):
+        low, high = prior.support
+        if not low < start[k] < high:
+            start[k] = model.parameters[layout.parameters[k]].value
+    return start
+
+
+def compare(base: Base, fit: ModelFit) -> tuple[float, list[Array]]:
+    """Part of the excess that a refitted model takes away, and how it changes the prediction of
+    each run, in noise units.
+
+    What was measured beside the data counts with them: a model must not seem better for having
+    moved a constant off what is known of it.
+    """
+    before, after = _beside_data(base.fit), _beside_data(fit)
+    changes = []
+    for r, run in enumerate(base.runs):
+        residual = (fit.predictor.runs[r].measured - fit.predictions[r].y).ravel() * run.scale
+        before += float(run.residual @ run.residual)
+        after += float(residual @ residual)
+        changes.append(run.residual - residual)
+    return (before - after) / base.fall_back, changes
+
+
+def fall_from(reference: Base, fit: ModelFit) -> float:
+    """Fall of the weighted sum of squares from a common model; minus infinity where it could not be
+    solved."""
+    share, _ = compare(reference, fit)
+    return share * reference.fall_back if np.isfinite(share) else -np.inf
+
+
+def _beside_data(fit: ModelFit) -> float:
+    """Sum of squares of what is measured beside the data: nuisance parameters and constants known
+    to a tolerance."""
+    return float(
+        sum(
+            ((value - prior.mean) / prior.sd) ** 2
+            for name, value, prior in zip(
+                fit.problem.names, fit.point.theta, fit.problem.priors, strict=True
+            )
+            if name in fit.problem.nuisances
+        )
+    )

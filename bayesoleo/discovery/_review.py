@@ -1,0 +1,371 @@
+"""Final effects looked at again, each beside all the others: what else could stand in its place,
+and whether something else does better there.
+
+While another effect is missing, its error blurs what two candidates would change: they look alike,
+or the nearer one seems better. With everything else in the model, noise alone says how sure their
+difference is. An effect that does better beside the others than the one that was added replaces it
+(sequential replacement; Miller 2002, Subset Selection in Regression, section 3.9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
+from bayesoleo.discovery._assembly import AddedEffect, Roles
+from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._hold_out_confirmation import confirmed, speak_against
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import (
+    ABSORBING_FAMILIES,
+    Ranked,
+    name_among,
+    rank,
+    score_candidates,
+)
+from bayesoleo.discovery._refit import Refit, refit
+from bayesoleo.discovery._round import Progress, Round
+from bayesoleo.discovery._score_basis import Base
+from bayesoleo.discovery._score_tests import Score
+from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._nonparametric import FAMILY
+
+
+@dataclass(frozen=True)
+class Place:
+    """A final effect's place in the model, and what could stand there.
+
+    Parameters
+    ----------
+    number : int
+        Of the round that added the effect, from zero.
+    without : State
+        The final model without the effect, on the fitted runs.
+    own : Ranked
+        The effect, estimated there, with its class.
+    rivals : tuple of Ranked
+        Others that were estimated, the best first.
+    """
+
+    number: int
+    without: State
+    own: Ranked
+    rivals: tuple[Ranked, ...]
+
+    @property
+    def better(self) -> tuple[Ranked, ...]:
+        """Rivals that make the data more than twenty times as likely, the best first.
+
+        Instead of what merely varies from run to run a cause stands that is as likely. Where a
+        rival leaves more than noise it must also explain as much of what the effect leaves as
+        another effect would have to: two shapes of one cause differ by less.
+        """
+        own = self.own.refit
+        assert own is not None
+        policy = own.policy
+        found = []
+        for rival in self.rivals:
+            result = rival.refit
+            assert result is not None
+            gap, scale = result.worth - own.worth, max(result.inflation, own.inflation)
+            needed = policy.equal_likelihood * scale * _dispersion(result, self.without)
+            if rival.absorbs < self.own.absorbs:
+                needed = -needed
+            clearly = result.reached or gap > policy.fair_share * own.remaining
+            if rival.absorbs <= self.own.absorbs and gap > needed and clearly:
+                found.append(rival)
+        return tuple(found[: policy.review_confirmed])
+
+
+def _dispersion(result: Refit, without: State) -> float:
+    """Of what an estimate leaves."""
+    base = without.base()
+    return dispersion(replace(base, excess=base.excess - result.fall))
+
+
+def reviewed(
+    progress: Progress,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect] | None,
+    callback: ProgressCallback,
+    *,
+    replacing: bool = True,
+) -> Progress:
+    """A finished search whose final effects have the classes that they have beside each other.
+
+    Parameters
+    ----------
+    progress : Progress
+        Finished.
+    roles : Roles
+    numerics : Numerics
+    effects : sequence of Effect or None
+        Instead of the catalogue.
+    callback : callable
+        Told what is being done.
+    replacing : bool
+        Whether an effect may be replaced by one that does better.
+
+    Returns
+    -------
+    Progress
+        Finished, with new classes; or not finished any more, if an effect was replaced: with
+        another one there the search goes on.
+    """
+    curve = any(step.effect.family == FAMILY for step in progress.state.assembly.steps)
+    for step in progress.state.assembly.steps:
+        number = _added_by(progress, step)
+        if number is None or step.effect.family == FAMILY:
+            continue
+        accepted = progress.rounds[number].accepted
+        if curve and (accepted is None or not accepted.same):
+            continue  # beside a curve nothing is replaced, and only known rivals are asked again
+        callback(f"look again at what was like {step.effect.id}")
+        place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
+        if place is None:
+            continue
+        for better in place.better if replacing and not curve else ():
+            found = _replaced(progress, step, place, better, roles, numerics, callback)
+            if found is not None:
+                return found
+        progress = _with_class(progress, place)
+    return progress if curve or not replacing else _smaller(progress, roles, numerics, callback)
+
+
+def _smaller(
+    progress: Progress, roles: Roles, numerics: Numerics, callback: ProgressCallback
+) -> Progress:
+    """The search with one effect less, if another in one place makes a second superfluous.
+
+    An effect that is only near needs a companion for what it lacks; beside each other both seem to
+    be needed, and the true one in its place does without.
+    """
+    steps = progress.state.assembly.steps
+    if len(steps) < 2:
+        return progress
+    fitted = replace(roles, held_out=(), strategy="none")
+    for step in steps:
+        for result, gap in _close_rivals(progress, step):
+            state = fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
+            base = state.base()
+            callback(f"look whether {result.score.option.key[0]} does without one of the others")
+            losses = [
+                loss_without(state, base, other, numerics) for other in state.assembly.steps[:-1]
+            ]
+            least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
+            if not least.worth + gap / least.scale < 0.0:
+                continue
+            found = _without_companion(progress, step, result, least, roles, numerics, callback)
+            if found is not None:
+                return found
+    return progress
+
+
+def _close_rivals(progress: Progress, step: AddedEffect) -> list[tuple[Refit, float]]:
+    """Estimates of what could stand in an effect's place, and by how much less they are worth: less
+    than the unknowns of another effect would be."""
+    entry = _entry_of(progress, step)
+    own = entry.accepted.refit if entry is not None and entry.accepted is not None else None
+    if entry is None or own is None or _added_by(progress, step) is not None:
+        return []  # estimated beside others than there are now
+    rivals = [
+        (item.refit, own.worth - item.refit.worth)
+        for item in entry.ranking
+        if item.refit is not None
+        and item.refit is not own
+        and not item.absorbs
+        and np.isfinite(item.refit.share)
+        and item.score.option.candidate.family != FAMILY
+    ]
+    near = [one for one in rivals if one[1] < 2.0 * own.price * own.inflation]
+    return sorted(near, key=lambda one: one[1])[: own.policy.review_simpler]
+
+
+def _entry_of(progress: Progress, step: AddedEffect) -> Round | None:
+    """The round that added a final effect."""
+    key = step.effect.id, step.target
+    for item in reversed(progress.rounds):
+        if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
+            return item
+    return None
+
+
+def _without_companion(
+    progress: Progress,
+    step: AddedEffect,
+    result: Refit,
+    least: Loss,
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
+) -> Progress | None:
+    """The search with a rival in a place and without another effect, if runs that were not used
+    have nothing against it."""
+    final, name = progress.state, result.score.option.key[0]
+    after = fit_state(result.assembly.without(least.step), roles, numerics)
+    if (final.at_floor and not after.at_floor) or speak_against(final, after, result.inflation):
+        return None
+    entry = _entry_of(progress, step)
+    assert entry is not None
+    item = next(one for one in entry.ranking if one.refit is result)
+    told = (
+        f"{name} stands instead of {step.effect.id}, and then {least.step.effect.id} is not needed"
+    )
+    last = replace(entry, accepted=item, after=after, reason=f"{told}: {least}")
+    callback(told)
+    notes = (*progress.notes, f"{told}: {least}")
+    return Progress(progress.first, after, (*progress.rounds[:-1], last), notes)
+
+
+def _added_by(progress: Progress, step: AddedEffect) -> int | None:
+    """Number of the round that added a final effect, if it was beside others than there are now."""
+    key = step.effect.id, step.target
+    for number, item in reversed(list(enumerate(progress.rounds))):
+        if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
+            beside = set(item.before.assembly.added)
+            now = set(progress.state.assembly.added) - {key}
+            return None if beside == now else number
+    return None
+
+
+def place_of(
+    progress: Progress,
+    step: AddedEffect,
+    number: int,
+    roles: Roles,
+    numerics: Numerics,
+    effects: Sequence[Effect] | None,
+    *,
+    only_known: bool = False,
+) -> Place | None:
+    """What could stand in a final effect's place; None where that cannot be said.
+
+    With ``only_known`` only what was in its class before is estimated.
+    """
+    final, accepted = progress.state, progress.rounds[number].accepted
+    assert accepted is not None
+    less = final.assembly.without(step)
+    if len(less.steps) != len(final.assembly.steps) - 1:
+        return None  # others act on what it brought
+    fitted = replace(roles, held_out=(), strategy="none")
+    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
+    base = without.base()
+    key = step.effect.id, step.target
+    # The effect itself speaks for those that are it in other words.
+    scores, _ = score_candidates(
+        base, less, effects, numerics.jobs, order=lambda option, _: option.key != key
+    )
+    if not scores or scores[0].option.key != key:
+        return None
+    own, others = scores[0], scores[1:]
+    known = accepted.same
+    chosen = [own, *_worth_estimating(own, others, known, only_known, numerics.policy)]
+    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
+    refits |= _from_other_shapes(base, refits, chosen, numerics)
+    ranking = rank(scores, progress.rounds[number].tests, refits, policy=numerics.policy)
+    mine = next(item for item in ranking if item.score is own)
+    if mine.refit is None:
+        return None
+    rest = [item for item in ranking if item.refit is not None and item is not mine]
+    rest.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
+    return Place(number, without, mine, tuple(rest))
+
+
+def _from_other_shapes(
+    base: Base, refits: Mapping[int, Refit], chosen: Sequence[Score], numerics: Numerics
+) -> dict[int, Refit]:
+    """Better estimates of effects that came out a little behind the best, by other starts.
+
+    Where friction switches, the error has several minima along the shape, and the shape that scores
+    best at the null may lie beside the wrong one: then an effect would be told from one that is the
+    same but for its shape.
+    """
+    best, policy = max(result.fall for result in refits.values()), base.policy
+    better: dict[int, Refit] = {}
+    for score in chosen:
+        found, grids = refits[id(score)], score.option.candidate.shapes
+        if not score.shapes or not found.fall > policy.restart_share * best:
+            continue
+        for part in policy.shape_starts:
+            if best - found.fall < policy.restart_gap * found.inflation:
+                break
+            shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
+            again = refit(base, replace(score, shapes=shapes), numerics)
+            if np.isfinite(again.share) and again.fall > found.fall:
+                found = better[id(score)] = replace(again, score=score)
+    return better
+
+
+def _worth_estimating(
+    own: Score,
+    others: Sequence[Score],
+    same: Sequence[str],
+    only_known: bool,
+    policy: SearchPolicy,
+) -> list[Score]:
+    """Those that score near an effect, the best first, and those that were in its class before."""
+    absorbs = own.option.candidate.family in ABSORBING_FAMILIES
+    near = [
+        score
+        for score in sorted(others, key=lambda score: -score.fall)
+        if score.fall > policy.near_best * own.fall
+        and (absorbs or score.option.candidate.family not in ABSORBING_FAMILIES)
+    ]
+    most = policy.review_rivals
+    chosen = [] if only_known else near[:most]
+    before = [one for one in others if name_among(own, one) in same and one not in chosen]
+    return [*chosen, *before[:most]]
+
+
+def _replaced(
+    progress: Progress,
+    step: AddedEffect,
+    place: Place,
+    better: Ranked,
+    roles: Roles,
+    numerics: Numerics,
+    callback: ProgressCallback,
+) -> Progress | None:
+    """The search with another effect in a place, if runs that were not used have nothing against
+    it."""
+    final = progress.state
+    before = fit_state(final.assembly.without(step), roles, numerics)
+    assert better.refit is not None
+    assert place.own.refit is not None
+    after, reason = confirmed(before, better, better.refit, roles, numerics, callback)
+    if after is None or (final.at_floor and not after.at_floor):
+        return None
+    if speak_against(final, after, better.refit.inflation):
+        return None
+    gained = better.refit.worth - place.own.refit.worth
+    way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"
+    reason += (
+        f"; it stands instead of {step.effect.id}, beside the others the weighted squared error is"
+        f" {way}, unknowns counted{'' if gained > 0 else ', and it names a cause'}"
+    )
+    tests = progress.rounds[place.number].tests
+    ranking = (better, place.own, *(item for item in place.rivals if item is not better))
+    notes = [*progress.notes, f"{better.effect} replaced {step.effect.id}: {reason}"]
+    state = eliminated(after, roles, numerics, notes, callback)
+    last = Round(before, ranking, {}, better, after, reason, tests)
+    rounds = (*progress.rounds[:-1], last)
+    return Progress(progress.first, state, rounds, tuple(notes))
+
+
+def _with_class(progress: Progress, place: Place) -> Progress:
+    """With the class of a final effect as it is beside the others."""
+    item = progress.rounds[place.number]
+    assert item.accepted is not None
+    new = replace(item.accepted, same=place.own.same, beside=place.own.refit)
+    ranking = tuple(new if one is item.accepted else one for one in item.ranking)
+    changed = replace(item, ranking=ranking, accepted=new)
+    rounds = (*progress.rounds[: place.number], changed, *progress.rounds[place.number + 1 :])
+    return replace(progress, rounds=rounds)

@@ -1,0 +1,184 @@
+"""Sizes of the estimated motion, and the dominant frequency of a residual.
+
+Frequency of what hums in transients: a line in what a model leaves that no input has.
+
+A frequency that the null leaves undefined cannot be scanned by a coarse grid: its score has a peak
+as narrow as the reciprocal of the record's length. So the highest line of the residual's spectrum
+is taken, if one so high comes by chance less than once in a thousand times; where there is none,
+there is no periodic force to score, and nothing that the search would have to be corrected for.
+
+Sizes of the estimated motion, which place the scan grids of effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage, optimize, stats
+
+from bayesoleo._types import Array
+from bayesoleo.data._harmonics import FALSE_ALARM
+from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.effects._parts import Scales
+from bayesoleo.prediction._records import Record
+
+#: Lines on either side from whose median the level beside a line is taken; cycles over the record
+#: below which a line is a drift.
+_BESIDE, _FEWEST = 25, 5
+#: A window that keeps strong lines from leaking far makes lines this many bins wide.
+_WIDE = 3
+
+
+def dominant_residual_frequency(fit: ModelFit) -> float | None:
+    """Frequency at which the residuals of transients hum, Hz; None where they do not."""
+    best: tuple[float, float] = (FALSE_ALARM, 0.0)
+    for r, record in enumerate(fit.records):
+        if record.periodic:
+            continue
+        e = fit.predictor.runs[r].measured - fit.predictions[r].y
+        e = np.where(weights(record) > 0, e, 0.0)
+        inputs = [record.samples[n] for n in fit.model.inputs if n in record.samples]
+        for values in e:
+            found = line_of(values, inputs, _step(record))
+            if found is not None:
+                best = min(best, found)
+    return best[1] if best[1] > 0 else None
+
+
+def line_of(values: Array, inputs: Sequence[Array], step: float) -> tuple[float, float] | None:
+    """Probability and frequency of the highest line of a signal that no input shares.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    inputs : sequence of ndarray, shape (N,)
+    step : float
+        Sampling interval, s.
+
+    Returns
+    -------
+    (p-value, frequency in Hz), or None where the record is too short.
+    """
+    own = _over_level(values)
+    if own is None:
+        return None
+    shared = np.zeros(own.size, dtype=bool)
+    for item in inputs:
+        level = _over_level(item)
+        if level is not None:
+            strong = level > stats.f.isf(FALSE_ALARM, 2, _BESIDE)
+            shared |= ndimage.binary_dilation(strong, iterations=_WIDE)
+    own[shared] = 0.0
+    k = int(np.argmax(own))
+    if own[k] == 0:
+        return None
+    p = float(-np.expm1(own.size * np.log1p(-stats.f.sf(own[k], 2, _BESIDE))))
+    return p, _refined(values, k) / (values.size * step)
+
+
+def _over_level(values: Array) -> Array | None:
+    """Powers of a windowed signal over their level beside them."""
+    window = np.hanning(values.size)
+    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
+    if power.size < 4 * _BESIDE or not power.any():
+        return None
+    # Of exponential powers the median is ln 2 of the mean.
+    level = ndimage.median_filter(power, 2 * _BESIDE + 1, mode="reflect") / np.log(2.0)
+    ratio: Array = power / np.maximum(level, 1e-9 * power.mean())
+    ratio[:_FEWEST] = 0.0
+    return ratio
+
+
+def _refined(values: Array, k: int) -> float:
+    """Cycles over the record at which the windowed signal's power is highest, near a bin."""
+    shown = (values - values.mean()) * np.hanning(values.size)
+    turn = -2j * np.pi * np.arange(values.size) / values.size
+
+    def less(cycles: float) -> float:
+        return -float(np.abs(np.exp(turn * cycles) @ shown))
+
+    found = optimize.minimize_scalar(less, bounds=(k - 1.0, k + 1.0), method="bounded")
+    return float(found.x)
+
+
+def _step(record: Record) -> float:
+    return float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+
+
+POINTS = 512
+
+
+def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:
+    """Ranges of every coordinate over all fitted runs.
+
+    A dof that the drive replaced moves as the driving channel does; offsets and gains on it are
+    small.
+    """
+    position: dict[str, tuple[float, float]] = {}
+    velocity: dict[str, float] = {}
+
+    def add(name: str, values: np.ndarray, rates: np.ndarray) -> None:
+        low, high = position.get(name, (np.inf, -np.inf))
+        position[name] = (min(low, float(values.min())), max(high, float(values.max())))
+        velocity[name] = max(velocity.get(name, 0.0), float(np.abs(rates).max()))
+
+    for run, record in zip(fit.predictor.runs, fit.records, strict=True):
+        phase = _places(record)
+        for dof, motion in run.known_motions().items():
+            rows = motion(phase)
+            add(dof, rows[0], rows[1])
+        for channel, item in record.signals.items():
+            values, rates = (item.evaluate(phase, record.rate, k) for k in (0, 1))
+            add(channel, values, rates)
+            if channel == drive:
+                for dof in native_dofs:
+                    if dof not in run.known_motions():
+                        add(dof, values, rates)
+    outputs = {
+        name: max(
+            float(np.ptp(run.measured[k][weights(run.record) > 0])) for run in fit.predictor.runs
+        )
+        for k, name in enumerate(fit.predictor.outputs)
+    }
+    periods = [time for record in fit.records for time in _times(record)]
+    ranges = {
+        name: (
+            min(float(run.measured[k].min()) for run in fit.predictor.runs),
+            max(float(run.measured[k].max()) for run in fit.predictor.runs),
+        )
+        for k, name in enumerate(fit.predictor.outputs)
+    }
+    kinds = frozenset(record.kind for record in fit.records)
+    times = min(periods), max(periods)
+    stated = [record.conditions for record in fit.records]
+    shared = set.intersection(*map(set, stated))
+    conditions = {name: float(np.mean([run[name] for run in stated])) for name in shared}
+    return Scales(
+        position,
+        velocity,
+        outputs,
+        *times,
+        ranges,
+        kinds,
+        dominant_residual_frequency(fit),
+        conditions,
+    )
+
+
+def _places(record: Record) -> np.ndarray:
+    """Where to look at the motion: all over a period, or at the samples of a transient."""
+    return np.arange(POINTS) / POINTS if record.periodic else record.position
+
+
+def _times(record: Record) -> tuple[float, ...]:
+    """Times on which a run moves: its period; of a transient, its length and, by the channel that
+    is fastest for its size, the period that a harmonic motion as fast would have."""
+    if record.periodic:
+        return (record.span,)
+    found = [record.span]
+    for item in record.signals.values():
+        values, rates = (item.evaluate(record.position, record.rate, k) for k in (0, 1))
+        if np.std(values) > 0 and np.std(rates) > 0:
+            found.append(float(min(record.span, 2 * np.pi * np.std(values) / np.std(rates))))
+    return tuple(found)

@@ -1,0 +1,482 @@
+"""The basis of score tests: residuals and sensitivities of the present model.
+
+Project directions out of others by their products alone, and know when nothing is left.
+
+Which sensitivities are real, and which only the round-off of a solution.
+
+A constant force on a coordinate that no output contains moves the model and shows nowhere. Its
+computed sensitivity is not zero but some last digits, and a score divides by it.
+
+How outputs change with parameters that a fitted model lacks or holds fixed, at its estimate.
+
+What every candidate is scored against: residuals and sensitivities of the present model, in
+units of the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._types import Array
+from bayesoleo.data._noise import NoiseSpectrum
+from bayesoleo.discovery._error_table import RunError
+from bayesoleo.discovery._fit import ModelFit, counted, weights
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.estimation._problem import measured_of
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._run_errors import input_columns
+from bayesoleo.solvers._orbit import Status
+
+#: A squared residual norm below this part of the squared norm is no direction of its own: the
+#: sensitivities themselves are good to some seven digits beside those of the model.
+LEAST = 1e-8
+#: Sums of products over some 1e5 samples are good to this part of the size of what they sum.
+ROUND_OFF = 1e3 * float(np.finfo(float).eps)
+
+
+def coefficients(gram: Array, cross: Array) -> Array:
+    """Coefficients ``(l, k)`` of directions on others, from ``J' W J`` and ``J' W C``.
+
+    The gram matrix is brought to a unit diagonal, so that units do not matter; directions that it
+    does not determine to the last digit are held back rather than cut off.
+    """
+    if not len(gram):
+        return np.zeros_like(cross)
+    scale = np.sqrt(np.diag(gram))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    floor = 10 * len(gram) * np.finfo(float).eps * max(values.max(), 1e-300)
+    inverse = vectors / np.maximum(values, floor)
+    return cast(Array, (inverse @ (vectors.T @ (cross / scale[:, None]))) / scale[:, None])
+
+
+def remains(gram: Array, project: Array, own: Array, information: Array) -> NDArray[np.bool_]:
+    """Which directions ``(k,)`` are more than round-off beside those projected out.
+
+    What is left of a direction's squared norm is the difference of large parts where the model's
+    own directions nearly cancel each other: ``|x|' |G| |x|`` with the coefficients ``x``.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (l, l)
+        ``J' W J``.
+    project : ndarray, shape (l, k)
+        Of :func:`coefficients`.
+    own, information : ndarray, shape (k, k)
+        ``C' W C`` before, and what is left after.
+    """
+    size = np.abs(project)
+    parts = np.einsum("ik,ij,jk->k", size, np.abs(gram), size)
+    before, left = np.diag(own), np.diag(information)
+    kept: NDArray[np.bool_] = left > np.maximum(LEAST * before, ROUND_OFF * parts)
+    return kept
+
+
+def squared_distance(value: Array, covariance: Array) -> float:
+    """``value' covariance^-1 value`` of values (k,) in units that may differ by any factor.
+
+    Directions that the covariance does not have, to twelve digits of its correlations, are left
+    out.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    unit = np.where(sd > 0, sd, 1.0)
+    scaled = value / unit
+    return float(
+        scaled @ np.linalg.lstsq(covariance / np.outer(unit, unit), scaled, rcond=1e-12)[0]
+    )
+
+
+#: A sensitivity is looked at again if a parameter that moves a state by all of its size moves an
+#: output by less of its own: solutions are good to some 1e-13 of their size, and what is real is
+#: found real by the second look.
+SUSPECT = 1e-9
+#: Relative change of the constants for the second look: far above round-off, and far too small for
+#: a real sensitivity to follow by more than ``REPEATS`` of its size.
+CHANGE, REPEATS = 1e-9, 1e-3
+
+
+def resolved_sensitivities(
+    run: RunPredictor, p: Array, samples: PredictedSamples, changed: Sequence[int]
+) -> Array:
+    """Derivatives of the outputs, zero where they are round-off.
+
+    What is suspiciously small is computed once more with constants that differ in the tenth digit:
+    a derivative repeats, round-off does not.
+
+    Parameters
+    ----------
+    run : RunPredictor
+        At its anchor.
+    p : ndarray, shape (L, np)
+        Constants of the samples.
+    samples : PredictedSamples
+        With derivatives ``(L, ny, na, N)``.
+    changed : sequence of int
+        Which of the constants may be changed for the second look.
+
+    Returns
+    -------
+    ndarray, shape (L, ny, na, N)
+    """
+    y_p = samples.y_p
+    assert y_p is not None
+    if run.anchor is None:
+        return y_p  # a force law is evaluated, not solved
+    suspect = _suspects(run, y_p)
+    if not suspect.any():
+        return y_p
+    nearby = p.copy()
+    # Each by a factor of its own, lest a common one scale all equations and change no digit.
+    nearby[:, changed] *= 1 + CHANGE * np.linspace(1.0, 2.0, len(changed))
+    again = run.predict(nearby, derivatives=True)
+    if again.y_p is None or (again.status != Status.CONVERGED.value).any():
+        return y_p
+    moved = np.linalg.norm(again.y_p - y_p, axis=-1)
+    noisy = suspect & (moved > REPEATS * np.linalg.norm(y_p, axis=-1))
+    return np.where(noisy[..., None], 0.0, y_p)
+
+
+def _suspects(run: RunPredictor, y_p: Array) -> NDArray[np.bool_]:
+    """Where outputs hardly move with a parameter though states do, shape (L, ny, na)."""
+    assert run.anchor is not None
+    size = np.abs(run.anchor.x).max(axis=0)
+    moved = np.abs(run.anchor.x_p).max(axis=1)
+    # A state at rest counts as moved without limit; whether that is real shows in the second look.
+    relative = np.where(moved > 0, 1e200, 0.0)
+    np.divide(moved, size, out=relative, where=size > 1e-150)
+    reach = relative.max(axis=1)
+    output = np.abs(run.measured).max(axis=1)
+    found = np.abs(y_p).max(axis=-1)
+    return cast(NDArray[np.bool_], (found > 0) & (found <= SUSPECT * output[:, None] * reach))
+
+
+@dataclass(frozen=True)
+class Block:
+    """Sensitivities of the new unknowns at one set of shapes.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Unknowns, by-run ones expanded.
+    by_run : list of ndarray, shape (ny, k, N)
+        One a run, SI.
+    """
+
+    names: tuple[str, ...]
+    by_run: list[Array]
+
+
+def sensitivities_of(
+    fit: ModelFit, model: Model, shapes: Sequence[Mapping[str, float]]
+) -> list[Block] | Status:
+    """Derivatives with respect to a model's estimated parameters at a fitted model's estimate.
+
+    Parameters
+    ----------
+    fit : ModelFit
+        Of a model that the other one extends, or whose constants it frees.
+    model : Model
+        Estimates the parameters that are asked for, and no others.
+    shapes : sequence of mapping of str to float
+        Values of shape parameters, one set a block.
+
+    Returns
+    -------
+    list of Block, or Status
+        Why there are none.
+    """
+    predictor = Predictor(
+        model,
+        fit.records,
+        steps=fit.steps,
+        scheme=fit.numerics.scheme,
+        backend="numpy",
+        jobs=1,
+        share=fit.predictor,
+    )
+    if predictor.outputs != fit.predictor.outputs:
+        return Status.SINGULAR
+    layout = predictor.layout
+    theta = layout.start(model)
+    found: list[list[Array]] = [[] for _ in shapes]
+    for r, run in enumerate(predictor.runs):
+        p = _constants(fit, r, run, predictor.constants(theta[None], r), shapes)
+        derivatives = _of_run(fit, r, run, p)
+        if isinstance(derivatives, Status):
+            return derivatives
+        for k, y_p in enumerate(derivatives):
+            full = np.zeros((y_p.shape[0], theta.size, y_p.shape[2]))
+            full[:, layout.columns[r]] = y_p
+            found[k].append(full)
+    return [Block(layout.names, item) for item in found]
+
+
+def _constants(
+    fit: ModelFit, r: int, run: RunPredictor, start: Array, shapes: Sequence[Mapping[str, float]]
+) -> Array:
+    """Constants of an extended model: present estimates, by-run values included, and shapes."""
+    p = np.repeat(start, len(shapes), axis=0)
+    position = {name: k for k, name in enumerate(run.kernels.derived.constants)}
+    names = fit.predictor.runs[r].kernels.derived.constants
+    for name, value in zip(names, present_constants(fit, r), strict=True):
+        if name in position:
+            p[:, position[name]] = value
+    for k, values in enumerate(shapes):
+        for name, value in values.items():
+            p[k, position[name]] = value
+    return p
+
+
+def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Status:
+    """Derivatives of one run's outputs, shape (L, ny, na, N)."""
+    run.motions = fit.predictor.runs[r].known_motions()
+    run.watched = False  # at the null nothing has moved
+    if len(p) == 1:
+        samples = run.evaluate(p[0])
+    else:
+        status = run.set_anchor(p[0])
+        if status is not Status.CONVERGED:
+            return status
+        samples = run.predict(p, derivatives=True)
+    if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
+        return Status(int(samples.status.max()))
+    constants = run.kernels.derived.constants
+    own = [k for k, name in enumerate(constants) if name in fit.model.parameters]
+    return resolved_sensitivities(run, p, samples, own)
+
+
+def present_constants(fit: ModelFit, r: int) -> Array:
+    """Constants of a fitted run at the estimate, shape (np,)."""
+    return cast(Array, fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0])
+
+
+#: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
+#: would miss what repeats with it.
+MOST_SAMPLES = 1500
+#: Directions of input noise that are counted in a run, and the squared size, in noise units, below
+#: which one is not worth it.
+MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
+
+
+@dataclass(frozen=True)
+class RunBase:
+    """One run in units of its noise: all arrays are divided by the noise of a sample, outputs one
+    after the other.
+
+    The noise covariance is ``I + B' B`` in these units; ``B``, from the input's noise, is counted
+    by Woodbury's identity.
+
+    Parameters
+    ----------
+    scale : ndarray, shape (m,)
+        Inverse standard deviation of a single sample's noise.
+    residual : ndarray, shape (m,)
+    sensitivity : ndarray, shape (l, m)
+        With respect to present unknowns, each in units of its prior's standard deviation.
+    input_noise : ndarray, shape (k, m)
+        ``B``: change of the outputs by one standard deviation of each input coefficient that
+        matters.
+    inverse : ndarray, shape (k, k)
+        ``(I + B B')^-1``.
+    period : ndarray of int, shape (m,)
+        Number of the period that each sample lies in.
+    mixed, moved : ndarray, shapes (k, l) and (k,)
+        ``B J`` and ``B e``, kept because every candidate needs them.
+    chosen : ndarray of int
+        Samples kept for comparing candidates with each other.
+    spectra : tuple of NoiseSpectrum
+        Of the outputs' noise; empty where it is taken as white.
+    """
+
+    scale: Array
+    residual: Array
+    sensitivity: Array
+    input_noise: Array
+    inverse: Array
+    period: NDArray[np.int64]
+    mixed: Array
+    moved: Array
+    chosen: NDArray[np.int64]
+    spectra: tuple[NoiseSpectrum, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        scale: Array,
+        residual: Array,
+        sensitivity: Array,
+        columns: Array,
+        period: NDArray[np.int64],
+        spectra: tuple[NoiseSpectrum, ...] = (),
+    ) -> RunBase:
+        """Keep the directions of input noise that matter against the noise of the samples."""
+        columns = columns * scale
+        size = np.sum(columns**2, axis=1)
+        kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
+        inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
+        e, J = residual * scale, sensitivity * scale
+        chosen = _choice(e.size)
+        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, chosen, spectra)
+
+    def products(self, new: Array) -> tuple[Array, Array, Array]:
+        """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
+        moved = self.input_noise @ new.T
+        through = self.inverse @ moved
+        cross = self.sensitivity @ new.T - self.mixed.T @ through
+        own = new @ new.T - moved.T @ through
+        return cross, own, new @ self.residual - self.moved @ through
+
+
+def _choice(size: int) -> NDArray[np.int64]:
+    """Some of so many samples, always the same."""
+    if size <= MOST_SAMPLES:
+        return np.arange(size)
+    return np.sort(np.random.default_rng(size).permutation(size)[:MOST_SAMPLES])
+
+
+@dataclass(frozen=True)
+class Base:
+    """What every candidate is scored against.
+
+    Parameters
+    ----------
+    fit : ModelFit
+        The present model.
+    runs : list of RunBase
+        Residuals and sensitivities by run.
+    gram : ndarray, shape (l, l)
+        ``J' W J``, with the prior precision of nuisance parameters and of constants known to a
+        tolerance.
+    gradient : ndarray, shape (l,)
+        ``J' W e``.
+    noise : float
+        Expected sum of squares of the averaged residual, had only noise remained.
+    excess : float
+        Sum of squares of the averaged residual beyond that.
+    doubt : float
+        Standard deviation of the excess where nothing is missing: the residual's own scatter, and
+        that of the noise, which is measured too.
+    policy : SearchPolicy
+        By which scores and estimates are judged.
+    """
+
+    fit: ModelFit
+    runs: list[RunBase]
+    gram: Array
+    gradient: Array
+    noise: float
+    excess: float
+    doubt: float
+    policy: SearchPolicy = SearchPolicy()
+
+    @property
+    def fall_back(self) -> float:
+        """Denominator of shares: the excess, or what of it noise alone could feign."""
+        return max(self.excess, 0.0) + self.feigned
+
+    @property
+    def feigned(self) -> float:
+        """Excess that noise alone exceeds once in forty times."""
+        return self.policy.excess_errors * self.doubt
+
+
+def base_of(fit: ModelFit, errors: Mapping[tuple[str, str], RunError]) -> Base:
+    """Prepare scoring.
+
+    Parameters
+    ----------
+    fit : ModelFit
+        The present model.
+    errors : mapping of (run, output) to RunError
+        What is left in the fitted runs, and the noise.
+    """
+    gram, gradient = _prior_terms(fit)
+    runs, noise, excess, variance = [], 0.0, 0.0, 0.0
+    for r, record in enumerate(fit.records):
+        entries = [errors[record.label, output] for output in fit.predictor.outputs]
+        measured = fit.predictor.runs[r].measured
+        sigma = [_sigma(e.sigma, m) for e, m in zip(entries, measured, strict=True)]
+        borne_out = np.array([e.input_scale for e in entries])
+        run = _run_base(fit, r, sigma, borne_out, _spectra(entries))
+        cross, _, score = run.products(run.sensitivity)
+        gram, gradient = gram + cross, gradient + score
+        for entry, value in zip(entries, sigma, strict=True):
+            own = counted(record) * (entry.noise / value) ** 2
+            noise += own
+            variance += 2.0 * own**2 * (1.0 / entry.coefficients + 1.0 / max(entry.free, 1.0))
+            excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
+        runs.append(run)
+    doubt = float(np.sqrt(variance))
+    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy)
+
+
+def _prior_terms(fit: ModelFit) -> tuple[Array, Array]:
+    """What priors add to ``J' W J`` and ``J' W e``, unknowns in units of their priors' sd.
+
+    Only of what was measured beside the data: a nuisance parameter or a constant known to a
+    tolerance is no free parameter, and must not take up an effect beyond what is known of it.
+    """
+    scale = PriorScale.of(fit.problem.priors, fit.problem.names)
+    theta, measured = fit.point.theta, measured_of(fit.problem)
+    slope = scale.slope(theta) * scale.sd / scale.unit(theta)
+    # Next to nothing is known of the curvature within bounds; the width says as much.
+    precision = scale.root.T @ scale.root
+    return np.where(np.outer(measured, measured), precision, 0.0), np.where(measured, slope, 0.0)
+
+
+def _run_base(
+    fit: ModelFit,
+    r: int,
+    sigma: Sequence[float],
+    borne_out: Array,
+    spectra: tuple[NoiseSpectrum, ...],
+) -> RunBase:
+    """One run at the present estimate, given the noise of a sample by output, and how much of the
+    input's noise the residual bears out."""
+    from_input = input_columns(fit.predictor.runs[r], present_constants(fit, r))
+    run, record = fit.predictor.runs[r], fit.records[r]
+    names = fit.predictor.layout.names
+    free = [names.index(name) for name in fit.problem.names]
+    unit = np.array([prior.sd for prior in fit.problem.priors])
+    own = fit.predictions[r].sensitivity[:, free] * unit[:, None]
+    return RunBase.of(
+        np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
+        (run.measured - fit.predictions[r].y).ravel(),
+        flat(own),
+        flat(from_input * borne_out[:, None, None]),
+        np.tile(replicate(record, fit.policy), len(sigma)),
+        spectra,
+    )
+
+
+def _spectra(entries: Sequence[RunError]) -> tuple[NoiseSpectrum, ...]:
+    found = tuple(entry.spectrum for entry in entries if entry.spectrum is not None)
+    return found if len(found) == len(entries) else ()
+
+
+def replicate(record: Record, policy: SearchPolicy) -> NDArray[np.int64]:
+    """Number of the period that each sample lies in; of a transient, of the stretch."""
+    if record.periodic:
+        return np.floor(record.phase + 1e-9).astype(np.int64)
+    count = policy.stretches
+    return np.minimum((count * record.position).astype(np.int64), count - 1)
+
+
+def _sigma(noise: float, measured: Array) -> float:
+    """Noise of a sample; data without noise get a floor far below what any record resolves."""
+    return max(noise, 1e-9 * float(np.ptp(measured)), 1e-300)
+
+
+def flat(columns: Array) -> Array:
+    """Columns of shape (ny, k, N) as (k, ny N), outputs one after the other."""
+    outputs, count, samples = columns.shape
+    return np.moveaxis(columns, 1, 0).reshape(count, outputs * samples)

@@ -1,0 +1,242 @@
+"""State of the search: a fitted model with its errors on all runs.
+
+Other starts for a fit that leaves more than is expected: a wrong optimum is no missing effect.
+
+Where a resonance lies between the frequencies that were driven, the sum of squares has an optimum
+on either side of each, and an estimate ends in the one that it starts near.
+
+A model in its present state: fitted, held against the noise on fitted and held-out runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesoleo._dask import connected, each_done
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array
+from bayesoleo.discovery._assembly import Assembly, Roles
+from bayesoleo.discovery._error_table import (
+    ErrorTable,
+    Noise,
+    compared,
+    is_at_floor,
+    too_quiet,
+    with_same_noise,
+)
+from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out
+from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, promising
+from bayesoleo.discovery._hold_out_error import Prediction, predict_fitted, predict_held_out
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._score_basis import Base, base_of
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._stability import Stability
+
+
+def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
+    """Unknowns from which the estimate ends higher than it did.
+
+    Parameters
+    ----------
+    fit : ModelFit
+        That leaves more than is expected.
+    numerics : Numerics
+
+    Returns
+    -------
+    ndarray, shape (l,), or None
+        The better optimum; None where none of those that are reached from draws of the priors is.
+    """
+    best, height = None, fit.point.objective + numerics.policy.better_optimum_declared
+    for start in promising(fit.problem, fit.point.theta, numerics.policy):
+        found = fit_model(
+            fit.model,
+            fit.records,
+            replace(numerics, steps=fit.steps),
+            start=start,
+            tolerance=1e-4,
+            max_iterations=30,
+            share=fit.predictor,
+            check_mesh=False,
+        )
+        if found.point.status.ok and found.point.objective > height:
+            best, height = found.point.theta, found.point.objective
+    return best
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything known of one model.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        At the estimate.
+    fit : ModelFit
+        On the fitted runs.
+    fitted, held_out : list of Prediction
+        By run.
+    fit_errors, hold_errors : ErrorTable
+        Of these.
+    """
+
+    assembly: Assembly
+    fit: ModelFit
+    fitted: list[Prediction]
+    held_out: list[Prediction]
+    fit_errors: ErrorTable
+    hold_errors: ErrorTable
+
+    @property
+    def policy(self) -> SearchPolicy:
+        """By which it is judged."""
+        return self.fit.policy
+
+    @property
+    def errors(self) -> ErrorTable:
+        """One entry each run and output: that of the held-out prediction where there is one."""
+        held = {entry.run for entry in self.hold_errors.entries}
+        rest = tuple(entry for entry in self.fit_errors.entries if entry.run not in held)
+        return ErrorTable((*rest, *self.hold_errors.entries))
+
+    @property
+    def stability(self) -> Stability | None:
+        """Of the periodic solutions of fitted and held-out runs; None where there are none."""
+        known = self.fit.stability
+        if known is None:
+            return None
+        # Where runs are held out in turn, all of them are fitted as well.
+        runs = {p.record.label: p.predictor.runs[0] for p in self.held_out}
+        runs = {label: run for label, run in runs.items() if label not in known.runs}
+        matrices = [run.anchor.monodromy if run.anchor else None for run in runs.values()]
+        jumps = np.array([run.jumps for run in runs.values()], dtype=np.int64)
+        return known.together(Stability.of(tuple(runs), matrices, jumps))
+
+    @property
+    def by_role(self) -> dict[str, dict[str, dict[str, float]]]:
+        """Pooled errors by role, as in the summary."""
+        return {**self.fit_errors.by_role(), **self.hold_errors.by_role()}
+
+    @property
+    def worst_ratio(self) -> float:
+        """Largest pooled ratio to what is expected over roles and outputs."""
+        tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
+        return float(np.max([table.worst_ratio(key="ratio_to_expected") for table in tables]))
+
+    @property
+    def at_floor(self) -> bool:
+        """Whether fitted and held-out runs are all down to what is expected of them."""
+        return all(
+            is_at_floor(table, policy=self.policy) for table in (self.fit_errors, self.hold_errors)
+        )
+
+    @property
+    def too_quiet(self) -> tuple[str, ...]:
+        """Where less is left than chance allows: a noise that was measured too large."""
+        return (
+            *too_quiet(self.fit_errors, policy=self.policy),
+            *too_quiet(self.hold_errors, policy=self.policy),
+        )
+
+    def with_noise(self, noise: Noise) -> State:
+        """The same errors held against a noise that was found with another model."""
+        return replace(
+            self,
+            fit_errors=with_same_noise(self.fit_errors, noise),
+            hold_errors=with_same_noise(self.hold_errors, noise),
+        )
+
+    @property
+    def unsolved(self) -> tuple[str, ...]:
+        """Runs whose prediction failed, with the reason."""
+        found = [*self.fitted, *self.held_out]
+        return tuple(f"{p.record.label}: {p.status.message}" for p in found if not p.status.ok)
+
+    def base(self) -> Base:
+        """What candidates are scored against."""
+        entries = self.fit_errors.entries
+        return base_of(self.fit, {(entry.run, entry.output): entry for entry in entries})
+
+
+def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:
+    """Predict all runs at a fit and compare with what was measured."""
+    fitted = predict_fitted(fit)
+    held_out = (
+        _left_out(fit, roles)
+        if roles.strategy == "leave-one-run-out"
+        else predict_held_out(fit, roles.held_out)
+    )
+    jobs, policy = fit.numerics.jobs, fit.policy
+    found = _compared(fitted, "fit", roles, fit.numerics)
+    fit_errors, known = expected_of_fitted(fit, fitted, found)
+    if roles.strategy != "leave-one-run-out":
+        known = {"": known[""]} if known else {}
+    rows = thread_map(
+        lambda pair: expected_of_held_out(*pair, known, policy=policy),
+        list(zip(held_out, _compared(held_out, "hold-out", roles, fit.numerics), strict=True)),
+        jobs,
+    )
+    return State(
+        assembly.with_values(fit.shared),
+        fit,
+        fitted,
+        held_out,
+        ErrorTable(tuple(fit_errors)),
+        ErrorTable(tuple(entry for row in rows for entry in row)),
+    )
+
+
+def _compared(
+    predictions: Sequence[Prediction], role: str, roles: Roles, numerics: Numerics
+) -> list[Compared]:
+    """Errors by run, with the noise as it was measured first."""
+    by_label = {p.record.label: role for p in predictions}
+    return thread_map(
+        lambda p: compared(p, by_label, roles.noise_of, policy=numerics.policy),
+        predictions,
+        numerics.jobs,
+    )
+
+
+def _left_out(fit: ModelFit, roles: Roles) -> list[Prediction]:
+    """Each run predicted by a fit to all the others, from the joint estimate."""
+    numerics = replace(fit.numerics, steps=fit.steps, scheduler=None)
+    left_out = _LeftOut(fit.model, fit.records, numerics, fit.problem.names, fit.point.theta)
+    with connected(fit.numerics.scheduler) as client:
+        # Here each fit has all threads for itself.
+        found = dict(each_done(left_out, roles.held_out, client=client, jobs=1))
+    return [found[index] for index in range(len(roles.held_out))]
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """One run predicted by the others, wherever it is sent."""
+
+    model: Model
+    records: tuple[Record, ...]
+    numerics: Numerics
+    names: tuple[str, ...]
+    theta: np.ndarray
+
+    def __call__(self, record: Record) -> Prediction:
+        others = [other for other in self.records if other.label != record.label]
+        keep = [k for k, name in enumerate(self.names) if not name.endswith(f"[{record.label}]")]
+        partial = fit_model(self.model, others, self.numerics, start=self.theta[keep])
+        return predict_held_out(partial, [record])[0]
+
+
+def fit_state(
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    *,
+    start: np.ndarray | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> State:
+    """Fit an assembly and describe its state."""
+    fit = fit_model(assembly.model(), roles.fitted, numerics, start=start, progress=progress)
+    return state_of(assembly, fit, roles)

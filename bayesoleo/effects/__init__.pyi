@@ -1,0 +1,22 @@
+from ._catalogue import (
+    called as called,
+    candidates as candidates,
+    catalogue as catalogue,
+    describe as describe,
+    find_effect as find_effect,
+)
+from ._effect import (
+    FAMILIES as FAMILIES,
+    Candidate as Candidate,
+    Effect as Effect,
+)
+from ._force_effect import (
+    InternalState as InternalState,
+    force_effect as force_effect,
+)
+from ._parts import (
+    Amplitude as Amplitude,
+    Constant as Constant,
+    Scales as Scales,
+    ShapeParameter as ShapeParameter,
+)

@@ -1,0 +1,354 @@
+"""Places where effects can act, and units of expressions there.
+
+Units of expressions, so that an effect's parameters carry the right ones wherever it sits.
+
+Where force-like effects can act, and which terms of a balance already resist motion.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from bayesoleo._units import dimensions
+from bayesoleo.errors import ModelError
+from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
+from bayesoleo.model._initial_states import with_starts
+from bayesoleo.model._model import Model
+from bayesoleo.model._parameters import Coordinate
+
+#: Names that a reader expects instead of base units.
+_USUAL = ("N", "Pa", "W", "J", "V", "N*m")
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def parse_unit(text: str) -> Any:
+    """Unit of a text as pint reads it, in base units; a number where the text is empty."""
+    try:
+        return _registry().Quantity(1.0, text or "dimensionless").to_base_units().units
+    except Exception as error:
+        hint = "write it as pint reads it, e.g. N*s/m"
+        raise ModelError("unknown unit", value=text, hint=hint) from error
+
+
+def unit_text(unit: Any) -> str:
+    """Shortest usual text of a unit."""
+    for name in _USUAL:
+        if parse_unit(name) == unit:
+            return name
+    return f"{unit:~C}"
+
+
+def unit_of(expression: sp.Expr, model: Model) -> Any:
+    """Unit of an expression over a model's names, in base units.
+
+    Raises
+    ------
+    ModelError
+        If summands differ in unit, or an exponent or a function's argument has a unit.
+    """
+    if isinstance(expression, sp.Symbol):
+        return _unit_of_symbol(expression, model)
+    if expression.is_number:
+        return parse_unit("")
+    if isinstance(expression, sp.Add | sp.Max | sp.Min):
+        return _common_unit(expression, model)
+    if isinstance(expression, sp.Mul):
+        product = parse_unit("")
+        for factor in expression.args:
+            product = product * unit_of(factor, model)
+        return product
+    if isinstance(expression, sp.Pow):
+        return _unit_of_power(expression, model)
+    if isinstance(expression, sp.Abs):
+        return unit_of(expression.args[0], model)
+    if not isinstance(expression, sp.sign | sp.Heaviside):
+        _require_number(expression.args[0], model)
+    return parse_unit("")
+
+
+def _unit_of_symbol(item: sp.Symbol, model: Model) -> Any:
+    if item == TIME:
+        return parse_unit("s")
+    name, order = split_derivative(item)
+    if name in model.definitions:
+        return unit_of(model.definitions[name], model)
+    declared = {**model.inputs, **{k: v.unit for k, v in model.dofs.items()}}
+    declared |= {k: v.unit for k, v in model.parameters.items()}
+    declared |= {k: v.unit for k, v in model.conditions.items()}
+    return parse_unit(declared[name]) / parse_unit("s") ** order
+
+
+def _common_unit(expression: sp.Expr, model: Model) -> Any:
+    """Of a sum; zero fits every unit."""
+    units = [unit_of(item, model) for item in expression.args if item != 0]
+    if any(unit != units[0] for unit in units):
+        raise ModelError("summands differ in unit", value=str(expression))
+    return units[0]
+
+
+def _unit_of_power(expression: sp.Pow, model: Model) -> Any:
+    base, exponent = expression.args
+    unit = unit_of(base, model)
+    _require_number(exponent, model)
+    if unit == parse_unit(""):
+        return unit
+    if not exponent.is_number:
+        raise ModelError("the power of a unit must be a number", value=str(expression))
+    return unit ** float(exponent)
+
+
+def _require_number(expression: sp.Expr, model: Model) -> None:
+    if unit_of(expression, model) != parse_unit(""):
+        raise ModelError("argument must be a number", value=str(expression))
+
+
+def balance_unit(model: Model, dof: str) -> str:
+    """Unit of a dof's equation: that of the first of its terms whose unit is defined."""
+    for term in model.equations[dof].values():
+        try:
+            return unit_text(unit_of(term, model))
+        except ModelError:
+            continue  # a term with bare numbers in it says nothing; the next one may
+    return ""
+
+
+@dataclass(frozen=True)
+class TargetUnits:
+    """Units at a place, under the words that effects use for them."""
+
+    words: dict[str, str]
+
+    def resolve(self, text: str) -> str:
+        """Replace the words ``force``, ``position``, ``channel`` and ``parameter``."""
+
+        def unit(match: re.Match[str]) -> str:
+            word = self.words.get(match.group(), "") or "dimensionless"
+            alone = word.isidentifier() or match.group() == text
+            return word if alone else f"({word})"
+
+        composed = re.sub(r"\b(force|position|channel|parameter)\b", unit, text)
+        if parse_unit(composed) == parse_unit(""):
+            return ""
+        if "dimensionless" in composed:
+            return unit_text(parse_unit(composed))
+        return composed
+
+
+def target_units(model: Model, target: str) -> TargetUnits:
+    """Units at a target: of the balance and the position, of the channel, of the parameter."""
+    words: dict[str, str] = {}
+    name, _, coordinate = target.partition("/")
+    if name in model.dofs:
+        words |= {"force": balance_unit(model, name), "position": model.dofs[name].unit}
+    if name in model.parameters:
+        words |= {"parameter": model.parameters[name].unit}
+    if name in model.conditions:
+        words |= {"parameter": model.conditions[name].unit}
+    if name in model.inputs:
+        words |= {"channel": model.inputs[name]}
+    if name in model.outputs:
+        unit = model.outputs[name].unit
+        words |= {"channel": unit}
+        if name not in model.dofs:
+            words |= {"force": unit, "position": _unit_of_motion(model, name, coordinate)}
+    return TargetUnits(words)
+
+
+def _unit_of_motion(model: Model, output: str, coordinate: str) -> str:
+    """Unit of the input that an output follows."""
+    moving = {split_derivative(item)[0] for item in model.output(output).free_symbols}
+    names = [coordinate] if coordinate else [name for name in model.inputs if name in moving]
+    return unit_text(_unit_of_symbol(symbol(names[0]), model)) if names else ""
+
+
+def force_places(model: Model) -> dict[str, Coordinate]:
+    """Places of a force-like effect by target.
+
+    A target is the name of a second-order dof's equation, or of an output that follows an input (a
+    force law). Where an output follows several inputs the target is ``output/input``; an input that
+    is no motion to the output's force, such as a pressure to a force, is no place.
+    """
+    # An input that goes with another one is no motion of its own.
+    coordinates = [item for item in model.coordinates() if WITHIN not in item.name]
+    second = [item for item in coordinates if item.kind == "equation" and item.velocity is not None]
+    laws = [item for item in coordinates if item.kind == "output"]
+    first = [item for item in coordinates if item.kind == "equation" and item.velocity is None]
+    # Where a balance of forces exists the forces act there: an output that shows an input as well
+    # (a compliant frame) is no second place, nor is the state of a memory or a temperature.
+    chosen = second or laws or first
+    shared = Counter((item.kind, item.target) for item in chosen)
+    places = {}
+    for item in chosen:
+        alone = shared[item.kind, item.target] == 1
+        if item.kind == "equation" or _is_motion(model, item):
+            places[item.target if alone else f"{item.target}/{item.name}"] = item
+    return places
+
+
+def _is_motion(model: Model, place: Coordinate) -> bool:
+    """Whether an input is to an output what a motion is to its force: together they do work.
+
+    A pressure or a stress does work over a length, a volume or a strain. Where a unit is not
+    declared nobody knows; two channels in one unit, such as volts, may be raw readings of a pair.
+    """
+    force, motion = model.outputs[place.target].unit, model.inputs[place.name]
+    if not force or not motion:
+        return True
+    powers, moved = dimensions(force), dimensions(motion)
+    if powers == moved:
+        return True
+    if not (set(moved) <= {"[length]"} or moved == dimensions("C")):
+        return False
+    for base, power in moved.items():
+        powers[base] = powers.get(base, 0) + power
+    for base, power in dimensions("J").items():
+        powers[base] = powers.get(base, 0) - power
+    # Work; or that by length, area or volume; or by mass, where a law is of accelerations.
+    by_length, by_mass = powers.pop("[length]", 0), powers.pop("[mass]", 0)
+    return -3 <= by_length <= 0 and by_mass in (0, -1) and not any(powers.values())
+
+
+def drives(model: Model) -> tuple[str, ...]:
+    """Inputs that are channels of their own, the one that gives the clock first."""
+    return tuple(name for name in model.inputs if WITHIN not in name)
+
+
+def resisting_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` whose balance resists motion: a pressure that is measured
+    beside a force is no second force."""
+    found = force_places(model)
+    laws = {name: place for name, place in found.items() if place.kind == "output"}
+    resisting = {
+        name: place
+        for name, place in laws.items()
+        if place.velocity is not None and model.output(place.target).has(place.velocity)
+    }
+    return {k: item for k, item in found.items() if k not in laws} | (resisting or laws)
+
+
+def moving_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` that have a velocity."""
+    return {k: item for k, item in force_places(model).items() if item.velocity is not None}
+
+
+def balance_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
+    """Named terms of the balance at a place."""
+    if place.kind == "equation":
+        return dict(model.equations[place.target])
+    return dict(model.output_terms(place.target))
+
+
+def acceleration(place: Coordinate) -> sp.Expr:
+    """Symbol of the second derivative of the position."""
+    return derivative_symbol(place.name, 2)
+
+
+def damping_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
+    """Terms of a balance that grow with velocity and vanish without it.
+
+    Friction saturates and so is none: the test is whether doubling a large velocity raises the term
+    by half or more.
+    """
+    found = {}
+    for name, term in balance_terms(model, place).items():
+        whole = model.expand(term)
+        if place.velocity is not None and whole.has(place.velocity):
+            at_rest = whole.subs(place.velocity, 0)
+            if at_rest == 0 and _grows(whole, place.velocity, model):
+                found[name] = term
+    return found
+
+
+def resistance_sense(model: Model, place: Coordinate) -> int:
+    """Sense in which a balance's damping grows with velocity, +1 or -1; 0 where it has none, or
+    its terms disagree."""
+    values = {
+        float(np.sign(_at_velocity(model.expand(term), place.velocity, model, 1.0).real))
+        for term in damping_terms(model, place).values()
+    }
+    return int(values.pop()) if len(values) == 1 else 0
+
+
+def _grows(term: sp.Expr, velocity: sp.Expr, model: Model) -> bool:
+    """Whether the term at twice a velocity is at least 1.5 times itself, at a mid-range state."""
+    once, twice = (abs(_at_velocity(term, velocity, model, value)) for value in (1.0, 2.0))
+    return twice >= 1.5 * once > 0
+
+
+def _at_velocity(term: sp.Expr, velocity: sp.Expr, model: Model, value: float) -> complex:
+    numbers = model.nominal()
+    # Any state will do that is off every zero; one half is inside a volume ratio of zero to one.
+    others = {item: 0.5 for item in term.free_symbols if item not in numbers and item != velocity}
+    return complex(term.subs(numbers).subs(others).subs(velocity, value))
+
+
+def spring_force(model: Model, place: Coordinate) -> sp.Expr:
+    """Sum of the terms of a balance that follow the position and neither velocity nor an input."""
+    total = sp.Integer(0)
+    for term in balance_terms(model, place).values():
+        whole = model.expand(term)
+        inputs = {name for name in model.inputs if name != place.name}
+        free = {split_derivative(item) for item in whole.free_symbols}
+        moving = any(order > 0 or name in inputs for name, order in free)
+        if whole.has(place.position) and not moving:
+            total += term
+    return total
+
+
+#: Constants that effects look for by name, whether or not a model's own equations hold them.
+LOOKED_FOR = frozenset(
+    {"ambient_temperature", "ambient_pressure", "initial_volume", "initial_pressure", "gravity"}
+)
+
+
+def is_quantity(model: Model, *names: str) -> bool:
+    """Whether all names are declared in the model."""
+    known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
+    return known.issuperset(names)
+
+
+def measures(model: Model, name: str, unit: str) -> bool:
+    """Whether a declared quantity is in a unit of this kind, as far as units tell."""
+    declared = {**model.inputs, **{key: item.unit for key, item in model.dofs.items()}}
+    declared |= {key: item.unit for key, item in model.parameters.items()}
+    declared |= {key: item.unit for key, item in model.conditions.items()}
+    own = declared.get(name, "")
+    return not own or dimensions(own) == dimensions(unit)
+
+
+def substitute(model: Model, table: Mapping[sp.Symbol, sp.Expr]) -> Model:
+    """Replace symbols everywhere in a model: definitions, equations, outputs, admissible region."""
+
+    def swap(expression: sp.Expr) -> sp.Expr:
+        return expression.xreplace(table)
+
+    return replace(
+        model,
+        dofs=with_starts(model, swap),
+        definitions={name: swap(e) for name, e in model.definitions.items()},
+        equations={
+            name: {term: swap(e) for term, e in terms.items()}
+            for name, terms in model.equations.items()
+        },
+        outputs={
+            name: replace(
+                output, terms={term: swap(e) for term, e in model.output_terms(name).items()}
+            )
+            for name, output in model.outputs.items()
+        },
+        admissible=[swap(e) for e in model.admissible],
+    )

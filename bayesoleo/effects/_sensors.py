@@ -1,0 +1,324 @@
+"""Sensor effects (offset, gain, lag, drift, saturation), and run-to-run parameters.
+
+What changes from run to run though the model takes it as constant.
+
+Sensors: offset, gain, lag, drift and saturation of a channel.
+
+A channel shows :math:`m` where the model says :math:`y`. Of an output the expression changes;
+of an input, which *is* what was measured, the model's own quantity is got back from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import sympy as sp
+
+from bayesoleo.effects._effect import BY_RUN, Effect, Names
+from bayesoleo.effects._nonparametric import COEFFICIENT
+from bayesoleo.effects._parts import Amplitude, Constant, Scales, Scan, ShapeParameter, geometric
+from bayesoleo.effects._places import substitute
+from bayesoleo.model._drive import possible_drives
+from bayesoleo.model._expressions import (
+    TIME,
+    WITHIN,
+    derivative_symbol,
+    partial,
+    split_derivative,
+    symbol,
+    total_derivative,
+)
+from bayesoleo.model._model import Model
+
+
+def _shared(model: Model) -> Sequence[str]:
+    """Estimated parameters that all runs share, but for constants known to a tolerance: these are
+    the same in all runs. A curve's coefficients mean nothing alone."""
+    free = {n: item for n, item in model.parameters.items() if not item.fixed}
+    shared = {n: item for n, item in free.items() if not item.by_run}
+    return tuple(n for n, item in shared.items() if not item.description.startswith(COEFFICIENT))
+
+
+def _vary(model: Model, target: str, names: Names) -> Model:
+    shared = symbol(target)
+    return substitute(model, {shared: shared + names["varies_by_run"]})
+
+
+# The deviations and the shared value are determined up to a constant only; the priors of the
+# deviations, centred on zero, decide it.
+VARIES = Effect(
+    id="varies_by_run",
+    family="run-to-run",
+    title="A parameter that differs from run to run",
+    formula=r"\theta + \delta_r",
+    amplitudes=(
+        Amplitude(
+            "varies_by_run",
+            "parameter",
+            r"\delta_r",
+            "deviation from the shared value",
+            by_run=True,
+        ),
+    ),
+    places=_shared,
+    change=_vary,
+    source=BY_RUN,
+    applies_to="estimated parameters",
+    own_name_per_target=True,
+)
+
+RUN_TO_RUN_EFFECTS = (VARIES,)
+
+
+_DERIVATIVES = 4
+# Of a motion that lags by a thirtieth of its period 2 % are missing without the second order in the
+# lag, 0.2 % without the third.
+_SERIES = 3
+VOCABULARY = "JCGM 200:2012, International vocabulary of metrology"
+
+
+def _channels(model: Model) -> Sequence[str]:
+    return (*(name for name in model.inputs if WITHIN not in name), *model.outputs)
+
+
+def _correct_input(
+    model: Model, channel: str, true: Callable[[sp.Expr, sp.Expr], sp.Expr]
+) -> Model:
+    """Replace an input and its derivatives by ``true(x, dx/dt)`` and the derivatives of that."""
+    table = {}
+    for order in range(_DERIVATIVES):
+        now, next_ = (derivative_symbol(channel, order + more) for more in (0, 1))
+        shown = true(now, next_)
+        # A constant offset leaves derivatives alone.
+        table[now] = shown if order == 0 else shown - true(sp.Integer(0), sp.Integer(0))
+    return substitute(model, table)
+
+
+def _offset(model: Model, channel: str, names: Names) -> Model:
+    offset = names["sensor_offset"]
+    if channel in model.inputs:
+        return _correct_input(model, channel, lambda x, rate: x - offset)
+    return model.with_term("output", channel, "sensor_offset", offset)
+
+
+def _gain(model: Model, channel: str, names: Names) -> Model:
+    gain = names["sensor_gain"]
+    if channel in model.inputs:
+        return _correct_input(model, channel, lambda x, rate: x / (1 + gain))
+    whole = sp.Add(*model.output_terms(channel).values())
+    return model.with_term("output", channel, "sensor_gain", gain * whole)
+
+
+def _lag(model: Model, channel: str, names: Names) -> Model:
+    lag = names["sensor_lag"]
+    if channel in model.inputs:
+        # To the first order only: with more derivatives of it no other channel could drive.
+        return _correct_input(model, channel, lambda x, rate: x + lag * rate)
+    shown = model.output(channel)
+    return model.with_term("output", channel, "sensor_lag", _before(model, shown, lag) - shown)
+
+
+def _before(model: Model, expression: sp.Expr, lag: sp.Expr) -> sp.Expr:
+    """An expression as it was ``lag`` ago.
+
+    What it depends on is taken back along its series, not the expression along its own: a motion is
+    smooth where the dry friction that follows it switches within the lag.
+    """
+    moving = _moving(model)
+    earlier = {TIME: TIME - lag}
+    for item in expression.free_symbols:
+        name, order = split_derivative(item)
+        if name in moving:
+            # A dof has the derivatives that its equations determine, an input those above noise.
+            highest = model.order(name) if name in model.dofs else _DERIVATIVES
+            known = max(highest - order, 1)
+            earlier[item] = _later(name, order, -lag, known)
+            if highest == 1 and order == 0:
+                earlier[item] += lag**2 / 2 * _acceleration(model, name)
+    return expression.xreplace(earlier)
+
+
+def _acceleration(model: Model, dof: str) -> sp.Expr:
+    """Second derivative of a dof of first order, by its equation; zero where that does not say."""
+    balance = model.expand(sp.Add(*model.equations[dof].values()))
+    rate = derivative_symbol(dof, 1)
+    storage = partial(balance, rate)
+    if storage == 0 or storage.has(rate):
+        return sp.Integer(0)
+    held = sp.Dummy("rate", real=True)
+    change = total_derivative(balance.xreplace({rate: held}), _moving(model)).xreplace({held: rate})
+    return -change / storage if _exists(model, change) else sp.Integer(0)
+
+
+def _moving(model: Model) -> tuple[str, ...]:
+    return (*model.dofs, *model.inputs)
+
+
+def _later(name: str, order: int, ahead: sp.Expr, known: int) -> sp.Expr:
+    """A derivative as it will be, by a series in the ``known`` derivatives above it."""
+    terms = range(min(known, _SERIES) + 1)
+    return sp.Add(
+        *(ahead**k / math.factorial(k) * derivative_symbol(name, order + k) for k in terms)
+    )
+
+
+def _rate(model: Model, channel: str) -> sp.Expr:
+    return total_derivative(model.output(channel), _moving(model))
+
+
+def _exists(model: Model, rate: sp.Expr) -> bool:
+    """Whether dofs have the derivatives in it: an output that shows an acceleration has no rate."""
+    found = map(split_derivative, rate.free_symbols)
+    return all(name not in model.dofs or order <= model.order(name) for name, order in found)
+
+
+def _laggable(model: Model) -> Sequence[str]:
+    """Channels whose rate exists."""
+    return tuple(
+        name
+        for name in _channels(model)
+        if name in model.inputs or _exists(model, _rate(model, name))
+    )
+
+
+def _drift(model: Model, channel: str, names: Names) -> Model:
+    return model.with_term("output", channel, "sensor_drift", names["sensor_drift"] * TIME)
+
+
+def _driftable(model: Model) -> Sequence[str]:
+    """Outputs that can not be an input: a periodic state cannot follow what drifts."""
+    return tuple(name for name in model.outputs if name not in possible_drives(model))
+
+
+def _sensor(
+    id: str,  # noqa: A002
+    title: str,
+    formula: str,
+    unit: str,
+    latex: str,
+    places: Callable[[Model], Sequence[str]],
+    change: Callable[[Model, str, Names], Model],
+    term: str,
+) -> Effect:
+    return Effect(
+        id=id,
+        family="sensor",
+        title=title,
+        formula=formula,
+        amplitudes=(Amplitude(id, unit, latex, title[0].lower() + title[1:]),),
+        places=places,
+        change=change,
+        source=f"{VOCABULARY}, {term}",
+        applies_to="outputs" if id == "sensor_drift" else "every channel",
+        own_name_per_target=True,
+    )
+
+
+OFFSET = _sensor(
+    "sensor_offset",
+    "Offset of a sensor",
+    "m = y + b",
+    "channel",
+    "b",
+    _channels,
+    _offset,
+    "4.20: instrumental bias",
+)
+GAIN = _sensor(
+    "sensor_gain",
+    "Gain error of a sensor",
+    "m = (1 + g) y",
+    "",
+    "g",
+    _channels,
+    _gain,
+    "4.12: sensitivity",
+)
+LAG = _sensor(
+    "sensor_lag",
+    "Lag of a sensor, channels misaligned in time",
+    r"m(t) = y(x(t - \tau)), x(t - \tau) \approx x - \tau \dot x + \frac{1}{2} \tau^2 \ddot x",
+    "s",
+    r"\tau",
+    _laggable,
+    _lag,
+    "4.23: step response time",
+)
+DRIFT = _sensor(
+    "sensor_drift",
+    "Drift of a sensor, or of a force",
+    "m = y + d t",
+    "channel/s",
+    "d",
+    _driftable,
+    _drift,
+    "4.21: instrumental drift",
+)
+
+
+# -- saturation ------------------------------------------------------------------------------------
+
+
+def _extreme(end: int) -> Callable[[Model, str, Scales], float]:
+    return lambda model, target, scales: _range(target, scales)[end]
+
+
+def _range(channel: str, scales: Scales) -> tuple[float, float]:
+    return scales.output_range.get(channel, (-1.0, 1.0))
+
+
+def _depth_grid(model: Model, channel: str, scales: Scales) -> tuple[float, ...]:
+    """From a level just inside the highest value measured to one a quarter of the range inside."""
+    low, high = _range(channel, scales)
+    return geometric((high - low) / 256, (high - low) / 4)
+
+
+_DEPTH = Scan(_depth_grid, "1/256 to 1/4 of the range measured")
+
+
+def _saturation(side: str) -> Effect:
+    """Beyond a level only a part of what is to be measured is shown; of a clipped channel none.
+
+    The level is stated as its depth inside the extreme value measured, so that it is positive.
+    """
+    upper = side == "upper"
+    id_ = f"sensor_saturation_{side}"
+
+    def saturate(model: Model, channel: str, names: Names) -> Model:
+        whole = sp.Add(*model.output_terms(channel).values())
+        inside = names["extreme"] - names["depth"] if upper else names["extreme"] + names["depth"]
+        beyond = sp.Max(whole - inside, 0) if upper else sp.Min(whole - inside, 0)
+        return model.with_term("output", channel, id_, -names[id_] * beyond)
+
+    beyond_level = (
+        r"- s \, \max(y - m_\mathrm{max} + h, 0)"
+        if upper
+        else r"+ s \, \max(m_\mathrm{min} + h - y, 0)"
+    )
+    word = "highest" if upper else "lowest"
+    return Effect(
+        id=id_,
+        family="sensor",
+        title=f"Sensor that saturates at its {side} end",
+        formula=f"m = y {beyond_level}",
+        amplitudes=(
+            Amplitude(id_, "", "s", "part that is not shown; one where the channel is clipped", 1),
+        ),
+        places=lambda model: tuple(model.outputs),
+        change=saturate,
+        source=f"{VOCABULARY}, 4.7: measuring interval",
+        shapes=(
+            ShapeParameter(
+                "depth", "channel", "h", f"distance from the {word} value measured", _DEPTH
+            ),
+        ),
+        constants=(
+            Constant("extreme", "channel", f"{word} value measured", _extreme(1 if upper else 0)),
+        ),
+        applies_to="outputs",
+        own_name_per_target=True,
+    )
+
+
+EFFECTS = (OFFSET, GAIN, LAG, DRIFT, _saturation("upper"), _saturation("lower"))

@@ -1,0 +1,34 @@
+from ._base import (
+    ErrorModel as ErrorModel,
+    Frame as Frame,
+    ProfiledErrorModel as ProfiledErrorModel,
+    Quantity as Quantity,
+)
+from ._correlated import (
+    CorrelatedErrors as CorrelatedErrors,
+)
+from ._discrepancy import (
+    DiscrepancyErrors as DiscrepancyErrors,
+    basis as basis,
+    spectrum as spectrum,
+)
+from ._full import (
+    FullErrors as FullErrors,
+    GivenErrors as GivenErrors,
+)
+from ._independent import (
+    IndependentErrors as IndependentErrors,
+    PerRunErrors as PerRunErrors,
+    log_likelihood as log_likelihood,
+    output_counts as output_counts,
+    staged_variance as staged_variance,
+)
+from ._registry import (
+    ERROR_MODELS as ERROR_MODELS,
+    check_word as check_word,
+    error_model as error_model,
+    profiled_error_model as profiled_error_model,
+)
+from ._shared import (
+    SharedDiscrepancyErrors as SharedDiscrepancyErrors,
+)

@@ -1,0 +1,207 @@
+r"""Correlated errors: white noise and an Ornstein-Uhlenbeck process, in time O(n).
+
+.. math::
+
+    e(t) = \epsilon(t) + x(t), \qquad \operatorname{cov}(e_i, e_j) =
+    v \left[ (1 - \rho)\, \delta_{ij} + \rho \exp(-|t_i - t_j| / \tau) \right].
+
+``v`` is the total variance, :math:`\rho` the share that is correlated and :math:`\tau` the time it
+is correlated over. Without white noise (:math:`\rho = 1`) samples that are equally spaced are
+AR(1). Alone that would not do: noise of the sensor is white, what a model lacks is not, and their
+sum would look short-lived to a process that has to be both.
+
+Between two samples the process keeps :math:`\exp(-\Delta t / \tau)` of itself, whatever
+:math:`\Delta t` is: gaps and unequal sampling need no care. A Kalman filter with one state
+whitens a record in one pass.
+
+References
+----------
+Kelly, Becker, Sobolewska, Siemiginowska and Uttley (2014), "Flexible and scalable methods for
+quantifying stochastic variability", *Astrophysical Journal* 788, eqs. 9-16 (the filter). Rasmussen
+and Williams (2006), *Gaussian Processes for Machine Learning*, eq. B.26 (the process).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from bayesoleo import _schema as schema
+from bayesoleo._types import Array, Integers
+from bayesoleo.error_models._base import Frame, Quantity, RunSamples
+from bayesoleo.error_models._independent import ByOutput
+from bayesoleo.model._priors import LogNormal, Uniform
+
+SQRT_2 = math.sqrt(2.0)
+_LOG_2_PI = float(np.log(2 * np.pi))
+# Steps of sampling that a correlation time is likely to exceed.
+_LEAST_STEPS = 4
+# Sampling steps that differ by less than this part of their median are the same.
+_EQUAL = 1e-6
+jit = numba.njit(nogil=True, cache=True, error_model="numpy")
+
+
+@jit
+def _log_likelihood(residual: Array, kind: Integers, steps: Array, eta: Array, out: Array) -> None:
+    """Log-likelihood of rows ``(L, n)``; ``kind (n - 1)`` says which of ``steps`` lies between."""
+    n = residual.shape[1]
+    decay = np.empty(steps.size)
+    for lane in range(residual.shape[0]):
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        white = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
+        rate = np.exp(-eta[lane, 2])
+        for k in range(steps.size):
+            decay[k] = np.exp(-steps[k] * rate)
+        mean, power, squares, logs, product = 0.0, share, 0.0, 0.0, 1.0
+        steady, last = False, -1
+        size = gain = left = 0.0
+        for i in range(n):
+            if not steady:
+                size = power + white
+                gain = power / size
+                left = gain * white
+            innovation = residual[lane, i] - mean
+            squares += innovation * innovation / size
+            product *= size
+            if product < 1e-200 or i % 16 == 15:
+                logs += np.log(product)
+                product = 1.0
+            if i < n - 1:
+                a = decay[kind[i]]
+                mean = a * (mean + gain * innovation)
+                ahead = share + a * a * (left - share)
+                # Once the filter has settled, its gain stays until the sampling changes.
+                steady = kind[i] == last and abs(ahead - power) <= 1e-15 * power
+                last, power = kind[i], ahead
+                if steady and kind[min(i + 1, n - 2)] != last:
+                    steady = False
+        logs += np.log(product)
+        out[lane] = -0.5 * (n * (_LOG_2_PI + eta[lane, 0]) + logs + squares * np.exp(-eta[lane, 0]))
+
+
+@jit
+def _whiten(
+    columns: Array, kind: Integers, steps: Array, eta: Array, out: Array, log_sd: Array
+) -> None:
+    """Rows ``(k, n)`` as innovations of unit variance, ``log_sd (n)`` what they are divided by."""
+    share, white = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
+    rate, sd = np.exp(-eta[2]), np.exp(0.5 * eta[0])
+    for row in range(columns.shape[0]):
+        mean, power = 0.0, share
+        for i in range(columns.shape[1]):
+            size = power + white
+            gain = power / size
+            innovation = columns[row, i] - mean
+            out[row, i] = innovation / (sd * np.sqrt(size))
+            log_sd[i] = 0.5 * (eta[0] + np.log(size))
+            if i < columns.shape[1] - 1:
+                a = np.exp(-steps[kind[i]] * rate)
+                mean = a * (mean + gain * innovation)
+                power = share + a * a * (gain * white - share)
+
+
+class CorrelatedErrors(ByOutput):
+    """White noise and an Ornstein-Uhlenbeck process for each output; every run starts anew.
+
+    Flat in the logarithm of the total variance, uniform in the share that is correlated, and
+    log-normal in its time, with four sampling intervals and the longest record two standard
+    deviations either side of the middle.
+    """
+
+    word = "correlated"
+
+    def __init__(self, frame: Frame) -> None:
+        super().__init__(frame)
+        self._usual = float(np.median(np.concatenate([np.diff(r.time) for r in frame.sampled()])))
+        self._steps = [_kinds(np.diff(run.time)) for run in frame.sampled()]
+
+    def _declare(self) -> tuple[Quantity, ...]:
+        outputs, samples = self.frame.outputs, self.frame.sampled()
+        shortest = min(float(np.median(np.diff(run.time))) for run in samples)
+        longest = max(float(run.time[-1] - run.time[0]) for run in samples)
+        # Shorter than a step it would be white noise once more, of a share that no data know.
+        shortest = min(_LEAST_STEPS * shortest, 0.5 * longest)
+        reach = max(0.25 * float(np.log(longest / shortest)), 0.5)
+        time = LogNormal(float(np.sqrt(shortest * longest)), reach)
+        shares = tuple(
+            Quantity(
+                schema.correlated_share(output),
+                0.0,
+                1.0,
+                Uniform(0.0, 1.0),
+                share=True,
+                long_name=f"share of the error variance of {output} that is correlated in time",
+            )
+            for output in outputs
+        )
+        times = tuple(
+            Quantity(
+                schema.correlation_time(output),
+                0.0,
+                prior=time,
+                unit="s",
+                long_name=f"correlation time of the error of {output}",
+            )
+            for output in outputs
+        )
+        return (*self.frame.log_variances(), *shares, *times)
+
+    def log_new(self, share: Array, log_length: Array) -> Array:
+        """Of the filter that has settled, at the usual sampling interval."""
+        part, white = ndtr(share), ndtr(-share)
+        with np.errstate(over="ignore", under="ignore"):
+            left = -np.expm1(-2 * self._usual * np.exp(-log_length))  # 1 - a^2
+        # Predicted variance P: P^2 + P (1 - a^2) (white - part) = part (1 - a^2) white.
+        half, product = 0.5 * left * (white - part), part * left * white
+        root = np.sqrt(half * half + product)
+        power = np.where(half > 0, product / (root + np.abs(half)), root - half)
+        return np.asarray(np.log(power + white))
+
+    def of_output(self, run: int, residual: Array, eta: Array) -> Array:
+        out = np.empty(len(residual))
+        _log_likelihood(residual, *self._steps[run], eta, out)
+        return out
+
+    def blocks_of_output(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        white, log_sd = np.empty_like(residual), np.empty_like(residual)
+        for lane in range(len(residual)):
+            rows = slice(lane, lane + 1)
+            _whiten(residual[rows], *self._steps[run], eta[lane], white[rows], log_sd[lane])
+        logs = -0.5 * (white * white + _LOG_2_PI) - log_sd
+        return np.asarray(np.add.reduceat(logs, starts, axis=1))
+
+    def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
+        white = np.empty_like(columns)
+        _whiten(columns, *self._steps[run], eta, white, np.empty(columns.shape[1]))
+        return np.asarray(white @ white.T)
+
+    def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+        lag = np.diff(samples.time)[:, None] / length
+        decay = np.exp(-lag)
+        new = rng.standard_normal((samples.time.size, len(length)))
+        new[1:] *= np.sqrt(-np.expm1(-2 * lag))
+        for i, kept in enumerate(decay):
+            new[i + 1] += kept * new[i]
+        return new.T
+
+
+def _kinds(steps: Array) -> tuple[np.ndarray, Array]:
+    """Which of the different sampling steps each one is, and their lengths."""
+    unit = _EQUAL * float(np.median(steps))
+    _, first, kind = np.unique(np.round(steps / unit), return_index=True, return_inverse=True)
+    return kind.astype(np.int64), steps[first]
+
+
+def covariance(time: Sequence[float] | Array, v: float, share: float, tau: float) -> Array:
+    """The covariance itself, shape (n, n), for whoever wants to see it."""
+    t = np.asarray(time, dtype=float)
+    kernel = np.exp(-np.abs(t[:, None] - t) / tau)
+    return cast(Array, v * ((1 - share) * np.eye(t.size) + share * kernel))

@@ -1,0 +1,257 @@
+r"""A discrepancy that repeats itself: white noise and a Gaussian process over phase.
+
+.. math::
+
+    e(t) = \epsilon(t) + \delta(f t), \qquad
+    \operatorname{cov}(\delta(\phi), \delta(\phi')) = v \rho\, k_\ell(\phi - \phi').
+
+What a model lacks is itself an answer to the motion. In a periodic steady state that motion
+repeats, so the discrepancy :math:`\delta` is the same function of phase in every period: more
+periods tell it apart from noise, but never average it away, which a process in time would let them
+do. Each run has its own :math:`\delta`; size and length are common to an output's runs.
+
+The correlation is Matérn's of order 3/2 around the circle, with length :math:`\ell` in cycles: once
+differentiable, because friction and contacts leave kinks. It is written as a Fourier series that is
+cut off, so a record costs one projection on its harmonics and, unless it holds whole periods of
+equal steps, one small factorisation. Of a run
+that does not repeat itself the record is half a cycle, over which a periodic function can be any.
+
+References
+----------
+Kennedy and O'Hagan (2001), "Bayesian calibration of computer models", *Journal of the Royal
+Statistical Society* B 63, eq. 5. Rasmussen and Williams (2006), *Gaussian Processes for Machine
+Learning*, eqs. 4.15 (the spectrum) and A.9-A.10 (the lemma). Solin and Särkkä (2014), "Explicit
+link between periodic covariance functions and state space models", *AISTATS*, eq. 14 (series of
+a periodic covariance).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtr
+
+from bayesoleo import _schema as schema
+from bayesoleo._types import Array
+from bayesoleo.error_models._base import Frame, Quantity, RunSamples
+from bayesoleo.error_models._independent import ByOutput
+from bayesoleo.model._priors import LogNormal, Uniform
+
+#: Harmonics of the series: the shortest length that it shows is about a fiftieth of a cycle.
+HARMONICS = 24
+#: Prior of the length in cycles: within a factor of four of a tenth.
+_LENGTH = LogNormal(0.1, 0.7)
+# Products of two functions of the basis, over those with themselves, that count as none.
+_NONE = 1e-10
+SQRT_2 = math.sqrt(2.0)
+_LOG_2_PI = float(np.log(2 * np.pi))
+jit = numba.njit(nogil=True, cache=True, error_model="numpy")
+
+
+def spectrum(length: Array) -> Array:
+    """Variances of the coefficients of 1, cos, sin, cos 2 ..., summing to one at any phase.
+
+    Parameters
+    ----------
+    length : ndarray, shape (L,)
+        In cycles.
+
+    Returns
+    -------
+    ndarray, shape (L, 2 HARMONICS + 1)
+    """
+    order = np.arange(HARMONICS + 1)
+    weight = (1 + (2 * np.pi * order * np.asarray(length)[:, None]) ** 2 / 3) ** -2.0
+    weight[:, 1:] *= 2
+    total = np.zeros(len(weight))
+    for column in weight.T:  # in a fixed order, whatever the number of rows
+        total += column
+    return np.repeat(weight / total[:, None], [1] + [2] * HARMONICS, axis=1)
+
+
+def basis(phase: Array) -> Array:
+    """1, cos, sin, cos 2 ... at phases in cycles, shape (n, 2 HARMONICS + 1)."""
+    angle = 2 * np.pi * np.outer(phase % 1.0, np.arange(1, HARMONICS + 1))
+    table = np.empty((phase.size, 2 * HARMONICS + 1))
+    table[:, 0], table[:, 1::2], table[:, 2::2] = 1.0, np.cos(angle), np.sin(angle)
+    return table
+
+
+@jit
+def project(rows: Array, table: Array, out: Array, squares: Array) -> None:
+    """Products of rows ``(L, n)`` with the basis ``(n, R)``, and their sums of squares."""
+    for lane in range(rows.shape[0]):
+        squares[lane] = 0.0
+        for j in range(table.shape[1]):
+            out[lane, j] = 0.0
+        for i in range(rows.shape[1]):
+            e = rows[lane, i]
+            squares[lane] += e * e
+            for j in range(table.shape[1]):
+                out[lane, j] += e * table[i, j]
+
+
+@jit
+def factorise(gram: Array, root: Array, noise: float, factor: Array) -> float:
+    """Cholesky factor of ``noise + D G D`` with ``D = diag(root)``, in place, and ln det."""
+    size, logs = root.size, 0.0
+    for i in range(size):
+        for j in range(i + 1):
+            total = root[i] * gram[i, j] * root[j]
+            if i == j:
+                total += noise
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            factor[i, j] = np.sqrt(total) if i == j else total / factor[j, j]
+        logs += np.log(factor[i, i])
+    return 2.0 * logs
+
+
+@jit
+def _log_likelihood(
+    projected: Array, squares: Array, count: int, gram: Array, weight: Array, eta: Array, out: Array
+) -> None:
+    """Log-likelihood of rows by the matrix inversion and determinant lemmas."""
+    size = gram.shape[0]
+    factor, root, answer = np.empty((size, size)), np.empty(size), np.empty(size)
+    for lane in range(projected.shape[0]):
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        noise = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
+        for j in range(size):
+            root[j] = np.sqrt(share * weight[lane, j])
+        logs = factorise(gram, root, noise, factor)
+        explained = 0.0
+        for i in range(size):
+            total = root[i] * projected[lane, i]
+            for k in range(i):
+                total -= factor[i, k] * answer[k]
+            answer[i] = total / factor[i, i]
+            explained += answer[i] * answer[i]
+        logs += (count - size) * np.log(noise) + count * (_LOG_2_PI + eta[lane, 0])
+        misfit = (squares[lane] - explained) / noise * np.exp(-eta[lane, 0])
+        out[lane] = -0.5 * (logs + misfit)
+
+
+@jit
+def _without_products(
+    projected: Array, squares: Array, count: int, gram: Array, weight: Array, eta: Array, out: Array
+) -> None:
+    """The same where no two functions of the basis have a product."""
+    size = gram.shape[0]
+    for lane in range(projected.shape[0]):
+        share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
+        noise = 0.5 * math.erfc(eta[lane, 1] / SQRT_2)
+        logs = explained = 0.0
+        for j in range(size):
+            power = share * weight[lane, j]
+            pivot = noise + power * gram[j, j]
+            explained += power * projected[lane, j] ** 2 / pivot
+            logs += np.log(pivot)
+        logs += (count - size) * np.log(noise) + count * (_LOG_2_PI + eta[lane, 0])
+        misfit = (squares[lane] - explained) / noise * np.exp(-eta[lane, 0])
+        out[lane] = -0.5 * (logs + misfit)
+
+
+def without_products(gram: Array) -> bool:
+    """Whether functions of the basis have none with each other: whole periods of equal steps.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (..., R, R)
+    """
+    diagonal = np.einsum("...ii->...i", gram)
+    beside = np.abs(gram - diagonal[..., None] * np.eye(gram.shape[-1]))
+    return bool(beside.max() <= _NONE * diagonal.min())
+
+
+class DiscrepancyErrors(ByOutput):
+    """White noise and a Gaussian process over phase for each output; every run has its own.
+
+    Flat in the logarithm of the total variance, uniform in the share of the discrepancy, log-normal
+    in its length.
+    """
+
+    word = "discrepancy"
+
+    def __init__(self, frame: Frame) -> None:
+        super().__init__(frame)
+        self._tables = [basis(self._phase(run)) for run in frame.sampled()]
+        self._grams = [table.T @ table for table in self._tables]
+        self._kernels = [
+            _without_products if without_products(gram) else _log_likelihood for gram in self._grams
+        ]
+
+    def _declare(self) -> tuple[Quantity, ...]:
+        outputs = self.frame.outputs
+        shares = tuple(
+            Quantity(
+                schema.discrepancy_share(output),
+                0.0,
+                1.0,
+                Uniform(0.0, 1.0),
+                share=True,
+                long_name=f"share of the error variance of {output} that repeats every period",
+            )
+            for output in outputs
+        )
+        lengths = tuple(
+            Quantity(
+                schema.discrepancy_length(output),
+                0.0,
+                prior=_LENGTH,
+                unit="1",
+                long_name=f"length in cycles over which the discrepancy of {output} is alike",
+            )
+            for output in outputs
+        )
+        return (*self.frame.log_variances(), *shares, *lengths)
+
+    def log_new(self, share: Array, log_length: Array) -> Array:
+        """The white part: of a curve that repeats itself nothing is new for long."""
+        return np.asarray(log_ndtr(-share))
+
+    def _phase(self, run: RunSamples) -> Array:
+        """Where a run's samples lie in its cycle."""
+        return run.phase
+
+    def of_output(self, run: int, residual: Array, eta: Array) -> Array:
+        table, gram = self._tables[run], self._grams[run]
+        projected, squares = np.empty((len(residual), len(gram))), np.empty(len(residual))
+        project(residual, table, projected, squares)
+        out = np.empty(len(residual))
+        weight = spectrum(np.exp(eta[:, 2]))
+        self._kernels[run](projected, squares, residual.shape[1], gram, weight, eta, out)
+        return out
+
+    def blocks_of_output(
+        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
+    ) -> Array:
+        # The density of all blocks up to one, less that of all before it.
+        table, weight = self._tables[run], spectrum(np.exp(eta[:, 2]))
+        lanes, size = len(residual), table.shape[1]
+        gram, projected, squares = np.zeros((size, size)), np.zeros((lanes, size)), np.zeros(lanes)
+        total = np.zeros((lanes, len(starts) + 1))
+        more, square = np.empty_like(projected), np.empty_like(squares)
+        ends = np.append(starts[1:], residual.shape[1])
+        for k, (first, last) in enumerate(zip(starts, ends, strict=True)):
+            rows = table[first:last]
+            project(np.ascontiguousarray(residual[:, first:last]), rows, more, square)
+            gram, projected, squares = gram + rows.T @ rows, projected + more, squares + square
+            _log_likelihood(projected, squares, int(last), gram, weight, eta, total[:, k + 1])
+        return np.diff(total, axis=1)
+
+    def products_of_output(self, run: int, columns: Array, eta: Array) -> Array:
+        share, noise = ndtr(eta[1]), ndtr(-eta[1])
+        root = np.sqrt(share * spectrum(np.exp(eta[2:]))[0])
+        inner = noise * np.eye(root.size) + root[:, None] * self._grams[run] * root
+        projected = root[:, None] * (self._tables[run].T @ columns.T)
+        left = columns @ columns.T - projected.T @ np.linalg.solve(inner, projected)
+        return np.asarray(left / noise * np.exp(-eta[0]))
+
+    def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+        table = basis(samples.phase)
+        root = np.sqrt(spectrum(length))
+        return np.asarray((root * rng.standard_normal(root.shape)) @ table.T)

@@ -1,0 +1,114 @@
+"""The error models by name: one line each.
+
+What the errors of the outputs have in common: one file and one word a model.
+
+Each model has up to two forms: quantities that are sampled with the parameters
+(:class:`ErrorModel`), and a covariance that point estimators eliminate in each iteration
+(:class:`ProfiledErrorModel`). A new model is one file and one line in the table below.
+
+=============== ====================================================================================
+word            errors
+=============== ====================================================================================
+``independent`` one variance for each output (Verbeek 1993, eqs. 2.29-2.30)
+``per-run``     one variance for each output and run
+``full``        one covariance over the outputs (eqs. 2.27-2.28)
+``correlated``  white noise and an Ornstein-Uhlenbeck process in time, for each output
+``discrepancy`` white noise and a Gaussian process over phase that repeats itself, for each output
+=============== ====================================================================================
+
+``shared-discrepancy`` is the last with a part of the process that all runs share.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from bayesoleo.error_models._base import ErrorModel, Frame, Measured, ProfiledErrorModel
+from bayesoleo.error_models._correlated import CorrelatedErrors
+from bayesoleo.error_models._discrepancy import DiscrepancyErrors
+from bayesoleo.error_models._full import FullErrors, GivenErrors, ProfiledFullErrors
+from bayesoleo.error_models._independent import (
+    IndependentErrors,
+    PerRunErrors,
+    ProfiledCommonErrors,
+    ProfiledIndependentErrors,
+)
+from bayesoleo.error_models._shared import SharedDiscrepancyErrors
+from bayesoleo.errors import InputError
+from bayesoleo.model._priors import Prior
+
+
+@dataclass(frozen=True)
+class _Forms:
+    """The two forms of a model; None where it has only the other."""
+
+    sampled: type[ErrorModel] | None
+    profiled: type[ProfiledErrorModel] | None
+
+
+_REGISTRY = {
+    "independent": _Forms(IndependentErrors, ProfiledIndependentErrors),
+    "per-run": _Forms(PerRunErrors, None),
+    "full": _Forms(FullErrors, ProfiledFullErrors),
+    "correlated": _Forms(CorrelatedErrors, None),
+    "discrepancy": _Forms(DiscrepancyErrors, None),
+    "shared-discrepancy": _Forms(SharedDiscrepancyErrors, None),
+    "common": _Forms(None, ProfiledCommonErrors),
+    "given": _Forms(None, GivenErrors),
+}
+#: Those that are sampled; the first is the default.
+ERROR_MODELS: tuple[str, ...] = tuple(word for word, form in _REGISTRY.items() if form.sampled)
+
+
+def check_word(word: str) -> str:
+    """The word, if there is such an error model.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if word not in ERROR_MODELS:
+        close = difflib.get_close_matches(word, ERROR_MODELS, 1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise InputError(
+            "unknown error model",
+            key="error_model",
+            value=word,
+            hint=f"{hint}one of {', '.join(ERROR_MODELS)}",
+        )
+    return word
+
+
+def error_model(
+    word: str, problem: Measured, *, log_variance_prior: Mapping[str, Prior] | None = None
+) -> ErrorModel:
+    """The error model of that name, bound to a problem's outputs and runs.
+
+    Parameters
+    ----------
+    word : str
+        One of :data:`ERROR_MODELS`.
+    problem : Problem
+        What is fitted. All but ``independent`` and ``per-run`` need one that gives residuals by
+        sample, :class:`~bayesoleo.estimation._problem.ResidualProblem`.
+    log_variance_prior : mapping of str to Prior, optional
+        By output, the prior of the logarithm of its variance; by default flat.
+
+    Raises
+    ------
+    InputError
+        If there is no such model, or it does not suit the problem.
+    """
+    kind = _REGISTRY[check_word(word)].sampled
+    assert kind is not None
+    return kind(Frame.of(problem, log_variance_prior))
+
+
+def profiled_error_model(word: str) -> ProfiledErrorModel:
+    """The form of an error model that point estimators eliminate, for ``V`` that is unknown."""
+    kind = _REGISTRY[word].profiled
+    assert kind is not None
+    return kind()

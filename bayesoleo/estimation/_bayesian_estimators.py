@@ -1,0 +1,334 @@
+"""The estimators BE, MVE, MMVE and MBE, and the Levenberg-Marquardt step, by name.
+
+The estimators' steps: each says only how the prior enters the linear equations.
+
+In scaled unknowns (``w = 1``) every step solves ``min |J d - e|^2 + |P d - r|^2``, with whitened
+sensitivities ``J`` and residuals ``e``. An estimator is the choice of the rows ``P``, of how they
+are carried on, and of whether the prior pulls: ``r`` is its slope for BE and zero for the others.
+
+References
+----------
+Verbeek (1993), eqs. 3.19-3.23, with Hendriks's MMVE.
+
+Levenberg-Marquardt as a trust region: the weight is what keeps a step within a known length.
+
+Like MBE it adds a weight to ``A``, but the weight follows success instead of the prior, so that it
+finds its way where a prior is far too wide to scale anything.
+
+References
+----------
+Levenberg (1944); Marquardt (1963); Moré (1978), "The Levenberg-Marquardt algorithm: implementation
+and theory", for the lengths, the secular equation and the update of the radius.
+
+The estimators by name.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, cast
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from bayesoleo._types import Array
+from bayesoleo.error_models._fitting import RANK
+from bayesoleo.errors import InputError
+from bayesoleo.estimation._least_squares import WhitenedEquations
+
+
+@dataclass(frozen=True)
+class Step[State]:
+    """What an estimator adds to the least-squares equations.
+
+    The state is whatever a step carries from one iteration to the next.
+    """
+
+    #: how a user asks for it
+    name: ClassVar[str] = ""
+    #: whether the prior stays where it was declared, and so belongs to the merit function
+    fixed_prior: ClassVar[bool] = False
+    #: whether steps may shrink before the optimum is reached
+    locks: ClassVar[bool] = False
+
+    #: whether the prior's weight is the same in every iteration, so that many data sets can be
+    #: fitted together
+    steady: ClassVar[bool] = False
+    #: whether the prior enters at all
+    weighted: ClassVar[bool] = True
+
+    #: whether it keeps steps within a length of its own
+    limits_length: ClassVar[bool] = False
+    #: iterations after which it is given up
+    most: ClassVar[int] = 100
+    #: whether it takes the residual's second derivatives into account
+    second_order: ClassVar[bool] = False
+
+    @abstractmethod
+    def begin(self, root: Array) -> State:
+        """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
+
+    def prepare(self, state: State, equations: WhitenedEquations) -> State:
+        """State with what the equations of this iteration ask for."""
+        return state
+
+    @abstractmethod
+    def rows(self, state: State, jacobian: Array) -> Array:
+        """Rows ``P``, shape (l, l) or (0, l), for whitened sensitivities of shape (k, l)."""
+
+    def accept(self, state: State, jacobian: Array, ratio: float, taken: Array) -> State:
+        """State after a step with these sensitivities, and its ratio of real to expected gain."""
+        return state
+
+    def refuse(self, state: State, step: Array) -> State | None:
+        """State with which to try a shorter step, or None to halve the step instead."""
+        return None
+
+
+@dataclass(frozen=True)
+class PriorStep(Step[Array]):
+    """A step whose state is the rows that it adds: at first the prior's."""
+
+    def begin(self, root: Array) -> Array:
+        return root
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        return state
+
+
+@dataclass(frozen=True)
+class BayesianStep(PriorStep):
+    """Bayesian estimator, BE: the prior stays at its centre (Verbeek 1993, eq. 3.19)."""
+
+    name: ClassVar[str] = "be"
+    steady: ClassVar[bool] = True
+    fixed_prior: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class ModifiedBayesianStep(PriorStep):
+    """Modified Bayesian estimator, MBE: the prior is re-centred on the current estimate.
+
+    It acts as a trust region; the fixed point is the maximum-likelihood point whatever the prior's
+    width (Verbeek 1993, eq. 3.23).
+    """
+
+    name: ClassVar[str] = "mbe"
+    steady: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class MinimumVarianceStep(PriorStep):
+    """Minimum-variance estimator, MVE: the weight grows by ``A`` in every iteration.
+
+    ``V <- (A + V^-1)^-1`` from ``V = diag(w)`` shrinks like 1/i, and so do the steps: the estimator
+    locks up (Verbeek 1993, eqs. 3.20-3.22).
+    """
+
+    name: ClassVar[str] = "mve"
+    locks: ClassVar[bool] = True
+
+    def accept(self, state: Array, jacobian: Array, ratio: float, taken: Array) -> Array:
+        return np.linalg.qr(np.vstack((jacobian, state)), mode="r")
+
+
+@dataclass(frozen=True)
+class ModifiedMinimumVarianceStep(PriorStep):
+    """Modified MVE: the prior variance is added again in every iteration, so nothing locks up.
+
+    The state is ``V``, zero at the start, above ``diag(w)``; the weight is ``(V + diag(w))^-1``
+    (Verbeek 1993, eq. 3.22, after Hendriks).
+    """
+
+    name: ClassVar[str] = "mmve"
+
+    def begin(self, root: Array) -> Array:
+        inverse = solve_triangular(root, np.eye(len(root)))
+        return np.stack((np.zeros_like(root), inverse @ inverse.T))
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        # S = L L' gives S^-1 = P'P with P = L^-1
+        identity = np.eye(state.shape[1])
+        return cast(
+            Array, solve_triangular(cholesky(state[0] + state[1], lower=True), identity, lower=True)
+        )
+
+    def accept(self, state: Array, jacobian: Array, ratio: float, taken: Array) -> Array:
+        triangle = np.linalg.qr(np.vstack((jacobian, self.rows(state, jacobian))), mode="r")
+        root = solve_triangular(triangle, np.eye(state.shape[1]))
+        return np.stack((root @ root.T, state[1]))
+
+
+@dataclass(frozen=True)
+class GaussNewtonStep(PriorStep):
+    """Gauss-Newton with a pseudo-inverse: the prior does not enter at all."""
+
+    name: ClassVar[str] = "gauss-newton"
+    steady: ClassVar[bool] = True
+    weighted: ClassVar[bool] = False
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        return np.zeros((0, jacobian.shape[1]))
+
+
+@dataclass(frozen=True)
+class NewtonStep(PriorStep):
+    """Newton's method on the objective with ``v`` eliminated (Verbeek 1993, Appendix A).
+
+    All that it adds is in its equations: see
+    :func:`bayesoleo.estimation._objectives.newton_equations`.
+    """
+
+    name: ClassVar[str] = "newton"
+    fixed_prior: ClassVar[bool] = True
+    second_order: ClassVar[bool] = True
+
+    def rows(self, state: Array, jacobian: Array) -> Array:
+        return np.zeros((0, jacobian.shape[1]))
+
+
+# A step may miss the radius by this part of it, which saves iterations of the secular equation.
+_SLACK = 0.1
+_MAX_SECULAR = 20
+# A radius that fell below this moves nothing.
+_SMALLEST = 1e-100
+# Ratios of real to promised gain below which the radius shrinks, and from which it grows.
+_POOR, _GOOD = 0.25, 0.75
+# What a refused step leaves of the radius, and one that gained little.
+_SHRINK, _HALF = 0.25, 0.5
+
+
+@dataclass(frozen=True)
+class TrustRegion:
+    """State of the step.
+
+    Parameters
+    ----------
+    radius : float
+        Longest step, in units of ``length``; NaN before the first one.
+    length : ndarray, shape (l,)
+        Longest columns of the sensitivities so far.
+    weight : float
+        What multiplies the lengths in the rows that keep the present step within the radius.
+    """
+
+    radius: float
+    length: Array
+    weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardtStep(Step[TrustRegion]):
+    """Levenberg-Marquardt with Moré's trust region."""
+
+    name: ClassVar[str] = "levenberg-marquardt"
+    weighted: ClassVar[bool] = False
+    limits_length: ClassVar[bool] = True
+    most: ClassVar[int] = 1000
+
+    def begin(self, root: Array) -> TrustRegion:
+        return TrustRegion(np.nan, np.zeros(len(root)))
+
+    def prepare(self, state: TrustRegion, equations: WhitenedEquations) -> TrustRegion:
+        # The staged variance shrinks by decades on the way; lengths must not change with it.
+        jacobian = equations.noise * equations.jacobian
+        length = np.maximum(state.length, np.linalg.norm(jacobian, axis=0))
+        length = np.where(length > 0, length, 1.0)
+        radius = state.radius
+        if np.isnan(radius):  # the first step is at most as long as the start is large
+            radius = float(np.linalg.norm(length * equations.place)) or 1.0
+        free = ~equations.held
+        weight = _weight((jacobian / length)[:, free], equations.noise * equations.residual, radius)
+        return TrustRegion(radius, length, np.sqrt(weight) / equations.noise)
+
+    def rows(self, state: TrustRegion, jacobian: Array) -> Array:
+        if state.weight == 0:
+            return np.zeros((0, state.length.size))
+        return state.weight * np.diag(state.length)
+
+    def accept(
+        self, state: TrustRegion, jacobian: Array, ratio: float, taken: Array
+    ) -> TrustRegion:
+        size = float(np.linalg.norm(state.length * taken))
+        if ratio < _POOR:
+            return replace(state, radius=_HALF * size)
+        if ratio >= _GOOD or state.weight == 0:
+            return replace(state, radius=max(state.radius, 2 * size))
+        return state
+
+    def refuse(self, state: TrustRegion, step: Array) -> TrustRegion:
+        size = float(np.linalg.norm(state.length * step))
+        return replace(state, radius=_SHRINK * min(size, state.radius))
+
+
+def _weight(jacobian: Array, residual: Array, radius: float) -> float:
+    """Weight ``m`` for which ``|(J'J + m)^-1 J'e|`` is the radius; zero if none is needed."""
+    if jacobian.shape[1] == 0:
+        return 0.0
+    left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
+    turned = singular * (left.T @ residual)
+    squares = singular**2
+    kept = singular > RANK * singular[0]
+
+    def length(weight: float) -> tuple[float, float]:
+        """Length of the step and its derivative with respect to the weight."""
+        parts = turned[kept] / (squares[kept] + weight)
+        size = float(np.linalg.norm(parts))
+        slope = -float(np.sum(parts**2 / (squares[kept] + weight)))
+        return size, slope / size if size > 0 else 0.0
+
+    size, slope = length(0.0)
+    if size <= (1 + _SLACK) * radius:
+        return 0.0
+    radius = max(radius, _SMALLEST)
+    low, high = (size - radius) / -slope, float(np.linalg.norm(turned)) / radius
+    weight = max(low, 1e-3 * high)
+    for _ in range(_MAX_SECULAR):
+        size, slope = length(weight)
+        if abs(size - radius) <= _SLACK * radius:
+            break
+        low, high = (weight, high) if size > radius else (low, weight)
+        # Newton's method on 1/size, which is nearly linear in the weight
+        weight = weight - (size - radius) / radius * size / slope
+        if not low <= weight <= high:
+            weight = max(1e-3 * high, float(np.sqrt(low * high)))
+    return weight
+
+
+METHODS: dict[str, Step[Any]] = {
+    step.name: step
+    for step in (
+        BayesianStep(),
+        MinimumVarianceStep(),
+        ModifiedMinimumVarianceStep(),
+        ModifiedBayesianStep(),
+        GaussNewtonStep(),
+        LevenbergMarquardtStep(),
+        NewtonStep(),
+    )
+}
+
+# What people type.
+_SHORT = {"lm": "levenberg-marquardt", "gn": "gauss-newton"}
+
+
+def method(name: str | Step[Any]) -> Step[Any]:
+    """Estimator of this name, or the step itself.
+
+    Raises
+    ------
+    InputError
+        If there is no estimator of that name.
+    """
+    if isinstance(name, Step):
+        return name
+    name = _SHORT.get(name, name)
+    if name not in METHODS:
+        raise InputError(
+            "there is no such estimator",
+            key="method",
+            value=name,
+            hint=f"use {', '.join(METHODS)}, or scipy: and one of SciPy's optimisers",
+        )
+    return METHODS[name]

@@ -1,0 +1,261 @@
+"""A model over reduced runs, as a problem that can be fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from copy import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array
+from bayesoleo.error_models._base import RunSamples
+from bayesoleo.errors import InputError
+from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
+from bayesoleo.estimation._problem import Evaluation, Misfit
+from bayesoleo.model._priors import Prior
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._orbit import Status
+
+# Vectors that one batch of sensitivities is computed for: what they take is the raw samples of a
+# run times the unknowns.
+_LANES = 16
+
+
+class CampaignProblem:
+    """Residuals of all runs of a campaign.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Model and runs.
+    fixed : mapping, optional
+        See :meth:`holding`.
+    """
+
+    def __init__(
+        self, predictor: Predictor, free: NDArray[np.int64] | None = None, full: Array | None = None
+    ):
+        self.predictor = predictor
+        self._last: tuple[Array, Evaluation] | None = None
+        layout = predictor.layout
+        self._all_priors = layout.priors(predictor.model)
+        self._free = np.arange(len(layout.names)) if free is None else free
+        self._full = layout.start(predictor.model) if full is None else full
+        self.names = tuple(layout.names[k] for k in self._free)
+        self.priors: tuple[Prior, ...] = tuple(self._all_priors[k] for k in self._free)
+        self.outputs = predictor.outputs
+        self.runs = layout.runs
+        self.counts = np.array(
+            [[_count(record)] * len(self.outputs) for record in predictor.records]
+        )
+
+    def kept(self, run: int, values: Array) -> Array:
+        """Of samples along the last axis of one run's arrays, those that count."""
+        kept = self.predictor.records[run].kept
+        return values if kept is None else values[..., kept]
+
+    def holding(self, values: dict[str, float]) -> CampaignProblem:
+        """The same problem with some unknowns held, e.g. the shared ones on a hold-out run."""
+        names = self.predictor.layout.names
+        full = self._full.copy()
+        for name, value in values.items():
+            if name in names:
+                full[names.index(name)] = value
+        free = np.array([k for k, name in enumerate(names) if name not in values], dtype=np.int64)
+        return CampaignProblem(self.predictor, free, full)
+
+    @property
+    def nuisances(self) -> frozenset[str]:
+        """Unknowns whose prior is a measurement, and counts in every estimator."""
+        layout, parameters = self.predictor.layout, self.predictor.model.parameters
+        owners = zip(layout.names, layout.parameters, strict=True)
+        return frozenset(name for name, owner in owners if parameters[owner].measured)
+
+    @property
+    def start(self) -> Array:
+        """Nominal values of the unknowns, shape (l,)."""
+        return self._full[self._free]
+
+    @property
+    def branch_jumps(self) -> NDArray[np.int64]:
+        """Solutions so far, by run, that left the branch of the one they started from, (N,)."""
+        return np.array([run.jumps for run in self.predictor.runs], dtype=np.int64)
+
+    def full(self, theta: Array) -> Array:
+        """All unknowns of the predictor, shape (L, all), from the free ones, shape (L, l)."""
+        vectors = np.repeat(self._full[None], theta.shape[0], axis=0)
+        vectors[:, self._free] = theta
+        return vectors
+
+    def evaluate(self, theta: Array) -> Evaluation:
+        """Residuals and sensitivities at one vector, shape (l,).
+
+        Every evaluation re-anchors the solver at ``theta``: an estimate walks, and starts each
+        solve where it stands. Asked again for the last vector, it answers from memory.
+        """
+        if self._last is None or not np.array_equal(self._last[0], theta):
+            self._last = (np.array(theta), self._evaluate(theta))
+        return self._last[1]
+
+    def _evaluate(self, theta: Array) -> Evaluation:
+        full = self.full(theta[None])[0]
+        runs = self.predictor.evaluate(full)
+        residual: Sequence[Sequence[Array]] = [
+            list(self.kept(r, record.measured - run.y))
+            for r, (record, run) in enumerate(zip(self.predictor.runs, runs, strict=True))
+        ]
+        outputs = range(len(self.outputs))
+        return Evaluation(
+            residual=tuple(np.concatenate([r[b] for r in residual]) for b in outputs),
+            sensitivity=tuple(
+                np.concatenate(
+                    [self.kept(r, run.sensitivity[b][self._free]).T for r, run in enumerate(runs)]
+                )
+                for b in outputs
+            ),
+            status=max((run.status for run in runs), default=Status.CONVERGED),
+            monodromy=tuple(run.monodromy for run in runs),
+        )
+
+    def misfit(self, theta: Array) -> Misfit:
+        """Sums of squares at many vectors, shape (L, l), from the frozen anchor."""
+        if all(record.kept is None for record in self.predictor.records):
+            return Misfit(*self.predictor.sum_of_squares(self.full(theta)))
+        return self._misfit_of_the_kept(theta)
+
+    def _misfit_of_the_kept(self, theta: Array) -> Misfit:
+        """The same where some samples do not count: by way of the residuals."""
+        sums = np.full((len(theta), len(self.runs), len(self.outputs)), np.nan)
+        status = np.zeros((len(theta), len(self.runs)), dtype=np.int64)
+        blocks = [
+            (r, slice(k, min(k + _LANES, len(theta))))
+            for r in range(len(self.runs))
+            for k in range(0, len(theta), _LANES)
+        ]
+
+        def work(block: tuple[int, slice]) -> None:
+            r, rows = block
+            residual, status[rows, r] = self.residuals(theta[rows], r)
+            sums[rows, r] = np.sum(residual**2, axis=2)
+
+        thread_map(work, blocks, self.predictor.jobs)
+        worst = status.max(axis=1)
+        sums[worst != Status.CONVERGED] = np.nan
+        return Misfit(sums, worst)
+
+    @property
+    def samples(self) -> tuple[RunSamples, ...]:
+        """When the samples of each run were taken, s."""
+        return tuple(
+            _samples_of(record, self.kept(r, record.time), self.predictor.model.inputs)
+            for r, record in enumerate(self.predictor.records)
+        )
+
+    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals (L, s, n) of one run at vectors (L, l) and statuses (L,), from the anchor."""
+        samples = self.predictor.simulate(self.full(theta), run)
+        return self.kept(run, self.predictor.runs[run].measured - samples.y), samples.status
+
+    def freeze(self, theta: Array) -> Status:
+        """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""
+        return max(self.predictor.set_anchor(self.full(theta[None])[0]), default=Status.CONVERGED)
+
+    @property
+    def lanes(self) -> int:
+        """Vectors whose sensitivities are computed together."""
+        return _LANES
+
+    @property
+    def data(self) -> tuple[Array, ...]:
+        """Measured samples of each output, runs one after the other, SI."""
+        rows = (self.kept(r, run.measured) for r, run in enumerate(self.predictor.runs))
+        columns = zip(*rows, strict=True)
+        return tuple(np.concatenate(column) for column in columns)
+
+    def with_data(self, data: Sequence[Array]) -> CampaignProblem:
+        """The same problem with other measured samples, shape (n_b,) for each output.
+
+        Raises
+        ------
+        InputError
+            If their number is another, or they are not finite.
+        """
+        wanted = [column.shape for column in self.data]
+        given = [np.shape(column) for column in data]
+        if given != wanted or not all(np.isfinite(column).all() for column in data):
+            raise InputError(
+                "data must be finite and as many as the problem's",
+                key="data",
+                value=given,
+                hint=f"give arrays of shapes {wanted}",
+            )
+        predictor, first = copy(self.predictor), 0
+        predictor.runs = []
+        for run in self.predictor.runs:
+            last = first + _count(run.record)
+            other = copy(run)
+            fresh = np.stack([np.asarray(column[first:last]) for column in data])
+            if run.record.kept is not None:
+                fresh, counting = run.measured.copy(), fresh
+                fresh[:, run.record.kept] = counting
+            other.measured = fresh
+            predictor.runs.append(other)
+            first = last
+        return CampaignProblem(predictor, self._free, self._full)
+
+    def normal_equations(self, theta: Array, data: Sequence[Array]) -> BatchNormalEquations:
+        """Equations at vectors (L, l), each compared with its own row of data (L, n_b).
+
+        Solves start from the anchor; :meth:`freeze` it near the vectors.
+        """
+        if self.predictor.model.dofs and any(run.anchor is None for run in self.predictor.runs):
+            self.freeze(self.start)
+        full = self.full(theta)
+        ends = np.cumsum(self.counts[:, 0])
+        shape = (len(theta), len(self.outputs), full.shape[1])
+
+        def of_run(r: int) -> BatchNormalEquations:
+            samples = self.predictor.runs[r].predict(
+                self.predictor.constants(full, r), derivatives=True
+            )
+            assert samples.y_p is not None
+            columns = self.predictor.layout.columns[r]
+            gram, slope = np.zeros((*shape, full.shape[1])), np.zeros(shape)
+            sums = np.empty(shape[:2])
+            cut = slice(ends[r] - self.counts[r, 0], ends[r])
+            y, y_p = self.kept(r, samples.y), self.kept(r, samples.y_p)
+            for b, column in enumerate(data):
+                rows = reduce_rows(column[:, cut] - y[:, b], y_p[:, b].mT)
+                gram[:, b, columns[:, None], columns], slope[:, b, columns], sums[:, b] = rows
+            return BatchNormalEquations(gram, slope, sums, samples.status)
+
+        parts = thread_map(of_run, range(len(self.predictor.runs)), self.predictor.jobs)
+        return BatchNormalEquations(
+            np.sum([part.gram for part in parts], axis=0)[:, :, self._free[:, None], self._free],
+            np.sum([part.slope for part in parts], axis=0)[:, :, self._free],
+            np.sum([part.sums for part in parts], axis=0),
+            np.stack([part.status for part in parts]).max(axis=0),
+        )
+
+
+def _samples_of(record: Record, time: Array, inputs: Iterable[str]) -> RunSamples:
+    """When samples of a run were taken, and where in its cycle: by the first input that swings."""
+    if not record.periodic:
+        return RunSamples(time, None)
+    first = record.frequency * float(time[0] - record.time[0])
+    for channel in inputs:
+        harmonics = record.harmonics.get(channel)
+        swing = None if harmonics is None else harmonics.coefficients[harmonics.orders == 1]
+        if swing is not None and swing.size:
+            return RunSamples(
+                time, record.frequency, first + float(np.angle(swing[0])) / (2 * np.pi)
+            )
+    return RunSamples(time, record.frequency, first)
+
+
+def _count(record: Record) -> int:
+    """Samples that count."""
+    return record.time.size if record.kept is None else int(record.kept.sum())

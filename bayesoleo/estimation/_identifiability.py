@@ -1,0 +1,231 @@
+"""Identifiability: directions that the data determine, posterior against prior.
+
+Directions in which the data know much and little, in the model's own words.
+
+The curvature of the objective, with every unknown in units of a scale of its own, has principal
+axes. Along a stiff one the data fix a combination of parameters, along a sloppy one they do not
+(Verbeek 1993, eqs. 2.44 and 2.45; the axes are ours, after Gutenkunst et al. 2007).
+
+Which parameters did the data say nothing about? Posterior against prior, parameter by parameter.
+
+A narrow interval may be the prior's own. The ratio of posterior to prior standard deviation tells:
+near one, the data added nothing, and the estimate is what was put in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._display import LabelledResult, columns
+from bayesoleo._types import Array
+from bayesoleo.errors import InputError
+from bayesoleo.estimation._objectives import curvature
+from bayesoleo.estimation._point_estimate import PointEstimate
+from bayesoleo.estimation._problem import EstimationProblem
+from bayesoleo.model._model import Model
+from bayesoleo.model._priors import Prior
+
+Scale = Literal["prior", "value"]
+# Components below this part of the largest do not help a reader.
+_WORTH_SAYING = 0.1
+# Information below that of the prior: the data have not moved the unknown.
+_UNDETERMINED = 1.0
+
+
+def principal_axes(
+    problem: EstimationProblem, point: PointEstimate, *, scale: Scale = "prior", exact: bool = False
+) -> LabelledResult:
+    """Principal axes of the likelihood at an estimate, the sloppiest first.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    point : PointEstimate
+    scale : {"prior", "value"}, optional
+        In units of the prior's standard deviation the information of an axis is that of the data
+        over that of the prior: below one the data have said nothing. Relative to the value, an axis
+        is a product of powers, and its standard deviation is relative.
+    exact : bool, optional
+        With second derivatives of the residual.
+
+    Returns
+    -------
+    LabelledResult
+        ``information(axis)``, ``sd(axis)``, ``direction(axis, parameter)``, ``words(axis)``,
+        ``scale(parameter)``.
+
+    Raises
+    ------
+    InputError
+        If ``scale`` is ``"value"`` and an estimate is zero.
+    """
+    unit = _unit(problem, point, scale)
+    whole = curvature(problem, point.theta, point.variance, prior=False, exact=exact)
+    scaled = over_variances(whole, len(unit)) * np.outer(unit, unit)
+    information, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(axis=0), range(len(unit))])
+    say = in_words if scale == "prior" else as_product
+    names = [str(name) for name in point.names]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sd = np.where(information > 0, 1 / np.sqrt(np.abs(information)), np.inf)
+    one = {"prior": "prior standard deviations", "value": "part of the value"}[scale]
+    data = xr.Dataset(
+        {
+            "information": _variable(("axis",), information, "information of the data", "1"),
+            schema.SD: _variable(("axis",), sd, "standard deviation along the axis", one),
+            "direction": _variable(
+                ("axis", schema.PARAMETER), vectors.T, "direction in scaled parameters", "1"
+            ),
+            "words": _variable(
+                ("axis",), np.array([say(v, names) for v in vectors.T], object), "axis", ""
+            ),
+            "scale": _variable((schema.PARAMETER,), unit, "scale", "unit of each parameter"),
+        },
+        coords={schema.PARAMETER: names},
+    )
+    data.attrs = {"scaled_by": scale}
+    return LabelledResult(data, axes_text(data))
+
+
+def over_variances(whole: Array, unknowns: int) -> Array:
+    """Curvature in the parameters, shape (l, l), with the variances following them.
+
+    The Schur complement of the block of the variances.
+    """
+    cross = whole[:unknowns, unknowns:]
+    return whole[:unknowns, :unknowns] - cross @ np.linalg.solve(
+        whole[unknowns:, unknowns:], cross.T
+    )
+
+
+def in_words(vector: Array, names: Sequence[str]) -> str:
+    """A direction as a sum: ``0.92 piston_area − 0.39 initial_volume``."""
+    text = ""
+    for k in _worth_saying(vector):
+        sign = "−" if vector[k] < 0 else "+"
+        text += f" {sign} {abs(vector[k]):.2g} {names[k]}"
+    return text.removeprefix(" + ").removeprefix(" ")
+
+
+def as_product(vector: Array, names: Sequence[str]) -> str:
+    """A direction of logarithms as a product of powers: ``piston_area^0.92 · volume^−0.39``."""
+    parts = [f"{names[k]}^{vector[k]:.2g}".replace("-", "−") for k in _worth_saying(vector)]
+    return " · ".join(parts)
+
+
+def _worth_saying(vector: Array) -> list[int]:
+    order = np.argsort(-np.abs(vector))
+    return [int(k) for k in order if abs(vector[k]) >= _WORTH_SAYING * abs(vector[order[0]])]
+
+
+def _unit(problem: EstimationProblem, point: PointEstimate, scale: Scale) -> Array:
+    if scale == "prior":
+        return np.array([prior.sd for prior in problem.priors])
+    if scale != "value":
+        raise InputError("unknown scale", key="scale", value=scale, hint="use 'prior' or 'value'")
+    if (point.theta == 0).any():
+        raise InputError(
+            "a value of zero has no logarithm",
+            key=point.names[int(np.argmin(np.abs(point.theta)))],
+            hint="use scale='prior'",
+        )
+    return np.abs(point.theta)
+
+
+def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+
+
+def axes_text(data: xr.Dataset) -> str:
+    """One line an axis, the sloppiest first."""
+    by_prior = data.attrs["scaled_by"] == "prior"
+    head = ["axis", "sd [prior sd]" if by_prior else "sd", "information", ""]
+    rows = []
+    for k in range(data.sizes["axis"]):
+        sd, information = float(data[schema.SD][k]), float(data["information"][k])
+        text = str(data["words"].values[k])
+        if by_prior and information < _UNDETERMINED:
+            text += "  (not determined by the data)"
+        shown = f"{sd:.3g}" if by_prior else f"{100 * sd:.3g} %"
+        rows.append([str(k + 1), shown, f"{information:.3g}", text])
+    width = max(len(row[3]) for row in rows)
+    return columns(head, [[*row[:3], row[3].ljust(width)] for row in rows])
+
+
+#: Ratio above which the data count as silent: the posterior is within 5 % as wide as the prior.
+SILENT = 0.95
+
+
+def data_against_prior(
+    sd: Mapping[str, float] | PointEstimate,
+    priors: Mapping[str, Prior] | Sequence[Prior],
+    *,
+    model: Model | None = None,
+    silent: float = SILENT,
+) -> xr.Dataset:
+    """How much narrower the data made what was known of each parameter.
+
+    Parameters
+    ----------
+    sd : mapping of str to float, or PointEstimate
+        Posterior standard deviations by name, from an estimate or from draws.
+    priors : mapping of str to Prior, or sequence of Prior
+        Of the same parameters; a sequence in the estimate's order.
+    model : Model, optional
+        Its constants that are known to a tolerance and were not estimated are listed too: they were
+        not asked.
+    silent : float, optional
+        Ratio from which on the data are said to add nothing.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``prior_sd``, ``posterior_sd``, ``ratio``, ``said_nothing`` (parameter); the attribute
+        ``statement`` says it in a sentence.
+
+    Raises
+    ------
+    InputError
+        If a parameter has no prior here.
+    """
+    found = dict(zip(sd.names, sd.sd, strict=True)) if isinstance(sd, PointEstimate) else dict(sd)
+    known = priors if isinstance(priors, Mapping) else dict(zip(found, priors, strict=True))
+    for name in found:
+        if name not in known:
+            raise InputError("no prior is given for this parameter", key=name)
+    prior_sd = {name: known[name].sd for name in found}
+    parameters = {} if model is None else {n: model.parameters[n] for n in model.uncertain()}
+    absent = [name for name in parameters if name not in found]
+    held = [*(sd.known if isinstance(sd, PointEstimate) else ()), *absent]
+    for name in absent:
+        prior = parameters[name].prior
+        assert prior is not None
+        found[name] = prior_sd[name] = prior.sd
+    width = np.array([prior_sd[name] for name in found])
+    ratio = np.array(list(found.values())) / width
+    quiet = ratio >= silent
+    return xr.Dataset(
+        {
+            "prior_sd": (schema.PARAMETER, width),
+            "posterior_sd": (schema.PARAMETER, list(found.values())),
+            "ratio": (schema.PARAMETER, ratio),
+            "said_nothing": (schema.PARAMETER, quiet),
+        },
+        coords={schema.PARAMETER: list(found)},
+        attrs={"statement": _statement(found, quiet, held)},
+    )
+
+
+def _statement(names: Mapping[str, float], quiet: np.ndarray, held: Sequence[str]) -> str:
+    silent = [n for n, flag in zip(names, quiet, strict=True) if flag and n not in held]
+    parts = []
+    if silent:
+        parts.append(f"the data add nothing to the prior of {', '.join(silent)}")
+    if held:
+        parts.append(f"{', '.join(held)} was held, known to its tolerance only")
+    return "; ".join(parts) if parts else "the data add to the prior of every parameter"

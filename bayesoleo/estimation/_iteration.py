@@ -1,0 +1,442 @@
+"""The iteration that all estimators share, with step lengths and history.
+
+The way of an estimator, and how it ended.
+
+How long a step should be, judged by the one before it.
+
+Linear equations that lack the residual's second derivatives can overshoot or fall short for ever,
+each step lowering the merit a little. Two steps on one line tell by how much.
+
+References
+----------
+Aitken (1926), "On Bernoulli's numerical solution of algebraic equations".
+
+The one loop of all estimators: stage the variances, take a step, halve it if it does not help.
+
+References
+----------
+Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rarely act.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._parallel import single_blas_thread
+from bayesoleo._types import Array, Float
+from bayesoleo.error_models._independent import output_counts
+from bayesoleo.estimation._bayesian_estimators import Step
+from bayesoleo.estimation._least_squares import PriorScale, WhitenedEquations, is_cut
+from bayesoleo.estimation._objectives import Objective, log_prior, newton_equations
+from bayesoleo.estimation._problem import EstimationProblem, Evaluation
+from bayesoleo.solvers._orbit import Status
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """Where one iteration ended.
+
+    Parameters
+    ----------
+    number : int
+        Zero at the start.
+    theta : ndarray, shape (l,)
+    variance : ndarray, shape (s,) or (s, s)
+        Staged at ``theta``; a matrix where the objective estimates one.
+    objective : float
+        The method's own objective at both.
+    halvings : int
+        Of the step that led here.
+    """
+
+    number: int
+    theta: Float[Array, " unknowns"]
+    variance: Float[Array, " outputs"] | Float[Array, "outputs outputs"]
+    objective: float
+    halvings: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the loop ended: the last point, its evaluation and the way there.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (l,)
+    evaluation : Evaluation
+    status : Status
+    history : tuple of Iteration
+        Empty if the start could not be evaluated.
+    evaluations : int
+    distance : float
+        To the method's fixed point by the last linearisation, in standard deviations.
+    failures : mapping of str to int
+        Evaluations that came to nothing, by the lower-case name of their status.
+    """
+
+    theta: Float[Array, " unknowns"]
+    evaluation: Evaluation
+    status: Status
+    history: tuple[Iteration, ...]
+    evaluations: int
+    distance: float
+    failures: Mapping[str, int] = field(default_factory=dict)
+
+
+# A step that turns back by more than this part of the last one overshoots: linear equations that
+# lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
+_OVERSHOOT = 0.3
+# Among steps below a standard deviation equations are close to linear, so that less tells as much;
+# what turns back by less than this gains a digit an iteration as it is.
+_OVERSHOOT_NEAR = 0.1
+# After so many steps in a row along one line, each longer than that part of the one before, steps
+# are lengthened, at most so far: the same equations can also fall short for ever.
+_STEADY = 4
+_LONGEST = 10.0
+# Cosine from which two steps lie on one line; off it nothing is known of the overshoot.
+_ON_ONE_LINE = 0.9
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a step compares with the one before it, by which it is shortened or lengthened.
+
+    Near the fixed point the error along one line shrinks from ``e`` to ``(1 - s k) e``, where ``s``
+    is the part of the proposed step that was taken and ``k`` how far a whole one goes. Two
+    proposals on that line tell ``k``, and the part ``1/k`` goes all the way (Aitken's process,
+    1926): at once where steps turn back, with care where they creep.
+
+    Parameters
+    ----------
+    taken : ndarray, shape (l,)
+        The last step, in scaled unknowns.
+    part : float
+        Of the proposal that was taken.
+    idle : int
+        Iterations in a row that were slow and gained nothing.
+    slow : bool
+        The present proposal is not much shorter than the last step.
+    steady : int
+        Steps in a row that crept along one line.
+    wanted : float
+        Part of the present proposal to take; one where nothing says otherwise.
+    """
+
+    taken: Array | None = None
+    part: float = 1.0
+    idle: int = 0
+    slow: bool = False
+    steady: int = 0
+    wanted: float = 1.0
+
+    def look(self, proposal: Array, rows: Array) -> Pace:
+        """Compare a proposal with the last step in the metric ``rows' rows``."""
+        if self.taken is None:
+            return self
+        new, old = rows @ proposal, rows @ self.taken
+        lengths = float(np.linalg.norm(new)), float(np.linalg.norm(old))
+        if min(lengths) == 0:
+            return replace(self, slow=False, steady=0, wanted=1.0)
+        cosine = float(new @ old) / (lengths[0] * lengths[1])
+        ratio = lengths[0] / lengths[1]
+        reach = 1 / self.part - float(np.sign(cosine)) * ratio
+        on_line = abs(cosine) >= _ON_ONE_LINE
+        creeps = on_line and 0 < reach < 1 - _OVERSHOOT
+        steady = self.steady + 1 if creeps else 0
+        wanted = 1.0
+        overshoot = _OVERSHOOT_NEAR if max(lengths) < 1 else _OVERSHOOT
+        if on_line and reach > 1 + overshoot:
+            wanted = 1 / reach
+        elif steady >= _STEADY:
+            wanted = min(1 / reach, _LONGEST)
+        return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
+
+    def after(self, taken: Array, part: float, idle: bool) -> Pace:
+        """Pace after a step that was a part of its proposal and gained nothing, or something."""
+        return Pace(taken, part, self.idle + 1 if idle and self.slow else 0, steady=self.steady)
+
+
+# 2**-30 of a step moves nothing that another thirty iterations could use.
+_MAX_HALVINGS = 30
+# Rounding of the merit function, by sample: a step that is worse by less is not worse.
+_ROUNDING = 1e-13
+# Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
+# this means nothing in statistics (0.0014 sd), but may lie below the noise of a solver's tolerance.
+_NEGLIGIBLE_GAIN = 1e-6
+_MANY_HALVINGS = 4
+# Distance to the fixed point, in standard deviations, up to which a small step means convergence.
+_NEAR = 0.1
+# So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
+_IDLE = 3
+# Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
+# asks for certified digits gets them, if slowly.
+_IDLE_STEPS = 1e3
+# A logarithm of which the data leave more than this part of the prior's sd may have no optimum: the
+# likelihood levels off on the way to zero or infinity, and an estimator that follows it never ends.
+# What then lies nearer to the level than _NEAR is on it.
+_FLAT = 0.9
+_LEVEL = 0.5 * _NEAR**2
+
+
+def iterate(
+    problem: EstimationProblem,
+    step: Step[Any],
+    start: Array,
+    objective: Objective,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    resolution: float = 0.0,
+    bias_corrected: bool = False,
+    progress: Callable[[Iteration], None] | None = None,
+) -> Outcome:
+    """Repeat a step until it is small.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    step : Step
+        The estimator.
+    start : ndarray, shape (l,)
+        Inside the priors' support.
+    objective : Objective
+        What is maximised.
+    tolerance : float
+        Converged when every unknown's step is below this part of its value, or of its linearised
+        standard deviation where that is larger.
+    max_iterations : int
+    resolution : float, optional
+        Converged also where a step is shorter than this many standard deviations, all unknowns
+        together.
+    bias_corrected : bool, optional
+        Stage the variances with eq. 3.18 instead of 3.17.
+    progress : callable, optional
+        Called with each :class:`Iteration`.
+
+    Returns
+    -------
+    Outcome
+        Ends on the last point that improved, so never on a worse one than the start.
+    """
+    loop = _Loop(problem, step, objective, bias_corrected, progress)
+    with single_blas_thread():
+        loop.move(loop.look(np.array(start, dtype=float)), 0)
+        status = loop.point.status
+        if status.ok:
+            try:
+                status = loop.run(tolerance, max_iterations, resolution)
+            except np.linalg.LinAlgError:
+                status = Status.SINGULAR
+    return Outcome(
+        theta=loop.point.theta,
+        evaluation=loop.point.evaluation,
+        status=status,
+        history=tuple(loop.history),
+        evaluations=loop.evaluations,
+        distance=loop.distance,
+        failures=dict(loop.failures),
+    )
+
+
+@dataclass(frozen=True)
+class _Point:
+    theta: Array
+    evaluation: Evaluation
+    moments: Array
+
+    @property
+    def status(self) -> Status:
+        if self.evaluation.status.ok and not np.isfinite(self.moments).all():
+            return Status.NOT_FINITE
+        return self.evaluation.status
+
+
+class _Loop:
+    """The iteration's current point and history; lives inside :func:`iterate` only."""
+
+    def __init__(
+        self,
+        problem: EstimationProblem,
+        step: Step[Any],
+        objective: Objective,
+        bias_corrected: bool,
+        progress: Callable[[Iteration], None] | None,
+    ) -> None:
+        self.problem, self.step, self.objective = problem, step, objective
+        self.bias_corrected, self.progress = bias_corrected, progress
+        self.counts: NDArray[np.int64] = output_counts(problem.counts)
+        self.scale = PriorScale.of(problem.priors, problem.names)
+        self.state = step.begin(self.scale.root)
+        self.history: list[Iteration] = []
+        self.evaluations, self.distance = 0, np.nan
+        self.failures: Counter[str] = Counter()
+        self.point: _Point
+
+    def look(self, theta: Array) -> _Point:
+        self.evaluations += 1
+        evaluation = self.problem.evaluate(theta)
+        point = _Point(theta, evaluation, np.array([np.nan]))
+        if evaluation.status.ok:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+                point = _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        if not point.status.ok:
+            self.failures[point.status.name.lower()] += 1
+        return point
+
+    def move(self, point: _Point, halvings: int) -> None:
+        """Make a point the current one, and a line of the history."""
+        self.point = point
+        if not point.status.ok:
+            return
+        variance = self.variance()
+        objective = self.merit(point, variance)
+        number = len(self.history)
+        iteration = Iteration(number, point.theta, variance, objective, halvings)
+        self.history.append(iteration)
+        if self.progress is not None:
+            self.progress(iteration)
+
+    def run(self, tolerance: float, max_iterations: int, resolution: float) -> Status:
+        """Iterate until a step is small and the fixed point near, or nothing helps."""
+        pace = Pace()
+        for _ in range(max_iterations):
+            variance = self.variance()
+            equations = self.equations(variance)
+            if not np.isfinite(equations.jacobian).all():
+                return Status.NOT_FINITE
+            self.state = self.step.prepare(self.state, equations)
+            weight = self.step.rows(self.state, equations.jacobian)
+            proposal = equations.solve(weight)
+            pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
+            part = self.part_of(proposal, pace, equations)
+            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance, resolution)
+            before = self.point
+            trial, halvings, taken = self.shorten(part * proposal, equations, variance, resolution)
+            if halvings >= _MANY_HALVINGS:
+                gain = 0.5 * float(proposal @ equations.gradient)
+                small = small or gain <= _NEGLIGIBLE_GAIN
+            if trial.status.ok and trial is not before:
+                self.move(trial, halvings)
+            elif not small:
+                return Status.NO_CONVERGENCE if trial.status.ok else trial.status
+            won = self.merit(self.point, variance) - self.merit(before, variance)
+            pace = pace.after(taken, part * 0.5**halvings, self.is_idle(won, equations, tolerance))
+            if small or pace.idle >= _IDLE:
+                self.distance = self.equations(self.variance()).distance()
+                if self.distance <= _NEAR:
+                    return Status.CONVERGED
+                if self.step.locks or self.point is before:
+                    return Status.NO_CONVERGENCE
+            expected = equations.expected_gain(taken)
+            ratio = won / expected if expected > 0 else 1.0
+            self.state = self.step.accept(self.state, equations.jacobian, ratio, taken)
+        return Status.NO_CONVERGENCE
+
+    def part_of(self, proposal: Array, pace: Pace, equations: WhitenedEquations) -> float:
+        """How much of a proposal to take: more than all of it only well inside the support."""
+        if pace.wanted <= 1:
+            return pace.wanted
+        if self.step.locks or is_cut(pace.wanted * proposal, equations.room):
+            return 1.0  # steps of an estimator that locks up creep by design
+        return pace.wanted
+
+    def shorten(
+        self, proposal: Array, equations: WhitenedEquations, variance: Array, resolution: float
+    ) -> tuple[_Point, int, Array]:
+        """First point along ever shorter steps that is not worse than the current one.
+
+        With the number of halvings and the step that led there. If there is none, or none before
+        steps are shorter than what is to be resolved: the last point that failed, or the current
+        one.
+        """
+        merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
+        trial = self.point
+        for halvings in range(_MAX_HALVINGS + 1):
+            trial = self.look(self.scale.moved(self.point.theta, proposal))
+            if trial.status.ok and self.merit(trial, variance) >= merit:
+                return trial, halvings, proposal
+            if np.linalg.norm(equations.jacobian @ proposal) < resolution:
+                break  # where a law has a jump no step helps, however short
+            softer = self.step.refuse(self.state, proposal)
+            if softer is None:
+                proposal = proposal / 2
+            else:
+                self.state = self.step.prepare(softer, equations)
+                proposal = equations.solve(self.step.rows(self.state, equations.jacobian))
+        return (self.point if trial.status.ok else trial), _MAX_HALVINGS, proposal
+
+    @property
+    def pulls(self) -> bool:
+        """Whether the prior stays where it was declared and counts in the objective."""
+        return self.step.fixed_prior and self.objective.prior
+
+    def variance(self) -> Array:
+        """Staged covariance of the errors at the current point."""
+        unknowns = len(self.scale.sd)
+        return self.objective.errors.stage(
+            self.point.moments, self.counts, unknowns, self.bias_corrected
+        )
+
+    def merit(self, point: _Point, variance: Array) -> float:
+        """Objective with ``v`` held; the prior counts only where it is fixed at its centre."""
+        value = self.objective.errors.log_likelihood(point.moments, variance, self.counts)
+        if self.pulls:
+            value += log_prior(self.scale.priors, point.theta)
+        return value
+
+    def equations(self, variance: Array) -> WhitenedEquations:
+        """Linear equations at the current point, with ``v`` held."""
+        theta, errors = self.point.theta, self.objective.errors
+        rows = errors.rows(self.point.evaluation, self.scale.unit(theta), variance)
+        slope = self.scale.slope(theta) if self.pulls else np.zeros(theta.size)
+        # a matrix has its entries' size on its diagonal
+        sizes = np.diag(variance) if variance.ndim == 2 else variance
+        noise = float(np.exp(0.5 * np.mean(np.log(sizes))))
+        place = theta / self.scale.unit(theta)
+        equations = WhitenedEquations(
+            *rows, slope, self.scale.room(theta), self.scale.root, place, noise
+        )
+        if not self.step.second_order:
+            return equations
+        self.evaluations += 2 * theta.size
+        return newton_equations(
+            self.problem,
+            errors,
+            self.scale,
+            theta,
+            self.point.evaluation,
+            variance,
+            equations,
+            prior=self.pulls,
+        )
+
+    def is_small(
+        self, proposal: Array, equations: WhitenedEquations, tolerance: float, resolution: float
+    ) -> bool:
+        if is_cut(proposal, equations.room):
+            return False
+        if not self.step.locks and equations.distance() <= resolution:
+            return True
+        if self.step.limits_length:  # a short step then means caution as often as arrival
+            own = equations.solve(equations.root)
+            proposal = np.where(np.abs(own) > np.abs(proposal), own, proposal)
+        unit = self.scale.unit(self.point.theta)
+        least = np.maximum(np.abs(self.point.theta), unit * equations.sd())
+        return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
+
+    def is_idle(self, won: float, equations: WhitenedEquations, tolerance: float) -> bool:
+        """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
+        nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
+        rows = equations.root
+        if not self.step.fixed_prior:
+            # A prior that only scales the steps must not hide how far the optimum is, if any.
+            flat = self.scale.logarithmic & (equations.sd() > _FLAT)
+            rows = rows[flat]
+            nothing = _LEVEL if flat.any() else nothing
+        return won <= nothing and equations.expected_gain(equations.solve(rows)) <= nothing

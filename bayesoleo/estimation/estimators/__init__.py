@@ -1,1 +1,0 @@
-"""How it is minimised, and the point estimate that results."""

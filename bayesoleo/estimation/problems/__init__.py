@@ -1,1 +1,0 @@
-"""What can be fitted: functions, models over runs, and sections of them."""

@@ -1,1 +1,0 @@
-"""What runs have in common and what not."""

@@ -1,1 +1,0 @@
-"""Which parameters matter for what is predicted."""

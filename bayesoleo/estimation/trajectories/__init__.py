@@ -1,1 +1,0 @@
-"""Estimation from chaotic and other transient records by multiple shooting."""

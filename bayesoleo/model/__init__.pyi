@@ -1,0 +1,29 @@
+from ._correlated_priors import (
+    JointNormal as JointNormal,
+    sample_of as sample_of,
+    with_joint_prior as with_joint_prior,
+)
+from ._drive import (
+    driven_by as driven_by,
+    possible_drives as possible_drives,
+)
+from ._kernels import (
+    kernels as kernels,
+)
+from ._model import (
+    Model as Model,
+)
+from ._parameters import (
+    Condition as Condition,
+    Coordinate as Coordinate,
+    Dof as Dof,
+    Output as Output,
+    Parameter as Parameter,
+)
+from ._priors import (
+    LogNormal as LogNormal,
+    Normal as Normal,
+    Prior as Prior,
+    TruncatedNormal as TruncatedNormal,
+    Uniform as Uniform,
+)

@@ -1,0 +1,213 @@
+"""Drive a model by any of its channels.
+
+A rig may control the displacement although the equation of motion is written for a force: then the
+displacement is the clean input, and the force is what the system answers. If the controlled
+channel's output map is a dof itself, the dof is replaced by the input with its exact derivatives;
+otherwise - an effect sits on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
+
+Where the given-up input enters with its rate as well (a lagging sensor shows ``F + tau dot(F)``),
+what is solved for is a state: the answer ``F`` becomes a dof of first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import sympy as sp
+
+from bayesoleo.errors import ModelError
+from bayesoleo.model._expressions import TIME, derivative_symbol, partial, split_derivative, symbol
+from bayesoleo.model._kernels import Structured
+from bayesoleo.model._model import Model
+from bayesoleo.model._parameters import Dof, Output
+
+#: An input has exact derivatives of any order; equations need at most this many.
+MAXIMUM_DERIVATIVE = 6
+
+
+def possible_drives(model: Model) -> tuple[str, ...]:
+    """Channels that :func:`driven_by` accepts."""
+    names = [*model.inputs]
+    for channel in model.outputs:
+        if _freed_input(model, channel) is not None:
+            names.append(channel)
+    return tuple(names)
+
+
+def driven_by(model: Model, channel: str) -> Model:
+    """Exchange an input against a measured output.
+
+    Parameters
+    ----------
+    model : Model
+        In its own drive.
+    channel : str
+        The channel that is to be the input. If it is one already, the model is returned unchanged.
+
+    Returns
+    -------
+    Model
+        With ``channel`` as an input and the former input as an output, under its own name.
+
+    Raises
+    ------
+    ModelError
+        If the exchange has no unique inverse; the message lists the channels that have one.
+    """
+    if channel in model.inputs:
+        return model
+    return _driven(Structured(model), channel).with_parameters(**model.parameters)
+
+
+@lru_cache(maxsize=512)
+def _driven(like: Structured, channel: str) -> Model:
+    """The same of any model with these equations; parameters and their values stay as they are."""
+    model = like.model
+    found = _freed_input(model, channel) if channel in model.outputs else None
+    if found is None:
+        raise ModelError(
+            f"model {model.name!r} cannot be driven by {channel!r}",
+            hint=f"drive it by one of: {', '.join(possible_drives(model))}",
+        )
+    dof, freed = found
+    if _orders(model.equation(dof), freed) == {0, 1}:
+        driven = _exchange_lagging(model, channel, dof, freed)
+        measured = model.output(channel)
+    else:
+        answer = _solve_for_input(model, dof, freed)
+        driven = _exchange(model, channel, dof, freed, answer)
+        table = {symbol(freed): sp.Add(*answer.values())}
+        measured = model.expand(model.output(channel).xreplace(table))
+    inverse = _explicit_inverse(model, measured, dof, channel)
+    if inverse is not None:
+        return _replace_dof(driven, dof, inverse)
+    equation = {"measured": measured, "drive": -symbol(channel)}
+    # The dof stays close to what is measured: a far better first guess than a static value.
+    stays = replace(
+        driven.dofs[dof], guess=channel, initial="equilibrium", initial_rate=f"dot({channel})"
+    )
+    dofs = {**driven.dofs, dof: stays}
+    return replace(driven, dofs=dofs, equations={**driven.equations, dof: equation})
+
+
+def _freed_input(model: Model, channel: str) -> tuple[str, str] | None:
+    """The dof that the channel observes and the input that its equation gives up for it."""
+    expression = model.output(channel)
+    for dof in model.dofs:
+        if not expression.has(symbol(dof)):
+            continue
+        equation = model.equation(dof)
+        for name in model.inputs:
+            slope = partial(equation, symbol(name))
+            linear = slope != 0 and not slope.has(symbol(name))
+            if linear and not expression.has(TIME) and _appears_once(model, name, dof, channel):
+                return dof, name
+    return None
+
+
+def _appears_once(model: Model, name: str, dof: str, channel: str) -> bool:
+    """Whether an input enters the dof's equation only, and the channel itself.
+
+    It may enter the equation with its rate, if linearly and not the channel as well.
+    """
+    own = _orders(model.equation(dof), name)
+    others = [model.equation(other) for other in model.dofs if other != dof]
+    others += [model.output(other) for other in model.outputs if other != channel]
+    if any(_orders(expression, name) for expression in others):
+        return False
+    if own == {0, 1}:
+        rate = partial(model.equation(dof), derivative_symbol(name, 1))
+        return not _orders(rate, name) and not _orders(model.output(channel), name)
+    return own == {0}
+
+
+def _orders(expression: sp.Expr, name: str) -> set[int]:
+    """Orders of the derivatives of a quantity that an expression contains."""
+    found = (split_derivative(item) for item in expression.free_symbols)
+    return {order for other, order in found if other == name}
+
+
+def _solve_for_input(model: Model, dof: str, freed: str) -> dict[str, sp.Expr]:
+    """The freed input as a sum of named terms: the equation solved for it."""
+    item = symbol(freed)
+    slope = partial(model.equation(dof), item)
+    terms = {}
+    for name, term in model.equations[dof].items():
+        rest = term.xreplace({item: sp.Integer(0)}) if term.has(item) else term
+        if rest != 0:
+            terms[name] = -rest / slope
+    return terms
+
+
+def _exchange(
+    model: Model, channel: str, dof: str, freed: str, answer: Mapping[str, sp.Expr]
+) -> Model:
+    """Swap the roles of the two channels; the dof still stands, with its equation given up."""
+    unit = model.outputs[channel].unit
+    inputs = {name: value for name, value in model.inputs.items() if name != freed} | {
+        channel: unit
+    }
+    outputs = {freed: Output(dict(answer), model.inputs[freed])}
+    outputs |= {name: output for name, output in model.outputs.items() if name != channel}
+    equations = {**model.equations, dof: {"drive": symbol(dof) - symbol(channel)}}
+    return replace(model, inputs=inputs, outputs=outputs, equations=equations)
+
+
+def _exchange_lagging(model: Model, channel: str, dof: str, freed: str) -> Model:
+    """The same where the freed input enters with its rate: the equation rules a new dof."""
+    taken = {*model.dofs, *model.inputs, *model.parameters, *model.conditions, *model.definitions}
+    state = f"{freed}_answer"
+    while state in taken:
+        state += "_"
+    rates = {derivative_symbol(freed, 1): derivative_symbol(state, 1)}
+    table = {symbol(freed): symbol(state)} | rates
+    terms = {name: term.xreplace(table) for name, term in model.equations[dof].items()}
+    # The answer takes the state's rate only, so that where the rate does not count it is as exact
+    # as without a state: interpolating the state itself would blur the jumps of dry friction.
+    answer = {name: e.xreplace(rates) for name, e in _solve_for_input(model, dof, freed).items()}
+    return _exchange(
+        model.with_dof(state, Dof(model.inputs[freed]), terms), channel, dof, freed, answer
+    )
+
+
+def _explicit_inverse(model: Model, measured: sp.Expr, dof: str, channel: str) -> sp.Expr | None:
+    """The dof as a function of the channel where the map is linear in the dof, else ``None``."""
+    slope = sp.diff(measured, symbol(dof))
+    rest = sp.expand(measured - slope * symbol(dof))
+    moving = {*model.dofs, *model.inputs, TIME.name}
+    involved = slope.free_symbols | rest.free_symbols
+    if slope == 0 or any(split_derivative(item)[0] in moving for item in involved):
+        return None
+    return (symbol(channel) - rest) / slope
+
+
+def _replace_dof(model: Model, dof: str, inverse: sp.Expr) -> Model:
+    """Substitute a prescribed motion for a dof and its derivatives everywhere, and drop the dof."""
+    (driver,) = (item for item in inverse.free_symbols if item.name in model.inputs)
+    slope = sp.diff(inverse, driver)
+    table = {symbol(dof): inverse}
+    for order in range(1, MAXIMUM_DERIVATIVE):
+        table[derivative_symbol(dof, order)] = slope * derivative_symbol(driver.name, order)
+
+    def swap(expression: sp.Expr) -> sp.Expr:
+        return expression.xreplace(table)
+
+    return replace(
+        model,
+        dofs={name: item for name, item in model.dofs.items() if name != dof},
+        equations={
+            name: {term: swap(e) for term, e in terms.items()}
+            for name, terms in model.equations.items()
+            if name != dof
+        },
+        outputs={
+            name: replace(
+                output, terms={term: swap(e) for term, e in model.output_terms(name).items()}
+            )
+            for name, output in model.outputs.items()
+        },
+        definitions={name: swap(e) for name, e in model.definitions.items()},
+        admissible=[swap(e) for e in model.admissible],
+    )

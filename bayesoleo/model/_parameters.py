@@ -1,0 +1,199 @@
+"""Parameters, dofs, conditions and outputs: the parts a model is declared from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+
+from bayesoleo.errors import ModelError
+from bayesoleo.model._priors import Normal, Prior, TruncatedNormal, Uniform
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A constant of the model, estimated or fixed.
+
+    Parameters
+    ----------
+    value : float
+        Nominal value in ``unit``; where an estimate starts.
+    unit : str
+        SI unit, as pint reads it; empty for a number.
+    sd : float, optional
+        Standard deviation of a normal prior about ``value``; with ``bounds``, a truncated normal.
+    relative_sd : float, optional
+        The same over ``value``: the thesis's "sigma = 0.1 theta" is ``relative_sd=0.1``.
+    bounds : tuple of float, optional
+        Lowest and highest admissible value; alone it means a uniform prior.
+    prior : Prior, optional
+        Any other prior, instead of ``sd``, ``relative_sd`` and ``bounds``.
+    fixed : bool
+        Not estimated: keeps ``value``. With a prior it is a constant known to that tolerance, and
+        an unknown like a nuisance parameter: the prior is a measurement that every estimator and
+        the posterior count.
+    by_run : bool
+        One independent value for every run.
+    nuisance : bool
+        Its prior is a measurement and counts in every estimator: a sensor's offset within its
+        accuracy, the error of a condition.
+    description : str
+        What it is, for reports.
+    latex : str, optional
+        How it is typeset.
+
+    Raises
+    ------
+    ModelError
+        If the start lies outside the bounds or the prior is stated twice.
+    """
+
+    value: float
+    unit: str = ""
+    sd: float | None = None
+    relative_sd: float | None = None
+    bounds: tuple[float, float] | None = None
+    prior: Prior | None = None
+    fixed: bool = False
+    by_run: bool = False
+    description: str = ""
+    latex: str | None = None
+    nuisance: bool = False
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.value):
+            raise ModelError("a parameter needs a finite value", value=self.value)
+        stated = [self.sd is not None, self.relative_sd is not None, self.prior is not None]
+        if sum(stated) > 1:
+            raise ModelError("prior stated twice", hint="give one of sd, relative_sd, prior")
+        if self.prior is None:
+            object.__setattr__(self, "prior", self._stated_prior())
+        # The prior is what counts from here on; a copy with another value keeps it.
+        for name in ("sd", "relative_sd", "bounds"):
+            object.__setattr__(self, name, None)
+        if self.prior is not None:
+            low, high = self.prior.support
+            if not low <= self.value <= high:
+                raise ModelError(
+                    "the bounds exclude the start",
+                    value=self.value,
+                    hint=f"choose a value between {low:g} and {high:g}, or wider bounds",
+                )
+
+    @property
+    def toleranced(self) -> bool:
+        """Whether it is a constant known to a tolerance."""
+        return self.fixed and self.prior is not None
+
+    @property
+    def measured(self) -> bool:
+        """Whether its prior is a measurement, which no estimator may forget."""
+        return self.nuisance or self.toleranced
+
+    def _stated_prior(self) -> Prior | None:
+        spread = self.sd
+        if self.relative_sd is not None:
+            spread = self.relative_sd * abs(self.value)
+            if spread == 0:
+                raise ModelError(
+                    "relative_sd of a value of zero is no prior", hint="write sd=… instead"
+                )
+        if spread is None:
+            return None if self.bounds is None else Uniform(*self.bounds)
+        return (
+            Normal(self.value, spread)
+            if self.bounds is None
+            else TruncatedNormal(self.value, spread, *self.bounds)
+        )
+
+
+@dataclass(frozen=True)
+class Dof:
+    """A degree of freedom.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit.
+    guess : str, float or sympy.Expr
+        Static value from which a first solution starts; may use parameters and conditions.
+    description : str
+        What it is.
+    initial : str, float or sympy.Expr, optional
+        Value with which a transient run starts, over parameters, conditions, channels - as measured
+        at the run's first sample, smoothed - and the word ``equilibrium``: the value at rest under
+        the first sample's inputs. Periodic runs have no start. By default it is estimated for each
+        transient run; see :mod:`bayesoleo.model._initial_states`.
+    initial_rate : str, float or sympy.Expr, optional
+        The velocity at the start, of a dof of second order; zero where only ``initial`` is given.
+    """
+
+    unit: str = ""
+    guess: str | float | sp.Expr = 0.0
+    description: str = ""
+    initial: str | float | sp.Expr | None = None
+    initial_rate: str | float | sp.Expr | None = None
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A quantity that is known and constant in a run, e.g. the initial pressure.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit.
+    default : float, optional
+        Used where a run does not state it; without a default a campaign must.
+    description : str
+        What it is.
+    """
+
+    unit: str = ""
+    default: float | None = None
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Output:
+    """A measured quantity that the model predicts, as a sum of named terms.
+
+    Parameters
+    ----------
+    terms : str, sympy.Expr or mapping of str to either
+        One expression, or its named terms.
+    unit : str
+        SI unit.
+    """
+
+    terms: str | float | sp.Expr | Mapping[str, str | float | sp.Expr]
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """Where a force can act: a position, its velocity, and the balance to which a term is added.
+
+    Parameters
+    ----------
+    name : str
+        The dof's or the input's name.
+    position, velocity : sympy.Expr
+        Symbols of the motion; ``velocity`` is ``None`` for a first-order dof.
+    kind : str
+        ``equation`` or ``output``: where the balance stands.
+    target : str
+        Name of that equation or output.
+    sign : int
+        A resisting force ``f`` enters as ``sign * f``.
+    """
+
+    name: str
+    position: sp.Expr
+    velocity: sp.Expr | None
+    kind: str
+    target: str
+    sign: int

@@ -1,0 +1,57 @@
+from ._discovery import (
+    nonparametric_shape as nonparametric_shape,
+    proposal as proposal,
+    ranking as ranking,
+)
+from ._errors import (
+    by_run as by_run,
+    error as error,
+)
+from ._estimates import (
+    history as history,
+    indifference as indifference,
+    prior_sensitivity as prior_sensitivity,
+    profile as profile,
+    sampling_distribution as sampling_distribution,
+    sensitivity as sensitivity,
+)
+from ._posterior import (
+    corner as corner,
+    pairs as pairs,
+    point_against_posterior as point_against_posterior,
+    trace as trace,
+)
+from ._predictions import (
+    branch as branch,
+    forecast as forecast,
+    predictive as predictive,
+    trajectory as trajectory,
+)
+from ._records import (
+    fit as fit,
+    period_search as period_search,
+    records as records,
+)
+from ._residual_tests import (
+    assessment as assessment,
+    residual_tests as residual_tests,
+)
+from ._residuals import (
+    residual as residual,
+    residual_breakdown as residual_breakdown,
+)
+from ._stored import (
+    Study as Study,
+    print_before_after as print_before_after,
+)
+from ._style import (
+    AFTER as AFTER,
+    BEFORE as BEFORE,
+    INK as INK,
+    SIMILAR as SIMILAR,
+    Scale as Scale,
+    engineering as engineering,
+    format_number as format_number,
+    format_unit as format_unit,
+    format_value as format_value,
+)

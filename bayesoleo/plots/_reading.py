@@ -1,0 +1,182 @@
+"""What figures take out of a DataTree; groups that are absent are None, never an error."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._display import LabelledResult
+from bayesoleo._types import Array
+from bayesoleo.errors import InputError
+
+BINS = 120
+"""Points shown over one period."""
+
+
+@dataclass(frozen=True)
+class RunView:
+    """What is said about a run in the title of its panel."""
+
+    index: int
+    label: str
+    role: str
+    frequency: float
+    duration: float
+    periodic: bool
+
+    @property
+    def remark(self) -> str:
+        """Frequency of a periodic run, duration of a transient one."""
+        if not self.periodic:
+            return f"transient, {self.duration:.3g} s"
+        return f"{self.frequency:.3g} Hz" if np.isfinite(self.frequency) else ""
+
+
+def dataset(found: LabelledResult | xr.Dataset | xr.DataTree) -> xr.Dataset:
+    """The labelled arrays of a result, as the function that found it returns it, bare or a group.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    data = found.data if isinstance(found, LabelledResult) else found
+    if isinstance(data, xr.DataTree):
+        return data.to_dataset()
+    if not isinstance(data, xr.Dataset):
+        raise InputError(
+            "a figure needs a result or its Dataset",
+            value=type(data).__name__,
+            hint="give what the function returns, or a group of a tree",
+        )
+    return data
+
+
+def group(tree: xr.DataTree, name: str) -> xr.Dataset | None:
+    """A group as a Dataset, or None."""
+    return tree[name].to_dataset() if name in tree.children else None
+
+
+def variable(tree: xr.DataTree, name: str, variable: str) -> xr.DataArray:
+    """A variable of a group that is there."""
+    return tree[name].to_dataset()[variable]
+
+
+def summary(tree: xr.DataTree) -> dict[str, Any]:
+    """The summary in the root attributes, empty if there is none."""
+    found: dict[str, Any] = json.loads(tree.attrs.get(schema.SUMMARY, "{}"))
+    return found
+
+
+def outputs(tree: xr.DataTree) -> list[str]:
+    """Output channels, in the order of the prediction."""
+    data = group(tree, schema.PREDICTION)
+    end = schema.before("")
+    return (
+        []
+        if data is None
+        else [str(n)[: -len(end)] for n in data.data_vars if str(n).endswith(end)]
+    )
+
+
+def channels(tree: xr.DataTree) -> list[str]:
+    """Measured channels: those that are not outputs (the inputs) first."""
+    data = group(tree, schema.RECORDS)
+    if data is None:
+        return []
+    own = [str(name) for name in data.data_vars if name not in (schema.TIME, schema.PHASE)]
+    return sorted(own, key=lambda name: name in outputs(tree))
+
+
+def runs(tree: xr.DataTree) -> list[RunView]:
+    """The runs, in the order of the tree."""
+    data, constant = group(tree, schema.RECORDS), group(tree, schema.CONSTANT_DATA)
+    if data is None:
+        return []
+    count = data.sizes[schema.RUN]
+    labels = data[schema.RUN].values if schema.RUN in data.coords else range(1, count + 1)
+    roles, frequencies = [""] * count, np.full(count, np.nan)
+    if constant is not None:
+        roles = [str(role) for role in constant[schema.ROLE].values]
+        frequencies = constant[schema.FREQUENCY].values.astype(float)
+    time = data[schema.TIME].values
+    periodic = np.zeros(count, dtype=bool)
+    if schema.PHASE in data:
+        periodic = np.isfinite(data[schema.PHASE].values).any(axis=1)
+    duration = np.nanmax(time, axis=1) - np.nanmin(time, axis=1)
+    return [
+        RunView(
+            i,
+            str(labels[i]),
+            roles[i],
+            float(frequencies[i]),
+            float(duration[i]),
+            bool(periodic[i]),
+        )
+        for i in range(count)
+    ]
+
+
+def unit(data: xr.DataArray) -> str:
+    """Unit of a variable, empty if it has none."""
+    return str(data.attrs.get(schema.UNITS, ""))
+
+
+def abscissa(tree: xr.DataTree, run: RunView) -> Array:
+    """Phase modulo 1 of every sample; of a transient the fraction of its duration; NaN padded."""
+    data = tree[schema.RECORDS].to_dataset()
+    if run.periodic:
+        return np.asarray(data[schema.PHASE].values[run.index] % 1.0, dtype=np.float64)
+    time = np.asarray(data[schema.TIME].values[run.index], dtype=np.float64)
+    return np.asarray((time - np.nanmin(time)) / max(run.duration, float(np.finfo(float).tiny)))
+
+
+def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
+    """Average values in equal bins of a position from 0 to 1; bins without a sample are NaN.
+
+    Parameters
+    ----------
+    position, values : ndarray, shape (n,)
+        Pairs with a NaN are left out.
+    bins : int
+        Number of bins.
+
+    Returns
+    -------
+    centres, means : ndarray, shape (bins,)
+    """
+    keep = np.isfinite(position) & np.isfinite(values)
+    index = np.minimum((position[keep] * bins).astype(int), bins - 1)
+    count = np.bincount(index, minlength=bins)
+    total = np.bincount(index, weights=values[keep], minlength=bins)
+    means = np.full(bins, np.nan)
+    np.divide(total, count, out=means, where=count > 0)
+    return (np.arange(bins) + 0.5) / bins, means
+
+
+def is_resolved(position: Array, values: Array) -> bool:
+    """Whether bins of phase show a signal; hundreds of harmonics they would average out."""
+    means = fold(position, values)[1]
+    variance = np.nanvar(values)
+    return bool(variance == 0.0 or np.nanvar(means) > 0.9 * variance)
+
+
+def thin(x: Array, y: Array, points: int = 2 * BINS) -> tuple[Array, Array]:
+    """At most ``points`` pairs that keep the extremes: of each stretch its smallest and largest."""
+    if y.size <= points or not np.isfinite(y).any():
+        return x, y
+    chosen: list[int] = []
+    for part in np.array_split(np.arange(y.size), points // 2):
+        if np.isfinite(y[part]).any():
+            chosen += sorted({part[np.nanargmin(y[part])], part[np.nanargmax(y[part])]})
+    return x[chosen], y[chosen]
+
+
+def coordinate_name(data: xr.Dataset, name: str) -> str:
+    """What a coordinate of the residual is called: whose position or velocity it is."""
+    return str(data[name].attrs.get(schema.LONG_NAME, name))

@@ -1,0 +1,213 @@
+"""Stored figures of long studies, and the table of errors before and after.
+
+Results of long studies: computed where that is possible, and otherwise shown from a store.
+
+Pages of the gallery use it. The store is the folder ``studies/figures`` of the repository; a page
+that was downloaded alone has none, and says what it leaves out. With
+``BAYESOLEO_STORE_FIGURES=1`` a run of a page renews what is stored.
+
+The table of a closed loop: errors before and after, and the posterior of what was added.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import matplotlib.image
+from matplotlib.figure import Figure
+from PIL import Image
+
+from bayesoleo.effects._catalogue import called
+from bayesoleo.plots._discovery import chosen
+from bayesoleo.plots._style import engineering, format_number
+
+DPI = 100
+
+
+def studies_folder() -> Path | None:
+    """Return the repository's folder ``studies`` if the running page is in it."""
+    page = Path(sys.argv[0]).resolve()
+    return next((place for place in page.parents if place.name == "studies"), None)
+
+
+class Study:
+    """What a page shows, computed or from the store.
+
+    Parameters
+    ----------
+    name : str
+        Of the page; names of stored files begin with it.
+    data : str, optional
+        Folder of the data set below ``BAYESOLEO_DATA``. Nothing is downloaded.
+    slow : bool
+        Whether to compute only when the store is to be renewed.
+    needs : sequence of str
+        Modules of the repository's folder ``studies`` that the computation imports.
+
+    Attributes
+    ----------
+    folder : Path or None
+        Of the data set.
+    campaign : Path or None
+        Folder that declares it: of a measured set that in the repository, else the data set's.
+    live : bool
+        Whether results are computed.
+    """
+
+    def __init__(
+        self, name: str, data: str | None = None, *, slow: bool = False, needs: Sequence[str] = ()
+    ) -> None:
+        self.name = name
+        self.studies = studies_folder()
+        root = os.environ.get("BAYESOLEO_DATA")
+        self.folder = Path(root) / data if root and data else None
+        self.campaign = self.folder
+        if data is not None and data.startswith("measured/"):
+            self.campaign = None if self.studies is None else self.studies / data
+        self.storing = os.environ.get("BAYESOLEO_STORE_FIGURES") == "1"
+        reason = self._reason(data, slow, needs)
+        self.live = not reason
+        if reason:
+            print(reason, self._instead(), sep="\n")
+
+    def _reason(self, data: str | None, slow: bool, needs: Sequence[str]) -> str:
+        """Say why results are not computed; empty if they are."""
+        if data is not None and (self.folder is None or not self.folder.is_dir()):
+            return f"The data set {data} is not on this machine (BAYESOLEO_DATA)."
+        if data is not None and self.campaign is None:
+            return f"The declaration of this campaign is studies/{data} of the repository."
+        if slow and not self.storing:
+            return "This takes minutes; to compute it, set BAYESOLEO_STORE_FIGURES=1."
+        missing = [module for module in needs if find_spec(module) is None]
+        if missing:
+            return f"This needs studies/{missing[0]}.py of the repository (PYTHONPATH=studies)."
+        return ""
+
+    def _instead(self) -> str:
+        if self._figures() is None:
+            return "The results are in the folder studies of the repository."
+        return "Shown are the stored results of the last run."
+
+    def _figures(self) -> Path | None:
+        return None if self.studies is None else self.studies / "figures"
+
+    def run[R](self, work: Callable[[], R]) -> R | None:
+        """Do the work if results are computed."""
+        return work() if self.live else None
+
+    def helper(self, module: str) -> ModuleType | None:
+        """Import a module of the folder ``studies`` if results are computed."""
+        return self.run(lambda: import_module(module))
+
+    def text(self, name: str, write: Callable[[], object]) -> None:
+        """Print what ``write`` prints, or printed in the last run."""
+        store, file = self._figures(), f"{self.name}-{name}.txt"
+        if not self.live:
+            if store is not None:
+                print((store / file).read_text(encoding="utf-8"), end="")
+            return
+        caught = io.StringIO()
+        with contextlib.redirect_stdout(caught):
+            write()
+        lines = "".join(f"{line.rstrip()}\n" for line in caught.getvalue().strip("\n").split("\n"))
+        print(lines, end="")
+        if self.storing and store is not None:
+            (store / file).write_text(lines, encoding="utf-8")
+
+    def figure(self, name: str, draw: Callable[[], Figure]) -> Figure | None:
+        """Return the figure that ``draw`` makes, or made in the last run; None without a store."""
+        store, file = self._figures(), f"{self.name}-{name}.png"
+        if not self.live:
+            return None if store is None else _framed(store / file)
+        figure = draw()
+        if self.storing and store is not None:
+            _write_png(figure, store / file)
+        return figure
+
+
+def _write_png(figure: Figure, path: Path) -> None:
+    """Write PNG with 128 colours, which is a third of the size."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=DPI, format="png")
+    image = Image.open(drawn).convert("RGB")
+    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def _framed(path: Path) -> Figure:
+    """Return a stored picture as a figure of its own size."""
+    pixels = matplotlib.image.imread(path)
+    height, width = pixels.shape[:2]
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.imshow(pixels, aspect="auto", interpolation="none")
+    axes.set_axis_off()
+    return figure
+
+
+ROLES = ("fit", "hold-out")
+
+
+def print_before_after(summary: Mapping[str, Any], unit: str, per_si: float) -> None:
+    """Print both tables.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``.
+    unit : str
+        In which errors are shown.
+    per_si : float
+        How many of it one SI unit is.
+    """
+    head = ("rms before", "after", "repeating before", "after", "over what is expected")
+    print(f"{f'error in {unit}':26}" + "".join(f"{text:>{len(text) + 3}}" for text in head))
+    for role in ROLES:
+        for output, last in summary["error_after"].get(role, {}).items():
+            first = summary["error_before"][role][output]
+            cells = [per_si * e[key] for key in ("rms", "repeating") for e in (first, last)]
+            ratio = " → ".join(f"{e['ratio_to_expected']:.1f}" for e in (first, last))
+            row = "".join(
+                f"{value:{len(text) + 3}.3g}" for value, text in zip(cells, head, strict=False)
+            )
+            print(f"{f'{output}, {role}':26}{row}{ratio:>24}")
+    print(f"\n{'posterior of what was added':34}{'mean':>10}{'sd':>10}   95 % interval")
+    for effect, names in added_parameters(summary):
+        print(effect)
+        for name in names:
+            print(_line(name, summary["parameters"][name]))
+
+
+def title_of(summary: Mapping[str, Any], effect: str | None) -> str:
+    """What an effect is called; a dash for none."""
+    return called(effect, summary.get("titles", {})) if effect else "–"
+
+
+def added_parameters(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    """Every effect that was added and stayed, with its parameters that were estimated."""
+    for entry in summary["rounds"]:
+        added = chosen(entry)
+        if added is None or added["effect"] not in summary["effects"]:
+            continue
+        names = [name for name in added["expected"] if name in summary["parameters"]]
+        yield title_of(summary, f"{added['effect']} @ {added['target']}"), names
+
+
+def _line(name: str, entry: Mapping[str, Any]) -> str:
+    scale = engineering(entry["unit"], abs(entry["mean"]))
+    if entry["interval"] is None:
+        mean = f"{scale.factor * entry['mean']:.4g}"
+        return f"  {name:32}{mean:>10}{scale.unit:>10}   shared with {entry['shared_with']}"
+    sd = scale.factor * entry["sd"]
+    mean, low, high = (
+        format_number(scale.factor * value, sd) for value in (entry["mean"], *entry["interval"])
+    )
+    return f"  {name:32}{mean:>10}{sd:>10.2g}   {low} … {high} {scale.unit}".rstrip()

@@ -1,0 +1,335 @@
+"""The log posterior density of many parameter vectors at once.
+
+Residuals of a problem at one vector, and what they tell of its unknowns under an error model.
+
+The log posterior density of many vectors at once, over coordinates without bounds.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo import _schema as schema
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array, Float
+from bayesoleo.error_models._base import ErrorModel
+from bayesoleo.error_models._registry import error_model
+from bayesoleo.errors import InputError
+from bayesoleo.estimation._problem import EstimationProblem, Misfit, ResidualProblem, jumps_of
+from bayesoleo.model._priors import Transforms
+from bayesoleo.posterior._unknowns import PlainUnknowns, Unknowns
+from bayesoleo.solvers._orbit import Status
+
+
+def residuals_at(problem: EstimationProblem, errors: ErrorModel, theta: Array) -> list[Array]:
+    """Residuals (s, n) of every run; where sums are enough, columns of equal squares.
+
+    Raises
+    ------
+    InputError
+        If they cannot be computed.
+    """
+    parts, status = [], Status.CONVERGED
+    if errors.by_sums:
+        misfit = problem.misfit(theta[None])
+        status = Status(int(misfit.status[0]))
+        if status.ok:
+            counts = np.asarray(problem.counts)
+            sizes = np.sqrt(misfit.sum_of_squares[0] / counts)
+            for row, n in zip(sizes, counts, strict=True):
+                parts.append(np.repeat(row[:, None], n[0], axis=1))
+    else:
+        for run in range(len(problem.runs)):
+            residual, found = cast(ResidualProblem, problem).residuals(theta[None], run)
+            status = max(status, Status(int(found[0])))
+            parts.append(residual[0])
+    if not status.ok:
+        raise InputError(f"a start cannot be evaluated: {status.message}", value=theta.tolist())
+    return parts
+
+
+def information_at(
+    problem: EstimationProblem, errors: ErrorModel, theta: Array, eta: Array
+) -> Array:
+    """``sum J' V^-1 J`` over runs and outputs, shape (l, l); zero where it cannot be computed.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        Its ``evaluate`` is called once.
+    errors : ErrorModel
+        Gives ``V``.
+    theta : ndarray, shape (l,)
+        Unknowns in their units.
+    eta : ndarray, shape (m,)
+        Coordinates of the error model.
+
+    References
+    ----------
+    Verbeek (1993), eq. 3.19: ``A``.
+    """
+    total = np.zeros((len(theta), len(theta)))
+    evaluation = problem.evaluate(theta)
+    if not evaluation.status.ok:
+        return total
+    counts = np.asarray(problem.counts)
+    ends = np.cumsum(counts, axis=0)
+    for run, (first, last) in enumerate(zip(ends - counts, ends, strict=True)):
+        columns = zip(evaluation.sensitivity, first, last, strict=True)
+        total += errors.products(run, [j[a:b].T for j, a, b in columns], eta)
+    return total
+
+
+#: Prefix of the names of the error variances' coordinates.
+LOG_VARIANCE = schema.log_variance("")
+#: Parameter vectors whose residuals are held at once: what they take stays in the cache.
+LANES = 8
+
+
+class Density(Protocol):
+    """What the sampler needs to know of a log density over ``d`` coordinates."""
+
+    evaluations: int
+    failures: Counter[str]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the ``d`` coordinates' quantities."""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Labels of the ``N`` parts of the log-likelihood."""
+
+    def natural(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
+        """Quantities in natural units, shape (W, d), from coordinates, shape (W, d)."""
+
+    def __call__(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> tuple[Float[Array, " walkers"], Float[Array, "walkers runs"]]:
+        """Log density, shape (W,), and log-likelihood by run, shape (W, N)."""
+
+
+class LogDensity:
+    """Log posterior of ``phi = (unknowns in coordinates without bounds, those of the errors)``.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        What is fitted: ``l`` unknowns, ``N`` runs, ``s`` outputs.
+    jobs : int, optional
+        Threads over which the rows are spread. By default the problem's ``misfit`` is called once
+        for all rows and spreads its own work. The result does not depend on it.
+    errors : ErrorModel or str, optional
+        What the errors have in common, ``m`` quantities; see
+        :mod:`bayesoleo.error_models`. By default one variance for each output.
+    unknowns : Unknowns, optional
+        How the problem's unknowns follow from ``p`` coordinates, and their prior; by default each
+        is one, with the problem's prior. See :mod:`bayesoleo.posterior._hierarchy`.
+
+    Attributes
+    ----------
+    evaluations : int
+        Rows evaluated so far.
+    failures : collections.Counter
+        Rows of density zero so far, by the lower-case name of their
+        :class:`~bayesoleo.solvers._orbit.Status`.
+
+    Raises
+    ------
+    InputError
+        If the error model does not suit the problem, or two quantities have one name.
+
+    Notes
+    -----
+    Each row's value depends on that row alone, bit for bit.
+
+    References
+    ----------
+    Verbeek (1993), eq. 2.29.
+    """
+
+    def __init__(
+        self,
+        problem: EstimationProblem,
+        jobs: int | None = None,
+        *,
+        errors: ErrorModel | str = "independent",
+        unknowns: Unknowns | None = None,
+    ) -> None:
+        self.problem, self.jobs = problem, jobs
+        self.errors = error_model(errors, problem) if isinstance(errors, str) else errors
+        self.unknowns = unknowns or PlainUnknowns(tuple(problem.names), tuple(problem.priors))
+        self.transforms = Transforms.of(problem.priors)
+        self.evaluations = 0
+        self.failures: Counter[str] = Counter()
+        self._size = len(self.unknowns.names)
+        for name in self.unknowns.names:
+            if schema.of_errors(name) or name in self.errors.names:
+                raise InputError(
+                    "a parameter has the name of an error model's quantity",
+                    key=name,
+                    hint="give it another name in the model",
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the ``p + m`` quantities: the unknowns', then the error model's."""
+        return (*self.unknowns.names, *self.errors.names)
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Labels of the ``N`` runs."""
+        return self.problem.runs
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates, ``p + m``."""
+        return len(self.names)
+
+    def split(self, phi: Array) -> tuple[Array, Array]:
+        """Coordinates of the unknowns, (W, p), and of the errors, (W, m)."""
+        return (
+            np.ascontiguousarray(phi[:, : self._size]),
+            np.ascontiguousarray(phi[:, self._size :]),
+        )
+
+    @property
+    def branch_jumps(self) -> int:
+        """Solutions of runs so far that left the branch of the one they started from."""
+        return int(jumps_of(self.problem).sum())
+
+    def natural(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
+        """All quantities in their units, from coordinates, both of shape (W, p + m)."""
+        block, eta = self.split(np.asarray(phi, dtype=float))
+        return np.concatenate([self.unknowns.natural(block), self.errors.natural(eta)], axis=1)
+
+    def coordinates(
+        self, natural: Float[Array, "walkers quantities"]
+    ) -> Float[Array, "walkers quantities"]:
+        """Coordinates of quantities in their units, both of shape (W, p + m)."""
+        block, eta = self.split(np.asarray(natural, dtype=float))
+        return np.concatenate(
+            [self.unknowns.coordinates(block), self.errors.coordinates(eta)], axis=1
+        )
+
+    def __call__(
+        self, phi: Float[Array, "walkers quantities"]
+    ) -> tuple[Float[Array, " walkers"], Float[Array, "walkers runs"]]:
+        """Evaluate all rows.
+
+        Parameters
+        ----------
+        phi : ndarray, shape (W, p + m)
+            Coordinates.
+
+        Returns
+        -------
+        log_density : ndarray, shape (W,)
+            Log-likelihood + log prior + log Jacobian; minus infinity where it cannot be evaluated,
+            never NaN.
+        by_run : ndarray, shape (W, N)
+            Normalised log-likelihood of every run; minus infinity likewise.
+        """
+        phi = np.ascontiguousarray(phi, dtype=float)
+        block, eta = self.split(phi)
+        prior = self.log_prior(phi)
+        status = np.full(len(phi), int(Status.CONVERGED))
+        status[~np.isfinite(prior)] = Status.OUT_OF_BOUNDS
+        status[~np.all(np.isfinite(phi), axis=1)] = Status.NOT_FINITE
+
+        by_run = np.full((len(phi), len(self.runs)), -np.inf)
+        inside = np.flatnonzero(status == Status.CONVERGED)
+        if inside.size:
+            theta = self.unknowns.theta(block[inside])
+            # Infinite or overflowing terms are told apart below by their status.
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                likelihood = self._of_sums if self.errors.by_sums else self._of_residuals
+                by_run[inside], status[inside] = likelihood(theta, eta[inside])
+        total = prior.copy()
+        with np.errstate(invalid="ignore"):
+            for run in by_run.T:
+                total += run
+        return self._mark_failures(total, by_run, status)
+
+    def dispersed(self, rng: np.random.Generator, count: int) -> Float[Array, "count coordinates"]:
+        """Draws of the unknowns' prior as coordinates, shape (count, p)."""
+        return self.unknowns.coordinates(self.unknowns.sample_prior(rng, count))
+
+    def log_prior(self, phi: Float[Array, "walkers quantities"]) -> Float[Array, " walkers"]:
+        """Log prior density of the coordinates, shape (W,), Jacobian included."""
+        block, eta = self.split(phi)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            return self.unknowns.log_prior(block) + self.errors.log_prior(eta)
+
+    def _of_sums(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        misfit = self._misfit(theta)
+        return self.errors.of_sums(misfit.sum_of_squares, eta), misfit.status
+
+    def _misfit(self, theta: Array) -> Misfit:
+        if self.jobs is None or self.jobs <= 1 or len(theta) < 2:
+            return self.problem.misfit(theta)
+        chunks = np.array_split(theta, min(self.jobs, len(theta)))
+        parts = thread_map(self.problem.misfit, chunks, self.jobs)
+        return Misfit(
+            np.concatenate([part.sum_of_squares for part in parts]),
+            np.concatenate([part.status for part in parts]),
+        )
+
+    def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Log-likelihood by run (W, N) and statuses (W,), in blocks of runs and rows."""
+        if self.errors.over_runs:
+            return self._of_all_residuals(theta, eta)
+        problem, count = cast(ResidualProblem, self.problem), len(theta)
+        by_run = np.full((count, len(self.runs)), np.nan)
+        status = np.zeros(by_run.shape, dtype=np.int64)
+        blocks = [
+            (run, slice(k, min(k + LANES, count)))
+            for run in range(len(self.runs))
+            for k in range(0, count, LANES)
+        ]
+
+        def work(task: tuple[int, slice]) -> None:
+            run, rows = task
+            residual, status[rows, run] = problem.residuals(theta[rows], run)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                by_run[rows, run] = self.errors.of_run(run, residual, eta[rows])
+
+        thread_map(work, blocks, self.jobs)
+        return by_run, status.max(axis=1)
+
+    def _of_all_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+        """The same where runs have errors in common, in blocks of rows."""
+        problem, count = cast(ResidualProblem, self.problem), len(theta)
+        by_run = np.full((count, len(self.runs)), np.nan)
+        status = np.zeros(by_run.shape, dtype=np.int64)
+
+        def work(rows: slice) -> None:
+            found = []
+            for run in range(len(self.runs)):
+                residual, status[rows, run] = problem.residuals(theta[rows], run)
+                found.append(residual)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                by_run[rows] = self.errors.of_runs(found, eta[rows])
+
+        thread_map(
+            work, [slice(k, min(k + LANES, count)) for k in range(0, count, LANES)], self.jobs
+        )
+        return by_run, status.max(axis=1)
+
+    def _mark_failures(
+        self, total: Array, by_run: Array, status: NDArray[np.int64]
+    ) -> tuple[Array, Array]:
+        status[(status == Status.CONVERGED) & ~np.isfinite(total)] = Status.NOT_FINITE
+        failed = status != Status.CONVERGED
+        total[failed], by_run[failed] = -np.inf, -np.inf
+        self.evaluations += len(total)
+        self.failures.update(Status(value).name.lower() for value in status[failed])
+        return total, by_run

@@ -1,0 +1,427 @@
+"""The sampler: adaptation, stopping rule and result.
+
+When to adapt, how long to keep, and whether that was enough.
+
+Sample a posterior until it is known well enough.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from bayesoleo._dask import connected
+from bayesoleo._types import Array
+from bayesoleo.errors import InputError
+from bayesoleo.posterior._checkpoints import Segment, Store, open_store
+from bayesoleo.posterior._diagnostics import (
+    Samples,
+    autocorrelation_time,
+    effective_size as effective_size_of,
+    nested_rhat,
+    rhat_limit,
+)
+from bayesoleo.posterior._ensembles import (
+    DistributedDensity,
+    Ensembles,
+    MoveWeights,
+    default_walkers,
+)
+from bayesoleo.posterior._log_density import Density
+from bayesoleo.posterior._mixture import Mixture
+from bayesoleo.posterior._mode_search import with_other_modes
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When to adapt, how long to keep, when to stop.
+
+    Parameters
+    ----------
+    effective_size : float
+        Effective draws asked for, of every quantity.
+    max_evaluations : int
+        No segment begins that would take more rows of the log density than this.
+    warm_up : int
+        Draws of the first warm-up round; each later one has twice as many.
+    most_rounds : int
+        Warm-up rounds at most.
+    least : int
+        Kept draws of each walker before anything is decided.
+    times : float
+        Kept draws in autocorrelation times before the estimates are believed.
+    segment : int
+        Draws of the longest segment: what a kill can cost.
+    """
+
+    effective_size: float
+    max_evaluations: int
+    warm_up: int
+    most_rounds: int
+    least: int
+    times: float
+    segment: int
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Diagnostics of the draws kept so far.
+
+    Parameters
+    ----------
+    times, sizes, rhat : ndarray, shape (d,)
+        Autocorrelation time, effective size, nested R-hat.
+    draws : int
+        Kept draws of each walker.
+    """
+
+    times: Array
+    sizes: Array
+    rhat: Array
+    draws: int
+
+    def shortfalls(self, schedule: Schedule, ensembles: int) -> list[str]:
+        """What is not yet good enough, in words; empty if everything is."""
+        if not np.all(np.isfinite(self.times)):
+            return ["a quantity never moved"]
+        short = []
+        if self.sizes.min() < schedule.effective_size:
+            short.append(
+                f"the effective size is {self.sizes.min():.0f}"
+                f" of {schedule.effective_size:.0f} asked for"
+            )
+        if self.draws < schedule.times * self.times.max():
+            short.append(
+                f"{self.draws} draws are fewer than {schedule.times:.0f}"
+                f" autocorrelation times of {self.times.max():.1f}"
+            )
+        limit = rhat_limit(ensembles, schedule.effective_size)
+        if self.rhat.max() > limit:
+            short.append(
+                f"the ensembles disagree: nested R-hat {self.rhat.max():.3f} above {limit:.3f}"
+            )
+        return short
+
+
+#: Points from which other modes are looked for, and for a first look.
+CLIMBS, QUICK_CLIMBS = 32, 16
+#: Part of the evaluations allowed that this may take.
+SEARCHING = 0.25
+#: Evaluations of the log density at which a first look ends, good or not, but not before so many
+#: steps of each walker: minutes, where a motion takes milliseconds.
+QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+
+
+def sample(
+    log_density: Density,
+    start: Mixture,
+    *,
+    effective_size: float = 1000,
+    ensembles: int = 4,
+    walkers: int | None = None,
+    seed: int,
+    out: Path | str | None = None,
+    fingerprint: str = "",
+    progress: bool | float = True,
+    max_evaluations: int = 2_000_000,
+    weights: MoveWeights | None = None,
+    segment: int = 100,
+    quick: bool = False,
+    climbs: int | None = None,
+    scheduler: str | None = None,
+) -> Samples:
+    """Draw from a density until every quantity has the effective size asked for.
+
+    Parameters
+    ----------
+    log_density : Density
+        Over ``d`` coordinates without bounds, usually a
+        :class:`~bayesoleo.posterior.LogDensity`.
+    start : Mixture
+        Laplace approximations at the modes; walkers start there and the independence move proposes
+        from it.
+    effective_size : float
+        Effective draws of every quantity to stop at, by the smaller of two estimates.
+    ensembles : int
+        Independent ensembles; nested R-hat compares them.
+    walkers : int, optional
+        Walkers of each; by default chosen from ``d``.
+    seed : int
+        Everything random follows from it; the draws do not depend on threads.
+    out : path-like, optional
+        Folder of checkpoints. A run that was killed continues there to the same draws; one that is
+        complete is read.
+    fingerprint : str
+        Hash of what the density depends on (data, model, priors); a folder with another one is
+        refused.
+    progress : bool or float
+        Whether to show a bar of the effective size, at once or after so many seconds.
+    max_evaluations : int
+        Rows of the log density to stop at.
+    weights : MoveWeights, optional
+        How often each kind of move is chosen; by default the warm-up's acceptance decides.
+    segment : int
+        Draws of the longest checkpointed segment.
+    quick : bool
+        Shorter warm-up, an effective size of at most 200 and not more than
+        :data:`QUICK_EVALUATIONS`, for a first look.
+    climbs : int, optional
+        Points from which modes are looked for that the start does not have
+        (:mod:`~bayesoleo.posterior._mode_search`), by default :data:`CLIMBS`, or
+        :data:`QUICK_CLIMBS`; none where zero. Without them, walkers that all start in one mode
+        reach their effective size there, whatever else there is.
+    scheduler : str, optional
+        Other processes or machines that evaluate the density: ``local:4``, or the address of a Dask
+        scheduler; see :func:`bayesoleo._dask.connected`. The draws are the same.
+
+    Returns
+    -------
+    Samples
+        With ``reached`` False and a ``warning`` if it stopped at ``max_evaluations``.
+
+    Raises
+    ------
+    InputError
+        If walkers are too few, or none finds a finite log density.
+    ResultsError
+        If the folder holds another run or another process writes there.
+
+    References
+    ----------
+    Foreman-Mackey et al. (2013), "emcee: the MCMC hammer", *PASP* 125. Margossian et al. (2024) for
+    the stopping rule.
+    """
+    dimension = len(log_density.names)
+    if start.dimension != dimension:
+        raise InputError(
+            "the start's mixture has another dimension than the log density",
+            value=(start.dimension, dimension),
+        )
+    if not effective_size > 0:
+        raise InputError(
+            "the effective size must be positive", key="effective_size", value=effective_size
+        )
+    group = Ensembles(
+        log_density, ensembles, walkers or default_walkers(dimension), weights or MoveWeights()
+    )
+    if quick:
+        max_evaluations = min(max_evaluations, max(QUICK_EVALUATIONS, QUICK_STEPS * group.chains))
+    schedule = _schedule(effective_size, max_evaluations, segment, quick)
+    number = (QUICK_CLIMBS if quick else CLIMBS) if climbs is None else climbs
+    print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
+    place = None if out is None else Path(out)
+    with open_store(place, print_of_run) as store, connected(scheduler) as client:
+        if client is not None:
+            group = replace(group, log_density=DistributedDensity(log_density, client))
+        bar = _Bar(schedule.effective_size, progress)
+        try:
+            if not store.segments:
+                store.append(_first(group, start, seed, number, schedule))
+            _warm_up(store, group, schedule, bar)
+            if weights is None:
+                group = replace(group, weights=_tuned(store.segments))
+            quality, short = _keep(store, group, schedule, bar)
+        finally:
+            bar.close()
+        return _samples(store.segments, group, quality, short)
+
+
+def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
+    if quick:
+        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 25, 10.0, segment)
+    return Schedule(effective_size, evaluations, 20, 6, 50, 20.0, segment)
+
+
+def _fingerprint(
+    given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule, climbs: int
+) -> str:
+    """Hash of all that the draws follow from; a larger effective size only continues them."""
+    digest = hashlib.sha256()
+    settings = [
+        given,
+        group.log_density.names,
+        group.log_density.runs,
+        group.ensembles,
+        group.walkers,
+        astuple(group.weights),
+        seed,
+        schedule.warm_up,
+        schedule.most_rounds,
+        np.asarray(start.degrees).tolist(),
+        climbs,
+    ]
+    digest.update(json.dumps(settings).encode())
+    for array in (start.centres, start.covariances, start.log_weights):
+        # Rounded: the mode found again on another machine differs in the last bits, and segments
+        # hold what was used.
+        digest.update(np.array2string(array, precision=6, threshold=array.size + 1).encode())
+    return digest.hexdigest()
+
+
+def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: Schedule) -> Segment:
+    """Walkers drawn from the start and from modes found beside it."""
+    spent = 0
+    # A climb takes some twenty rows and as many as there are coordinates, a dozen times.
+    climbs = min(climbs, int(SEARCHING * schedule.max_evaluations / (12 * (20 + start.dimension))))
+    if climbs > 0:
+        # A generator of its own: where nothing is found the draws are what they are without.
+        rng = np.random.default_rng([seed, climbs])
+        start, spent = with_other_modes(group.log_density, start, climbs, rng)
+    first = group.start(start, seed)
+    return replace(first, evaluations=first.evaluations + spent)
+
+
+def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar) -> None:
+    """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau."""
+    while not _is_warm(store.segments, schedule):
+        rounds = sum(s.phase == "warm-up" for s in store.segments)
+        steps = schedule.warm_up * 2**rounds
+        bar.show("warm-up", 0.0, store.segments)
+        store.append(group.advance(store.segments[-1], steps, "warm-up"))
+
+
+def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
+    rounds = [s for s in segments if s.phase == "warm-up"]
+    if any(s.phase == "kept" for s in segments) or len(rounds) >= schedule.most_rounds:
+        return True
+    spent = sum(s.evaluations for s in segments)
+    following = schedule.warm_up * 2 ** len(rounds) * segments[0].coords.shape[1]
+    if spent + following > schedule.max_evaluations / 2:  # leave half for draws that are kept
+        return True
+    if len(rounds) < 2:
+        return False
+    # Nearly all proposals that forget where a walker was are taken: so it did, and none is left in
+    # a tail that the mixture misses.
+    if _independence(rounds[-1]) > 0.8:
+        return True
+    times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
+    return bool(np.all(rounds[-1].draws >= 10 * times))
+
+
+def _tuned(segments: list[Segment]) -> MoveWeights:
+    """From the last round of the warm-up: fixed before draws are kept, the same after a restart."""
+    rounds = [s for s in segments if s.phase == "warm-up"]
+    return MoveWeights.tuned(_independence(rounds[-1])) if rounds else MoveWeights()
+
+
+def _independence(segment: Segment) -> float:
+    """Acceptance of the independence move."""
+    return segment.accepted["independence"] / max(segment.proposed["independence"], 1)
+
+
+def _keep(
+    store: Store, group: Ensembles, schedule: Schedule, bar: _Bar
+) -> tuple[Quality, list[str]]:
+    """Add segments until the draws are good enough or the evaluations are spent."""
+    while True:
+        kept = [s for s in store.segments if s.phase == "kept"]
+        done = sum(s.draws for s in kept)
+        if done in _decisions(schedule.least, done):
+            quality = _quality(kept, group)
+            short = quality.shortfalls(schedule, group.ensembles)
+            bar.show("sampling", float(quality.sizes.min()), store.segments)
+            if not short:
+                return quality, []
+        steps = min(_decisions(schedule.least, done)[-1] - done, schedule.segment)
+        spent = sum(s.evaluations for s in store.segments)
+        if spent + steps * group.chains > schedule.max_evaluations:
+            return _stopped(kept, group, schedule)
+        store.append(group.advance(store.segments[-1], steps, "kept"))
+
+
+def _decisions(least: int, done: int) -> list[int]:
+    """Numbers of draws at which it is decided whether to stop, up to the first after those done.
+
+    They grow by a fifth and depend on nothing else, so that a run that was interrupted stops at
+    the same draw; and the diagnostics, whose cost grows with the draws, are computed rarely.
+    """
+    numbers = [least]
+    while numbers[-1] <= done:
+        numbers.append(int(np.ceil(1.2 * numbers[-1])))
+    return numbers
+
+
+def _stopped(
+    kept: list[Segment], group: Ensembles, schedule: Schedule
+) -> tuple[Quality, list[str]]:
+    if sum(s.draws for s in kept) < 4:  # what splitting chains in halves needs
+        raise InputError(
+            "no draw could be kept within so many evaluations",
+            key="max_evaluations",
+            value=schedule.max_evaluations,
+            hint=f"allow at least {4 * schedule.least * group.chains}",
+        )
+    quality = _quality(kept, group)
+    short = quality.shortfalls(schedule, group.ensembles)
+    return quality, [f"stopped before {schedule.max_evaluations} evaluations", *short]
+
+
+def _quality(kept: list[Segment], group: Ensembles) -> Quality:
+    draws = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
+    ensemble = np.repeat(np.arange(group.ensembles), group.walkers)
+    return Quality(
+        autocorrelation_time(draws),
+        effective_size_of(draws),
+        nested_rhat(draws, ensemble),
+        draws.shape[1],
+    )
+
+
+def _samples(
+    segments: list[Segment], group: Ensembles, quality: Quality, short: list[str]
+) -> Samples:
+    kept = [s for s in segments if s.phase == "kept"]
+    coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
+    chains, draws, dimension = coords.shape
+    natural = group.log_density.natural(coords.reshape(-1, dimension))
+    proposed = sum((s.proposed for s in kept), start=Counter[str]())
+    accepted = sum((s.accepted for s in kept), start=Counter[str]())
+    acceptance = {name: accepted[name] / n for name, n in proposed.items() if n}
+    acceptance["all"] = accepted.total() / proposed.total()
+    return Samples(
+        names=group.log_density.names,
+        runs=group.log_density.runs,
+        draws=natural.reshape(chains, draws, dimension),
+        log_density=np.concatenate([s.log_density for s in kept]).T,
+        log_likelihood=np.concatenate([s.by_run for s in kept]).swapaxes(0, 1),
+        ensemble=np.repeat(np.arange(group.ensembles), group.walkers),
+        start=group.log_density.natural(segments[0].coords[0]),
+        mixture=kept[-1].mixture,
+        autocorrelation_time=quality.times,
+        effective_size=quality.sizes,
+        rhat_nested=quality.rhat,
+        acceptance=acceptance,
+        evaluations=sum(s.evaluations for s in segments),
+        failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
+        branch_jumps=sum(s.branch_jumps for s in segments),
+        failed=np.concatenate([s.failed for s in kept]),
+        reached=not short,
+        warning="; ".join(short),
+    )
+
+
+class _Bar:
+    """Progress towards the effective size."""
+
+    def __init__(self, total: float, shown: bool | float) -> None:
+        self._delay = 0.0 if shown is True else shown
+        self._bar = tqdm(
+            total=round(total), disable=not shown, unit=" effective draws", delay=self._delay
+        )
+        self._bar.set_description("warm-up", refresh=False)
+
+    def show(self, phase: str, size: float, segments: list[Segment]) -> None:
+        self._bar.set_description(phase, refresh=False)
+        self._bar.set_postfix(evaluations=sum(s.evaluations for s in segments), refresh=False)
+        self._bar.n = min(round(size), self._bar.total)
+        if self._bar.format_dict["elapsed"] >= self._delay:
+            self._bar.refresh()
+
+    def close(self) -> None:
+        self._bar.close()

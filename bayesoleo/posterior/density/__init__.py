@@ -1,1 +1,0 @@
-"""The log posterior density: errors, unknowns and priors over coordinates without bounds."""

@@ -1,1 +1,0 @@
-"""What samples say: trees, predictions, the point estimate beside them, calibration."""

@@ -1,1 +1,0 @@
-"""Ensembles of walkers: moves, segments that survive a kill, and when to stop."""

@@ -1,0 +1,225 @@
+"""Inputs of a run and their exact derivatives, as solvers and integrators take them.
+
+Rows of inputs and their exact derivatives, at any phase of a record.
+
+A model under the inputs of one run, as integrators take it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.errors import CampaignError, ModelError
+from bayesoleo.model._derivatives import analytic_pieces
+from bayesoleo.model._expressions import COSINE, SINE, WITHIN
+from bayesoleo.model._kernels import kernels
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._records import Harmonics, Record, Signal
+from bayesoleo.solvers._initial_value import Dynamics
+from bayesoleo.solvers._switching import InputSignal, periodic_signal
+
+
+def harmonics_of(record: Record, channel: str) -> Harmonics:
+    """A channel's periodic representation.
+
+    Raises
+    ------
+    CampaignError
+        If the record lacks the channel.
+    """
+    if channel not in record.harmonics:
+        restricted = _restricted(record, channel)
+        if isinstance(restricted, Harmonics):
+            return restricted
+        raise CampaignError(
+            f"the model needs channel {channel!r}",
+            run=record.label,
+            hint=f"channels there are: {', '.join(record.harmonics) or 'none'}",
+        )
+    return record.harmonics[channel]
+
+
+def signal_of(record: Record, channel: str, highest: int = 0) -> Signal:
+    """What a channel is as an input, periodic or not.
+
+    Parameters
+    ----------
+    record : Record
+        A run.
+    channel : str
+        Of it.
+    highest : int
+        The highest derivative that is taken of the channel: noise grows with it, so that less of
+        what is near the noise may stay.
+
+    Raises
+    ------
+    CampaignError
+        If the record lacks the channel.
+    """
+    if channel not in record.signals:
+        restricted = _restricted(record, channel)
+        if restricted is not None:
+            return restricted.for_derivative(highest)
+        raise CampaignError(
+            f"the model needs channel {channel!r}",
+            run=record.label,
+            hint=f"channels there are: {', '.join(record.signals) or 'none'}",
+        )
+    return record.signals[channel].for_derivative(highest)
+
+
+def highest_derivatives(rows: tuple[tuple[str, int], ...]) -> dict[str, int]:
+    """The highest derivative that is taken of each channel of some rows."""
+    highest: dict[str, int] = {}
+    for channel, derivative in rows:
+        highest[channel] = max(derivative, highest.get(channel, 0))
+    return highest
+
+
+def _restricted(record: Record, name: str) -> Signal | None:
+    """One channel at the harmonics of another, as :func:`~bayesoleo.model._expressions.within`
+    names it; of a transient, the channel itself."""
+    channel, _, other = name.partition(WITHIN)
+    if channel in (COSINE, SINE) and other in record.harmonics:
+        return _turning(record.harmonics[other], channel)
+    if channel not in record.signals or other not in record.signals:
+        return None
+    if not record.periodic:
+        return record.signals[channel]
+    item = record.harmonics[channel]
+    like = record.harmonics[other]
+    kept = np.isin(item.orders, like.orders)
+    return replace(
+        item,
+        limits=like.limits,
+        orders=item.orders[kept],
+        coefficients=item.coefficients[kept],
+        variances=item.variances[kept],
+    )
+
+
+def _turning(item: Harmonics, part: str) -> Harmonics | None:
+    """The first harmonic with unit amplitude, or a quarter of a turn behind it."""
+    first = np.flatnonzero(item.orders == 1)
+    if first.size == 0 or item.coefficients[first[0]] == 0:
+        return None
+    c, variance = item.coefficients[first], item.variances[first]
+    quarter = 1.0 if part == COSINE else -1j
+    size = np.abs(c)
+    return Harmonics(item.orders[first], quarter * c / size, variance / size**2)
+
+
+#: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
+#: of the same run share them.
+RowCache = dict[tuple[str, str, int, int], Array]
+
+
+def input_rows(
+    record: Record,
+    rows: tuple[tuple[str, int], ...],
+    phase: Array,
+    grid: str = "",
+    cache: RowCache | None = None,
+) -> Array:
+    """Values of input rows ``(channel, derivative)``, shape (nu, N).
+
+    Parameters
+    ----------
+    record : Record
+        A run.
+    rows : tuple of (str, int)
+        As in ``Derived``; the channel ``time`` gives seconds since the
+        first sample.
+    phase : ndarray, shape (N,)
+        Cycles since the first sample; of a transient, parts of its length.
+    grid : str
+        Names ``phase`` in the cache.
+    cache : dict, optional
+        Taken from and added to.
+    """
+    known = {} if cache is None else cache
+    highest = highest_derivatives(rows)
+    table = np.empty((len(rows), phase.size))
+    for k, (channel, derivative) in enumerate(rows):
+        if channel == "time":
+            table[k] = phase / record.rate
+        else:
+            key = (grid, channel, derivative, highest[channel])
+            if key not in known:
+                item = signal_of(record, channel, highest[channel])
+                known[key] = item.evaluate(phase, record.rate, derivative)
+            table[k] = known[key]
+    return table
+
+
+def dynamics_of(
+    model: Model, record: Record, active: Sequence[str] | None = None, backend: str = "numba"
+) -> Dynamics:
+    """The equations of a periodic run in analytic pieces, with its harmonics as inputs.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    record : Record
+        A periodic run; its first sample is time zero.
+    active : sequence of str, optional
+        Parameters to differentiate by; by default those that are estimated.
+    backend : {"numba", "numpy"}
+        Of the kernels; NumPy's are called back from compiled code at every step, which is slow.
+
+    Returns
+    -------
+    Dynamics
+        Its constants ``p`` are the model's parameters and conditions in the model's order.
+
+    Raises
+    ------
+    ModelError
+        If there is nothing to integrate, or an output needs higher derivatives of a dof than the
+        equations.
+    """
+    pieces = analytic_pieces(model)
+    derived = kernels(pieces.model, active, backend).derived
+    if not model.dofs:
+        raise ModelError(f"model {model.name!r} has no dof", hint="evaluate its outputs instead")
+    for dof, order in zip(derived.dofs, derived.orders, strict=True):
+        if order != model.order(dof):
+            raise ModelError(
+                f"model {model.name!r}: an output needs a higher derivative of {dof!r} than its"
+                " equation",
+                hint="write the output in terms of what the equations contain, or use another "
+                "solver than shooting: collocation or adaptive",
+            )
+    return Dynamics(
+        kernels=kernels(pieces.model, active, backend),
+        orders=derived.orders,
+        signal=signal_of_rows(record, derived.inputs),
+        active=len(derived.active),
+        conditions=len(derived.admissible),
+        switches=pieces.switches,
+    )
+
+
+def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSignal:
+    """Fourier coefficients of input rows; the time itself, which no equation has, is left zero."""
+    used = {
+        name: harmonics_of(record, name).for_derivative(highest)
+        for name, highest in highest_derivatives(rows).items()
+        if name != "time"
+    }
+    count = 1 + max((int(item.orders.max(initial=0)) for item in used.values()), default=0)
+    table = np.zeros((len(rows), count), dtype=complex)
+    for row, (name, derivative) in zip(table, rows, strict=True):
+        if name == "time":
+            continue
+        item = used[name]
+        rates = (2j * np.pi * record.frequency * item.orders) ** derivative
+        row[item.orders] = np.where((item.orders == 0) & (derivative > 0), 0, rates)
+        row[item.orders] *= item.coefficients
+    return periodic_signal(record.frequency, table.real, -table.imag)

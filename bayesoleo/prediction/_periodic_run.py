@@ -1,0 +1,422 @@
+"""Prediction of one periodic run, with sensitivities.
+
+Predict one run: solve the model under its inputs, evaluate outputs at its raw samples.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
+from bayesoleo.errors import CampaignError, ModelError
+from bayesoleo.model._expressions import COSINE, SINE, TIME, WITHIN
+from bayesoleo.model._kernels import Kernels
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._anchors import PATH_PIECES, Anchor, solve_from_shot
+from bayesoleo.prediction._inputs import RowCache, input_rows
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._stability import unstable_of
+from bayesoleo.prediction._starts import KnownRows, Motion, guess_rows
+from bayesoleo.prediction._sum_of_squares import FusedSquares, squared_distances
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import (
+    Boundary,
+    Solution,
+    sensitivities,
+    solve_extrapolated,
+    solve_from_guess,
+    solve_periodic,
+)
+from bayesoleo.solvers._schemes import scheme
+
+#: Parameter vectors whose samples are evaluated together.
+CHUNK = 8
+#: Threads share a run.
+_COUNTING = threading.Lock()
+
+
+@dataclass(frozen=True)
+class PredictedSamples:
+    """Predicted outputs of one run.
+
+    Parameters
+    ----------
+    y : ndarray, shape (L, ny, N)
+        At the raw samples, SI; NaN where the solve failed.
+    y_p : ndarray, shape (L, ny, na, N), or None
+        Derivatives with respect to the active parameters.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+    jumped : ndarray of bool, shape (L,), or None
+        Whether a periodic solution left the branch of the anchor from which it was started, or
+        changed the number of its unstable multipliers; None where there is no such thing.
+    monodromy : ndarray, shape (L, D, D), or None
+        Of the periodic solutions, where derivatives were asked for; its eigenvalues are the Floquet
+        multipliers.
+    """
+
+    y: Float[Array, "vectors outputs samples"]
+    y_p: Float[Array, "vectors outputs active samples"] | None
+    status: Int[Integers, " vectors"]
+    jumped: Bool[Flags, " vectors"] | None = None
+    monodromy: Float[Array, "vectors states states"] | None = None
+
+
+class RunPredictor:
+    """One run of one model; all arrays that do not depend on parameters are computed once.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    kernels : Kernels
+        Of that model.
+    record : Record
+        A periodic run.
+    steps : int
+        Steps of the mesh.
+    scheme_name : str
+        Discretisation.
+    known_rows : dict, optional
+        Input rows that another model of the same run has computed; this one adds to it.
+    """
+
+    _fused: tuple[Any, FusedSquares | None] | None = None
+
+    #: Solutions so far that left the branch of the anchor from which they were started, and whether
+    #: they are looked for: where a solution is known, it costs more than the solution.
+    jumps, watched = 0, True
+
+    def __init__(
+        self,
+        model: Model,
+        kernels: Kernels,
+        record: Record,
+        steps: int,
+        scheme_name: str,
+        known_rows: RowCache | None = None,
+    ):
+        self.model, self.kernels, self.record, self.steps = model, kernels, record, steps
+        derived = kernels.derived
+        self._check(record)
+        if any(expression.has(TIME) for expression in derived.residual):
+            raise ModelError(
+                f"model {model.name!r}: an equation depends on time, so that nothing periodic "
+                f"solves it, and run {record.label} is periodic",
+                hint="use time in outputs, or in equations of transients only",
+            )
+        self.scheme = scheme(scheme_name, derived.orders)
+        self.period = 1.0 / record.frequency
+        self.points = self.scheme.phases(steps)
+        self.known_rows: RowCache = {} if known_rows is None else known_rows
+        #: Channels' rows that guesses took so far, at nodes and at collocation points.
+        self._guessed: tuple[KnownRows, KnownRows] = ({}, {})
+        grid = f"{scheme_name} {steps}"
+        self.boundary = Boundary(
+            equations=kernels,
+            scheme=self.scheme,
+            period=self.period,
+            inputs=input_rows(record, derived.inputs, self.points, grid, self.known_rows),
+            conditions=len(derived.admissible),
+            active=len(derived.active),
+        )
+        self.plan = self.scheme.plan(record.phase, steps) if derived.dofs else None
+        self.sample_inputs = input_rows(
+            record, derived.inputs, record.phase, "samples", self.known_rows
+        )
+        self.measured = np.stack([record.samples[name] for name in derived.outputs])
+        self.anchor: Anchor | None = None
+        self.motions: dict[str, Motion] = {}
+        self.active = np.array(
+            [derived.constants.index(name) for name in derived.active], dtype=np.int64
+        )
+
+    def _check(self, record: Record) -> None:
+        # An input may be one measured channel at the harmonics of another.
+        needed = [part for name in self.model.inputs for part in name.split(WITHIN)]
+        known = {*record.samples, COSINE, SINE}
+        missing = [name for name in (*needed, *self.model.outputs) if name not in known]
+        if missing:
+            raise CampaignError(
+                f"model {self.model.name!r} needs channel {missing[0]!r}, which the campaign lacks",
+                run=record.label,
+                hint=f"channels there are: {', '.join(record.samples)}",
+            )
+        for name, condition in self.model.conditions.items():
+            if name not in record.conditions and condition.default is None:
+                raise CampaignError(
+                    f"model {self.model.name!r} needs condition {name!r}",
+                    run=record.label,
+                    hint=f'write {name} = {{ value = …, unit = "{condition.unit}" }} '
+                    "under [runs.conditions]",
+                )
+
+    def found(self) -> dict[str, Any]:
+        """What does not follow from model, record and mesh, to be given to :meth:`restore`."""
+        return {"anchor": self.anchor, "measured": self.measured}
+
+    def restore(self, found: dict[str, Any]) -> None:
+        """Take over what :meth:`found` gave of the same run, here or in another process."""
+        vars(self).update(found)
+
+    def base_constants(self) -> Array:
+        """Nominal parameters and this run's conditions, shape (np,)."""
+        values = []
+        for name in self.kernels.derived.constants:
+            if name in self.model.parameters:
+                values.append(self.model.parameters[name].value)
+            else:
+                default = self.model.conditions[name].default
+                values.append(
+                    self.record.conditions.get(name, np.nan if default is None else default)
+                )
+        return np.array(values)
+
+    def known_motions(self) -> dict[str, Motion]:
+        """The anchored motion of each dof, from which an extended model of the run can start."""
+        if self.anchor is None:
+            return {}
+        starts = np.cumsum([0, *(order + 1 for order in self.kernels.derived.orders)])
+        return {
+            dof: partial(self._rows_of, int(starts[k]), int(starts[k + 1]))
+            for k, dof in enumerate(self.kernels.derived.dofs)
+        }
+
+    def _rows_of(self, first: int, last: int, phase: Array) -> Array:
+        assert self.anchor is not None
+        return self.rows(self.anchor.x, phase)[first:last]
+
+    def rows(self, x: Array, phase: Array) -> Array:
+        """Values and derivatives of all dofs at phases ``(N,)`` in cycles, shape (nz, N), of
+        unknowns ``x (n, w)``; of their derivatives ``(n, w, na)``, shape (nz, na, N)."""
+        alone = x.ndim == 2
+        step = self.boundary.step(self.steps)
+        found = self.scheme.sample(x[None, :, :, None] if alone else x[None], self._at(phase), step)
+        return np.asarray(found[0, :, 0] if alone else found[0])
+
+    def _at(self, phase: Array) -> Any:
+        """Plan of the scheme for phases."""
+        return self.scheme.plan(phase, self.steps)
+
+    def guess(self, p: Array) -> Array:
+        """First guess of the unknowns, shape (1, n, w)."""
+        derived = self.kernels.derived
+        constants = dict(zip(derived.constants, p, strict=True))
+        nodes = np.arange(self.steps) / self.steps
+        at_nodes, at_points = (
+            guess_rows(self.model, derived, self.record, constants, phase, self.motions, known)
+            for phase, known in zip((nodes, self.points), self._guessed, strict=True)
+        )
+        return self.scheme.from_motion(at_nodes[None], at_points[None])
+
+    def set_anchor(self, p: Array) -> Status:
+        """Solve at constants ``p (np,)`` and keep the solution as the start of later ones."""
+        if not self.kernels.derived.dofs:
+            return Status.CONVERGED
+        solution = self._from_anchor(p[None]) if self.anchor is not None else None
+        if solution is None or solution.status[0] != Status.CONVERGED.value:
+            solution = self.solve_from_guess(p)
+        if solution.status[0] == Status.CONVERGED.value:
+            solution, x_p, monodromy = sensitivities(self.boundary, p[None], solution)
+            if solution.status[0] == Status.CONVERGED.value:
+                moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+                anchor = Anchor(p.copy(), solution.x[0], moved, monodromy[0])
+                self.anchor = anchor.after(self.anchor, self.boundary, self.active)
+                self.jumps += self.anchor.jumped
+        return Status(int(solution.status[0]))
+
+    def solve_from_guess(self, p: Array) -> Solution:
+        """Periodic solution at constants ``p (np,)`` without an anchor."""
+        guess = self.guess(p)
+        solution = solve_from_guess(self.boundary, p[None], guess)
+        if solution.status[0] != Status.NO_CONVERGENCE.value:
+            return solution
+        if self.anchor is not None:
+            guess = self.anchor.x[None]  # nearer, so that shooting takes fewer passes
+        found = solve_from_shot(self.model, self.kernels, self.record, self.boundary, p, guess)
+        return solution if found is None else found
+
+    def _from_anchor(self, p: Array) -> Solution:
+        anchor = self.anchor
+        assert anchor is not None
+        change = p[:, self.active] - anchor.p[self.active]
+        solution = solve_extrapolated(self.boundary, p, anchor.extrapolation, change)
+        for pieces in PATH_PIECES:
+            failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
+            for lane in failed:
+                solution = self._along_path(p, solution, int(lane), pieces)
+        return solution
+
+    def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:
+        """Walk from the anchor to one lane's parameters in equal pieces."""
+        anchor = self.anchor
+        assert anchor is not None
+        x = anchor.x[None]
+        for fraction in np.linspace(0.0, 1.0, pieces + 1)[1:]:
+            between = anchor.p + fraction * (p[lane] - anchor.p)
+            trial = solve_periodic(self.boundary, between[None], x, max_iterations=15)
+            if trial.status[0] != Status.CONVERGED.value:
+                return solution
+            x = trial.x
+        result, status = solution.x.copy(), solution.status.copy()
+        result[lane], status[lane] = x[0], Status.CONVERGED.value
+        return replace(solution, x=result, status=status)
+
+    def solve(self, p: Array) -> Solution:
+        """Periodic solutions for constants ``p (L, np)``; the anchor must be set."""
+        if self.anchor is None:
+            count = p.shape[0]
+            failed = np.full(count, Status.NO_CONVERGENCE.value, dtype=np.int64)
+            empty = np.zeros((count, self.steps, self.scheme.width))
+            return Solution(empty, failed, np.zeros(count, dtype=np.int64))
+        return self._from_anchor(p)
+
+    def predict(self, p: Array, *, derivatives: bool = False) -> PredictedSamples:
+        """Outputs at the raw samples for constants ``p (L, np)``."""
+        if not self.kernels.derived.dofs:
+            status = np.zeros(p.shape[0], dtype=np.int64)
+            return self._at_samples(p, None, None, status, derivatives)
+        solution = self.solve(p)
+        x_p: Array | None = None
+        monodromy: Array | None = None
+        if derivatives:
+            solution, x_p, monodromy = sensitivities(self.boundary, p, solution)
+        samples = self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+        jumped = self._left(p, solution.x, samples.status, monodromy)
+        return replace(samples, jumped=jumped, monodromy=monodromy)
+
+    def _left(
+        self, p: Array, x: Array, status: NDArray[np.int64], monodromy: Array | None = None
+    ) -> NDArray[np.bool_]:
+        """Whether solutions that converged left the anchor's branch, which is counted."""
+        anchor = self.anchor
+        if not self.watched or anchor is None or anchor.monodromy is None:  # of a transient
+            return np.zeros(p.shape[0], dtype=np.bool_)
+        good = status == Status.CONVERGED.value
+        left = anchor.left_by(p[:, self.active] - anchor.p[self.active], x) & good
+        for lane in np.flatnonzero(left):  # few: those that the prediction misses by far
+            left[lane] = not anchor.leads_to(p[lane], x[lane], self.boundary, self.active)
+        if monodromy is not None:
+            left |= good & (unstable_of(monodromy) != anchor.unstable)
+        if left.any():
+            with _COUNTING:
+                self.jumps += int(left.sum())
+        return cast(NDArray[np.bool_], left)
+
+    def evaluate(self, p: Array) -> PredictedSamples:
+        """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it.
+
+        One solve does for both, where :meth:`predict` would repeat it.
+        """
+        status = np.array([self.set_anchor(p)], dtype=np.int64)
+        if not self.kernels.derived.dofs:
+            return self._at_samples(p[None], None, None, status, derivatives=True)
+        if self.anchor is None or status[0] != Status.CONVERGED.value:
+            shape = (1, len(self.kernels.derived.outputs), len(self.active), self.record.time.size)
+            return PredictedSamples(
+                np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan), status
+            )
+        x_p = np.moveaxis(self.anchor.x_p, 0, 2)[None]
+        samples = self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
+        monodromy = None if self.anchor.monodromy is None else self.anchor.monodromy[None]
+        return replace(samples, jumped=np.array([self.anchor.jumped]), monodromy=monodromy)
+
+    def _at_samples(
+        self,
+        p: Array,
+        x: Array | None,
+        x_p: Array | None,
+        status: NDArray[np.int64],
+        derivatives: bool,
+    ) -> PredictedSamples:
+        """Outputs of solutions ``x (L, n, w)`` with their derivatives ``x_p (L, n, w, na)``."""
+        z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
+        z_p = self._rows_at_samples(x_p, p) if derivatives and x_p is not None else None
+        return self._outputs(p, z, z_p, status, derivatives)
+
+    def _outputs(
+        self,
+        p: Array,
+        z: Array,
+        z_p: Array | None,
+        status: NDArray[np.int64],
+        derivatives: bool,
+    ) -> PredictedSamples:
+        """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives of ``z_p``."""
+        derived, count = self.kernels.derived, p.shape[0]
+        samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        y = np.full((count, ny, samples), np.nan)
+        with np.errstate(all="ignore"):
+            self.kernels.output(z, self.sample_inputs, p, lanes, y)
+        status = self._judge(status, z, p, y, lanes)
+        if not derivatives:
+            return PredictedSamples(y, None, status)
+        yz, yp = np.zeros((count, ny, z.shape[1], samples)), np.zeros((count, ny, na, samples))
+        with np.errstate(all="ignore"):
+            self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
+        if z_p is not None:
+            yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
+        return PredictedSamples(y, yp, status)
+
+    def squares(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums
+        of failed lanes mean nothing.
+
+        The same as comparing :meth:`predict` with the measurement, but fused where there is
+        compiled code for it (:mod:`bayesoleo.prediction._sum_of_squares`).
+        """
+        fused = self._fused_squares()
+        if fused is None:
+            return self._squares_of_predictions(p)
+        solution = self.solve(p)
+        status = solution.status.copy()
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        step = self.boundary.step(self.steps)
+        sums, inside, defined = fused.sums(self.measured, solution.x, p, step, lanes)
+        finite = defined[lanes] & np.isfinite(sums[lanes]).all(axis=1)
+        status[lanes[~finite]] = Status.NOT_FINITE.value
+        status[lanes[~inside[lanes]]] = Status.INADMISSIBLE.value
+        self._left(p, solution.x, status)
+        return sums, status
+
+    def _fused_squares(self) -> FusedSquares | None:
+        """Of the present plan: a transient's changes with its mesh."""
+        if self._fused is None or self._fused[0] is not self.plan:
+            made = FusedSquares.of(self.kernels, self.scheme, self.plan, self.sample_inputs)
+            self._fused = (self.plan, made)
+        return self._fused[1]
+
+    def _squares_of_predictions(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Through predictions of a few vectors at a time."""
+        parts = [self.predict(p[first : first + CHUNK]) for first in range(0, len(p), CHUNK)]
+        squares = [squared_distances(self.measured, part.y) for part in parts]
+        return np.concatenate(squares), np.concatenate([part.status for part in parts])
+
+    def _rows_at_samples(self, x: Array | None, p: Array) -> Array:
+        """Values and derivatives of the dofs at the raw samples, shape (L, nz, C, N)."""
+        if x is None:
+            return np.empty((p.shape[0], 0, 1, self.record.time.size))
+        return self.scheme.sample(x, self.plan, self.boundary.step(self.steps))
+
+    def _judge(
+        self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
+        status = status.copy()
+        finite = np.isfinite(y[lanes]).all(axis=(1, 2))
+        status[lanes[~finite]] = Status.NOT_FINITE.value
+        if self.boundary.conditions:
+            a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
+            with np.errstate(all="ignore"):
+                self.kernels.admissible(z, self.sample_inputs, p, lanes, a)
+            status[lanes[np.isnan(a[lanes]).any(axis=(1, 2))]] = Status.NOT_FINITE.value
+            status[lanes[(a[lanes] <= 0).any(axis=(1, 2))]] = Status.INADMISSIBLE.value
+        y[status != Status.CONVERGED.value] = np.nan
+        return status

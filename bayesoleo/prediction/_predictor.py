@@ -1,0 +1,318 @@
+"""Prediction of all runs of a campaign, and where each unknown enters a model.
+
+Where the unknowns of an estimate go in a model: shared ones once, by-run ones once a run.
+
+Predict all runs of a campaign for one or many vectors of unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array, Float, Int, Integers
+from bayesoleo.errors import ModelError
+from bayesoleo.model._kernels import kernels
+from bayesoleo.model._model import Model
+from bayesoleo.model._priors import Prior
+from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
+from bayesoleo.prediction._periodic_solver import SolvedRun
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._transient_run import TransientRun
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Maps a vector of unknowns to each run's model parameters.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Unknowns: ``damping``, or ``offset[run]`` for a parameter that varies by run.
+    parameters : tuple of str
+        The model's parameter behind each unknown.
+    runs : tuple of str
+        Labels of the runs.
+    columns : ndarray of int, shape (N, na)
+        For each run, the unknown behind each active parameter.
+    active : tuple of str
+        Estimated parameters in the model's order.
+    """
+
+    names: tuple[str, ...]
+    parameters: tuple[str, ...]
+    runs: tuple[str, ...]
+    columns: NDArray[np.int64]
+    active: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: Model, runs: Sequence[str]) -> Layout:
+        """Layout of a model's estimated parameters over runs."""
+        names: list[str] = []
+        owners: list[str] = []
+        active = model.estimated()
+        columns = np.empty((len(runs), len(active)), dtype=np.int64)
+        for k, name in enumerate(active):
+            if model.parameters[name].by_run:
+                columns[:, k] = len(names) + np.arange(len(runs))
+                names += [f"{name}[{run}]" for run in runs]
+                owners += [name] * len(runs)
+            else:
+                columns[:, k] = len(names)
+                names.append(name)
+                owners.append(name)
+        return cls(tuple(names), tuple(owners), tuple(runs), columns, active)
+
+    def priors(self, model: Model) -> tuple[Prior, ...]:
+        """Prior of each unknown.
+
+        Raises
+        ------
+        ModelError
+            If an estimated parameter has none.
+        """
+        priors = []
+        for name in self.parameters:
+            prior = model.parameters[name].prior
+            if prior is None:
+                raise ModelError(
+                    f"model {model.name!r}: parameter {name!r} has no prior",
+                    hint="give it sd=…, relative_sd=…, bounds=(low, high) or prior=…, "
+                    "or write fixed=True",
+                )
+            priors.append(prior)
+        return tuple(priors)
+
+    def start(self, model: Model) -> Array:
+        """Nominal values of the unknowns, shape (l,)."""
+        return np.array([model.parameters[name].value for name in self.parameters])
+
+
+#: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
+BLOCK = 32
+
+
+@dataclass(frozen=True)
+class RunPrediction:
+    """Prediction of one run at one vector of unknowns.
+
+    Parameters
+    ----------
+    y : ndarray, shape (ny, N)
+        Outputs at the raw samples, SI.
+    sensitivity : ndarray, shape (ny, l, N)
+        Derivatives with respect to all unknowns.
+    status : Status
+    jumped : bool
+        Whether the periodic solution left the branch of the one it was started from.
+    monodromy : ndarray, shape (D, D), or None
+        Of the periodic solution; its eigenvalues are the Floquet multipliers.
+    """
+
+    y: Float[Array, "outputs samples"]
+    sensitivity: Float[Array, "outputs unknowns samples"]
+    status: Status
+    jumped: bool = False
+    monodromy: Float[Array, "states states"] | None = None
+
+
+class Predictor:
+    """A model over the runs of a campaign.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    records : sequence of Record
+        The runs.
+    steps : int
+        Steps of the mesh in a period; how finely the steps of transients are cut.
+    scheme : str
+        Discretisation, see :func:`bayesoleo.solvers._schemes.scheme`.
+    solver : str
+        Of periodic runs, see :func:`~bayesoleo.prediction._orbits.periodic_orbit`; a transient is
+        solved by collocation.
+    backend : {"numba", "numpy"}
+        Kernels; NumPy's are ready at once.
+    jobs : int, optional
+        Threads.
+    share : Predictor, optional
+        Of other models of the same runs; input rows are computed once for all.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        records: Sequence[Record],
+        *,
+        steps: int = 256,
+        scheme: str = DEFAULT_SCHEME,
+        solver: str = COLLOCATION,
+        backend: str = "numba",
+        jobs: int | None = None,
+        share: Predictor | None = None,
+    ):
+        self.model, self.records, self.steps, self.scheme, self.jobs = (
+            model,
+            tuple(records),
+            steps,
+            scheme,
+            jobs,
+        )
+        self.backend, self.solver = backend, solver
+        self.layout = Layout.of(model, [record.label for record in records])
+        compiled = kernels(model, self.layout.active, backend)
+        self.outputs = compiled.derived.outputs
+        shared = {} if share is None else {id(run.record): run for run in share.runs}
+
+        def build(record: Record) -> RunPredictor:
+            like = shared.get(id(record))
+            if record.periodic:
+                rows = None if like is None else like.known_rows
+                if solver == COLLOCATION:
+                    return RunPredictor(model, compiled, record, steps, scheme, rows)
+                return SolvedRun(model, compiled, record, steps, scheme, solver, backend, rows)
+            same = like if isinstance(like, TransientRun) else None
+            return TransientRun(model, compiled, record, steps, scheme, same)
+
+        self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
+        self._base = np.stack([run.base_constants() for run in self.runs])
+        #: Of the last evaluation, the first run that could not be solved.
+        self._failed: int | None = None
+
+    def __copy__(self) -> Predictor:
+        """A copy that shares everything, and not one made anew of a state."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs to make the same predictor: compiled code stays here."""
+        names = ("model", "records", "steps", "scheme", "solver", "backend", "jobs")
+        return {name: getattr(self, name) for name in names} | {
+            "found": [run.found() for run in self.runs]
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        found, model, records = (state.pop(name) for name in ("found", "model", "records"))
+        Predictor.__init__(self, model, records, **state)
+        for run, known in zip(self.runs, found, strict=True):
+            run.restore(known)
+
+    def constants(
+        self, theta: Float[Array, "vectors unknowns"], run: int
+    ) -> Float[Array, "vectors constants"]:
+        """Model constants of a run, shape (L, np), from unknowns of shape (L, l)."""
+        p = np.repeat(self._base[run][None], theta.shape[0], axis=0)
+        p[:, self.runs[run].active] = theta[:, self.layout.columns[run]]
+        return p
+
+    def set_anchor(self, theta: Float[Array, " unknowns"]) -> list[Status]:
+        """Solve every run at ``theta (l,)`` and start later solutions from there."""
+        work = range(len(self.runs))
+        return thread_map(
+            lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs
+        )
+
+    def predict(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction]:
+        """Outputs and sensitivities of every run at ``theta (l,)``."""
+        return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)
+
+    def evaluate(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction]:
+        """Anchor every run at ``theta (l,)`` and predict it there, by one solve.
+
+        Where runs were anchored before and one cannot be solved at ``theta``, all stay where they
+        were anchored, all predictions have its status and are not finite, and the others need not
+        be solved: what a step of an estimate asks is whether all can be.
+        """
+        everything = range(len(self.runs))
+        if any(run.anchor is None for run in self.runs):
+            return thread_map(lambda r: self._evaluate_run(theta, r), everything, self.jobs)
+        before, found = [run.anchor for run in self.runs], self._until_one_fails(theta)
+        self._failed = next((r for r, run in found.items() if not run.status.ok), None)
+        if self._failed is None:
+            return [found[r] for r in everything]
+        for run, anchor in zip(self.runs, before, strict=True):
+            run.anchor = anchor
+        return [self._unsolved(r, found[self._failed].status) for r in everything]
+
+    def _until_one_fails(self, theta: Array) -> dict[int, RunPrediction]:
+        """Predictions by run, that which failed last time first, and none after one that fails; in
+        several threads the others go together, whatever comes of each."""
+        runs = list(range(len(self.runs)))
+        if self._failed is not None:
+            runs.remove(self._failed)
+            runs.insert(0, self._failed)
+        found: dict[int, RunPrediction] = {}
+        alone = len(runs) if self.jobs == 1 else int(self._failed is not None)
+        for r in runs[:alone]:
+            found[r] = self._evaluate_run(theta, r)
+            if not found[r].status.ok:
+                return found
+        rest = thread_map(lambda r: self._evaluate_run(theta, r), runs[alone:], self.jobs)
+        return found | dict(zip(runs[alone:], rest, strict=True))
+
+    def _evaluate_run(self, theta: Array, r: int) -> RunPrediction:
+        return self._by_unknown(r, self.runs[r].evaluate(self.constants(theta[None], r)[0]))
+
+    def _unsolved(self, r: int, status: Status) -> RunPrediction:
+        shape, unknowns = self.runs[r].measured.shape, len(self.layout.names)
+        nothing = np.full((shape[0], unknowns, shape[1]), np.nan)
+        return RunPrediction(np.full(shape, np.nan), nothing, status)
+
+    def _predict_run(self, theta: Array, r: int) -> RunPrediction:
+        constants = self.constants(theta[None], r)
+        return self._by_unknown(r, self.runs[r].predict(constants, derivatives=True))
+
+    def _by_unknown(self, r: int, samples: PredictedSamples) -> RunPrediction:
+        """Derivatives of one run's samples with respect to all unknowns."""
+        assert samples.y_p is not None
+        _, ny, _, count = samples.y_p.shape
+        sensitivity = np.zeros((ny, len(self.layout.names), count))
+        sensitivity[:, self.layout.columns[r]] = samples.y_p[0]
+        return RunPrediction(
+            samples.y[0],
+            sensitivity,
+            Status(int(samples.status[0])),
+            samples.jumped is not None and bool(samples.jumped[0]),
+            None if samples.monodromy is None else samples.monodromy[0],
+        )
+
+    def simulate(self, theta: Float[Array, "vectors unknowns"], r: int) -> PredictedSamples:
+        """Outputs of run number ``r`` for many vectors, shape (L, l)."""
+        return self.runs[r].predict(self.constants(theta, r))
+
+    def sum_of_squares(
+        self, theta: Float[Array, "vectors unknowns"]
+    ) -> tuple[Float[Array, "vectors runs outputs"], Int[Integers, " vectors"]]:
+        """Sums of squared residuals, shape (L, N, ny), and the status of each vector, shape (L,).
+
+        The work is cut into blocks of runs and vectors; every vector's result is computed from its
+        own lane in a fixed order, so neither the cut nor the threads change a bit of it.
+        """
+        count, runs = theta.shape[0], len(self.runs)
+        total = np.full((count, runs, len(self.outputs)), np.nan)
+        status = np.zeros((count, runs), dtype=np.int64)
+        blocks = [
+            (r, slice(k, min(k + BLOCK, count)))
+            for r in range(runs)
+            for k in range(0, count, BLOCK)
+        ]
+
+        def work(task: tuple[int, slice]) -> None:
+            r, block = task
+            total[block, r], status[block, r] = self.runs[r].squares(
+                self.constants(theta[block], r)
+            )
+
+        thread_map(work, blocks, self.jobs)
+        worst = status.max(axis=1, initial=0)
+        total[worst != Status.CONVERGED.value] = np.nan
+        return total, worst

@@ -1,0 +1,222 @@
+"""Errors of a predicted run: noise of its inputs, and discretisation of its motion.
+
+How the noise of a run's inputs reaches its predicted outputs.
+
+The input's harmonics are known with a variance each. What their errors do to the prediction repeats
+in every period, so the scatter between periods does not contain it: it has to be computed, by the
+same linear problem that gives parameter sensitivities. A transient's smooth input has an error at
+every sample; a few draws of it stand for its covariance.
+
+How far the motion of a run, as it is solved for, is from what its equations ask for.
+
+The mesh of a run is frozen, so that a log density is the same function everywhere; how good it is
+is asked for once, at the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.prediction._band_limited import Smoothed
+from bayesoleo.prediction._inputs import (
+    harmonics_of,
+    highest_derivatives,
+    input_rows,
+    signal_of_rows,
+)
+from bayesoleo.prediction._periodic_run import RunPredictor
+from bayesoleo.prediction._periodic_solver import SolvedRun
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
+from bayesoleo.solvers._mesh import equidistant, tableau
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._schemes import DEFAULT_SCHEME
+from bayesoleo.solvers._switched import PeriodicProblem
+from bayesoleo.solvers._switching import evaluate
+
+#: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
+DRAWS = 16
+
+
+def input_columns(run: RunPredictor, p: Array) -> Array:
+    """Change of the outputs by one standard deviation of each input coefficient.
+
+    Parameters
+    ----------
+    run : RunPredictor
+        Anchored near ``p``.
+    p : ndarray, shape (np,)
+        Model constants.
+
+    Returns
+    -------
+    ndarray, shape (ny, k, N)
+        Real and imaginary parts of all significant harmonics of all inputs, of a transient draws
+        over the root of their number; SI; no columns where the run could not be solved.
+    """
+    derived, boundary = run.kernels.derived, run.boundary
+    ny, samples = run.measured.shape
+    at_samples = _input_changes(run, run.record.position)
+    lanes, one = np.zeros(1, dtype=np.int64), p[None]
+    z = np.empty((1, 0, samples))
+    moved = np.zeros((1, 0, at_samples.shape[1], samples))
+    if derived.dofs:
+        solution = run.solve(one)
+        if solution.status[0] != Status.CONVERGED.value:
+            return np.zeros((ny, 0, samples))
+        step = boundary.step(run.steps)
+        z = run.scheme.sample(solution.x[..., None], run.plan, step)[:, :, 0]
+        moved = run.scheme.sample(_states(run, one, solution.x), run.plan, step)
+    yz, yp = np.zeros((1, ny, z.shape[1], samples)), np.zeros((1, ny, len(derived.active), samples))
+    yu = np.zeros((1, ny, len(derived.inputs), samples))
+    with np.errstate(all="ignore"):
+        run.kernels.output_jacobian(z, run.sample_inputs, one, lanes, yz, yp)
+        run.kernels.output_inputs(z, run.sample_inputs, one, lanes, yu)
+    columns = np.einsum("yuN,ukN->ykN", yu[0], at_samples)
+    columns += np.einsum("yzN,zkN->ykN", yz[0], moved[0])
+    return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
+
+
+def _states(run: RunPredictor, p: Array, x: Array) -> Array:
+    """Change of the solver's unknowns, shape (1, n, w, k)."""
+    boundary, d = run.boundary, len(run.scheme.orders)
+    points, nz = boundary.inputs.shape[1], run.scheme.state_size + d
+    lanes = np.zeros(1, dtype=np.int64)
+    z, g, gz = np.zeros((1, nz, points)), np.zeros((1, d, points)), np.zeros((1, d, nz, points))
+    gu = np.zeros((1, d, boundary.inputs.shape[0], points))
+    run.scheme.rows(x, lanes, boundary.step(run.steps), z)
+    run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
+    run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
+    right = np.einsum("lduN,ukN->ldkN", gu, _input_changes(run, run.points))
+    step, held = boundary.step(run.steps), not run.record.periodic
+    return run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
+
+
+def _input_changes(run: RunPredictor, phase: Array) -> Array:
+    """Change of every input row by one standard deviation of each coefficient, shape (nu, k, N)."""
+    rows, record = run.kernels.derived.inputs, run.record
+    if not record.periodic:
+        return _drawn_changes(run, phase)
+    highest = highest_derivatives(rows)
+    channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
+    blocks = []
+    for channel in channels:
+        item = harmonics_of(record, channel).for_derivative(highest[channel])
+        turn = (
+            np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0))
+            * np.sqrt(item.variances)[:, None]
+        )
+        block = np.zeros((len(rows), 2 * item.orders.size, phase.size))
+        for k, (name, derivative) in enumerate(rows):
+            if name == channel:
+                changed = (2j * np.pi * record.frequency * item.orders)[
+                    :, None
+                ] ** derivative * turn
+                block[k, : item.orders.size], block[k, item.orders.size :] = (
+                    changed.real,
+                    -changed.imag,
+                )
+        blocks.append(block[:, np.abs(block).max(axis=(0, 2)) > 0])
+    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))
+
+
+@lru_cache(maxsize=64)
+def _errors(signal: Smoothed) -> tuple[Smoothed, ...]:
+    return tuple(signal.errors(DRAWS))
+
+
+def _drawn_changes(run: RunPredictor, position: Array) -> Array:
+    """The same of a transient: draws of its inputs' errors."""
+    rows, record = run.kernels.derived.inputs, run.record
+    highest, blocks = highest_derivatives(rows), []
+    for channel in run.model.inputs:
+        if any(row[0] == channel for row in rows):
+            draws = _errors(record.smoothed[channel].for_derivative(highest[channel]))
+            block = np.zeros((len(rows), len(draws), position.size))
+            for k, (name, derivative) in enumerate(rows):
+                if name == channel:
+                    for j, draw in enumerate(draws):
+                        block[k, j] = draw.evaluate(position, record.rate, derivative)
+            blocks.append(block / np.sqrt(DRAWS))
+    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, position.size))
+
+
+#: Error over the swing below which nothing more is resolved: what no channel shows.
+TOLERANCE = 1e-6
+#: Points of a run at which its equations are looked at: every run of every fit is.
+LOOKS = 16_384
+
+
+def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:
+    """Estimate the error of a run's anchored motion.
+
+    Parameters
+    ----------
+    run : RunPredictor
+        Of a periodic run or of a transient, anchored.
+    tolerance : float
+        Error over the swing below which it need not be known.
+
+    Returns
+    -------
+    ErrorEstimate
+        Its error is NaN where there is no motion, or no estimate of its error.
+    """
+    anchor, derived = run.anchor, run.kernels.derived
+    if anchor is None or not derived.dofs:
+        return NONE
+    if isinstance(run, SolvedRun):
+        return run.error()
+    initial = not run.record.periodic
+    problem = PeriodicProblem(
+        equations=run.kernels,
+        orders=derived.orders,
+        period=run.period,
+        inputs_at=_inputs_at(run),
+        conditions=len(derived.admissible),
+        active=len(derived.active),
+    )
+    scheme = run.scheme
+    method, mesh = tableau(DEFAULT_SCHEME), equidistant(run.steps)
+    if isinstance(scheme, Collocation):
+        method, mesh = scheme.method, scheme.mesh or mesh
+
+    return estimate_error(
+        problem,
+        method,
+        anchor.p,
+        lambda phase: run.rows(anchor.x, phase),
+        mesh,
+        tolerance,
+        initial=initial,
+        looks=LOOKS,
+    )
+
+
+def _inputs_at(run: RunPredictor) -> Callable[[Array], Array]:
+    """Input rows at phases; harmonics by rotation, since so many phases are asked for."""
+    rows, record = run.kernels.derived.inputs, run.record
+    if not record.periodic:
+        return lambda position: input_rows(record, rows, position)
+    signal = signal_of_rows(record, rows)
+    return lambda phase: evaluate(signal, phase * run.period)
+
+
+def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:
+    """Outputs ``(ny, N)`` at the raw samples of the better motion that an estimate found."""
+    better, anchor = estimate.better, run.anchor
+    if better is None or anchor is None:
+        return None
+    position = run.record.phase if run.record.periodic else run.record.position
+    plan = better.scheme.plan(position, better.mesh.steps, initial=not run.record.periodic)
+    step = better.boundary.step(better.mesh.steps)
+    z = better.scheme.sample(better.x[None, :, :, None], plan, step)[:, :, 0]
+    y = np.empty((1, len(run.kernels.derived.outputs), position.size))
+    with np.errstate(all="ignore"):
+        run.kernels.output(z, run.sample_inputs, anchor.p[None], np.array([0]), y)
+    return cast(Array, y[0])

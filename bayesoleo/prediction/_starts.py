@@ -1,0 +1,320 @@
+"""First guesses of periodic motions, and initial states of transients.
+
+A first guess of a periodic motion: measured where a dof is measured, declared otherwise.
+
+The state with which a transient starts, and how it depends on the parameters.
+
+Three kinds of symbols occur in a start: constants of the run, channels as measured at the first
+sample, and the equilibrium. The equilibrium solves the equations of the dofs that ask for it with
+all rates zero; its derivatives follow by the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import cast
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from bayesoleo._types import Array, Float, Int, Integers
+from bayesoleo.model._derivatives import Derived
+from bayesoleo.model._expressions import (
+    derivative_symbol,
+    parse,
+    split_derivative,
+    symbol,
+    total_derivative,
+)
+from bayesoleo.model._initial_states import EQUILIBRIUM, start_of
+from bayesoleo.model._kernels import Kernels
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
+from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._orbit import Status
+
+#: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.
+Motion = Callable[[Array], Array]
+#: Rows of channels at fixed phases, by channel and derivative: they depend on no parameter.
+KnownRows = dict[tuple[str, int], Array]
+
+
+def guess_rows(
+    model: Model,
+    derived: Derived,
+    record: Record,
+    constants: Mapping[str, float],
+    phase: Array,
+    motions: Mapping[str, Motion] | None = None,
+    known_rows: KnownRows | None = None,
+) -> Array:
+    """Values and derivatives of every dof, shape (nz, N): known motions before guesses.
+
+    With ``known_rows``, of the same record and phases, channels are evaluated once only.
+    """
+    rows: list[Array] = []
+    for dof, order in zip(derived.dofs, derived.orders, strict=True):
+        if motions is not None and dof in motions:
+            known = motions[dof](phase)
+            if known.shape[0] == order + 1:
+                rows.extend(known)
+                continue
+        expression = _measured_motion(model, dof, record) or _declared(model, dof)
+        for _ in range(order + 1):
+            rows.append(_evaluate(expression, record, constants, phase, known_rows))
+            expression = total_derivative(expression, list(record.harmonics))
+    return np.stack(rows) if rows else np.empty((0, phase.size))
+
+
+def _measured_motion(model: Model, dof: str, record: Record) -> sp.Expr | None:
+    """The channel that measures a dof directly, if there is one."""
+    for channel in model.outputs:
+        if model.output(channel) == symbol(dof) and channel in record.harmonics:
+            return symbol(channel)
+    return None
+
+
+def _declared(model: Model, dof: str) -> sp.Expr:
+    known = {name: symbol(name) for name in (*model.parameters, *model.conditions, *model.inputs)}
+    return parse(
+        model.dofs[dof].guess, known, model.inputs, f"model {model.name!r}, guess of {dof!r}"
+    )
+
+
+def _evaluate(
+    expression: sp.Expr,
+    record: Record,
+    constants: Mapping[str, float],
+    phase: Array,
+    known_rows: KnownRows | None,
+) -> Array:
+    function, items = _compiled(expression)
+    found: KnownRows = {} if known_rows is None else known_rows
+    columns = []
+    for item in items:
+        channel, order = split_derivative(item)
+        if channel in record.harmonics:
+            assert item == derivative_symbol(channel, order)
+            if (channel, order) not in found:
+                item = harmonics_of(record, channel).for_derivative(order)
+                found[channel, order] = item.evaluate(phase, record.frequency, order)
+            columns.append(found[channel, order])
+        else:
+            columns.append(np.asarray(constants[channel]))
+    return cast(Array, np.zeros(phase.size) + np.asarray(function(*columns), dtype=float))
+
+
+@lru_cache(maxsize=256)
+def _compiled(expression: sp.Expr) -> tuple[Callable[..., Array], tuple[sp.Symbol, ...]]:
+    """A guess as a function of its symbols: the same for every run, and slow to make."""
+    items = tuple(sorted(expression.free_symbols, key=str))
+    return sp.lambdify(items, expression, "numpy"), items
+
+
+MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
+#: A Newton step this small, over the state's size, leaves round-off only.
+SMALL_STEP = 1e-12
+
+
+@dataclass(frozen=True)
+class StartStates:
+    """Initial states of many parameter vectors.
+
+    Parameters
+    ----------
+    state : ndarray, shape (L, D)
+        Value of each dof, and velocity of one of second order.
+    by_parameter : ndarray, shape (L, D, na)
+        Its derivatives.
+    status : ndarray of int, shape (L,)
+        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+    """
+
+    state: Float[Array, "vectors states"]
+    by_parameter: Float[Array, "vectors states active"]
+    status: Int[Integers, " vectors"]
+
+
+class InitialState:
+    """Initial states of one run.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    kernels : Kernels
+        Of that model.
+    record : Record
+        A transient run.
+    """
+
+    def __init__(self, model: Model, kernels: Kernels, record: Record):
+        self.kernels, derived = kernels, kernels.derived
+        self.inputs = input_rows(record, derived.inputs, np.zeros(1))
+        starts = [start_of(model, dof) for dof in derived.dofs]
+        channels = {*model.inputs, *model.outputs} - {*model.parameters, *model.conditions}
+        self.resting = np.array([start.from_rest for start in starts], dtype=bool)
+        self.first = np.cumsum([0, *(order + 1 for order in derived.orders)])[:-1]
+        self.rows = np.array(
+            [self.first[j] + k for j, order in enumerate(derived.orders) for k in range(order)],
+            dtype=np.int64,
+        )
+        expressions = [
+            start.rate if k else start.value
+            for start, order in zip(starts, derived.orders, strict=True)
+            for k in range(order)
+        ]
+        self._values = _Table([_measured(e, record, channels) for e in expressions], kernels)
+        guesses = [_measured(_guess(model, dof), record, channels) for dof in derived.dofs]
+        self._guesses = _Table(guesses, kernels)
+
+    def __call__(self, p: Array) -> StartStates:
+        """States and derivatives for constants ``p (L, np)``; each lane by itself."""
+        lanes, derived = p.shape[0], self.kernels.derived
+        status = np.zeros(lanes, dtype=np.int64)
+        rest = np.zeros((lanes, len(derived.dofs)))
+        rest_p = np.zeros((lanes, len(derived.dofs), len(derived.active)))
+        if self.resting.any():
+            rest, rest_p, status = self._equilibrium(p)
+        owner = np.repeat(np.arange(len(derived.orders)), derived.orders)
+        state, state_p, slope = self._values(p, rest[:, owner])
+        state_p = state_p + slope[:, :, None] * rest_p[:, owner]
+        bad = ~np.isfinite(state).all(axis=1) | ~np.isfinite(state_p).all(axis=(1, 2))
+        status[bad & (status == Status.CONVERGED.value)] = Status.NOT_FINITE.value
+        return StartStates(state, state_p, status)
+
+    def _equilibrium(self, p: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Rest positions ``(L, d)`` of the dofs that ask for them, by damped Newton steps."""
+        derived, lanes = self.kernels.derived, np.arange(p.shape[0])
+        nz, d, moving = len(derived.states), len(derived.dofs), ~self.resting
+        nothing = np.zeros((p.shape[0], d))
+        guess, guess_p, _ = self._guesses(p, nothing)
+        known, known_p, _ = self._values(p, np.zeros((p.shape[0], self.rows.size)))
+        z, z_p = np.zeros((p.shape[0], nz, 1)), np.zeros((p.shape[0], nz, len(derived.active)))
+        owner = np.repeat(np.arange(d), derived.orders)
+        given = self.rows[moving[owner]]
+        z[:, given, 0], z_p[:, given] = known[:, moving[owner]], known_p[:, moving[owner]]
+        values = self.first[self.resting]
+        z[:, values, 0], z_p[:, values] = guess[:, self.resting], guess_p[:, self.resting]
+        g, gz = np.zeros((p.shape[0], d, 1)), np.zeros((p.shape[0], d, nz, 1))
+        gp = np.zeros((p.shape[0], d, len(derived.active), 1))
+        self._evaluate(z, p, lanes, g, gz)
+        # An equation that holds wherever the dofs are (a memory at rest) says nothing: its dof
+        # stays at its guess.
+        own = np.flatnonzero(self.resting)
+        silent = (np.abs(gz[:, own][:, :, values, 0]).max(axis=2, initial=0.0) == 0.0) & (
+            g[:, own, 0] == 0.0
+        )
+        status = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
+        for lane in lanes:
+            free = ~silent[lane]
+            status[lane] = self._solve(z, p, int(lane), own[free], values[free])
+        with np.errstate(all="ignore"):
+            self._evaluate(z, p, lanes, g, gz)
+            self.kernels.parameters(z, self.inputs, p, lanes, gp)
+        for lane in lanes[status == Status.CONVERGED.value]:
+            free = ~silent[lane]
+            rows, columns = own[free], values[free]
+            kept = z_p[lane].copy()
+            kept[columns] = 0.0
+            right = gp[lane, rows, :, 0] + gz[lane, rows, :, 0] @ kept
+            matrix = gz[lane][np.ix_(rows, columns)][:, :, 0]
+            z_p[lane, columns] = -np.linalg.solve(matrix, right)
+        return z[:, self.first, 0], z_p[:, self.first], status
+
+    def _evaluate(self, z: Array, p: Array, lanes: NDArray[np.int64], g: Array, gz: Array) -> None:
+        with np.errstate(all="ignore"):
+            self.kernels.jacobian(z, self.inputs, p, lanes, g, gz)
+
+    def _solve(
+        self, z: Array, p: Array, lane: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> int:
+        """Newton's method on one lane's static equations, in place."""
+        one, where = z[lane : lane + 1], p[lane : lane + 1]
+        d, nz = len(self.kernels.derived.dofs), z.shape[1]
+        g, gz, only = np.zeros((1, d, 1)), np.zeros((1, d, nz, 1)), np.zeros(1, dtype=np.int64)
+        self._evaluate(one, where, only, g, gz)
+        for _ in range(MAXIMUM_ITERATIONS):
+            matrix, right = gz[0][np.ix_(rows, columns)][:, :, 0], g[0, rows, 0]
+            if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+                return Status.NOT_FINITE.value
+            try:
+                step = -np.linalg.solve(matrix, right)
+            except np.linalg.LinAlgError:
+                return Status.SINGULAR.value
+            base = one[0, columns, 0].copy()
+            if np.all(np.abs(step) <= SMALL_STEP * (np.abs(base) + np.abs(step))):
+                return Status.CONVERGED.value
+            unit = np.abs(gz[0, rows, :, 0] * one[0, :, 0]).sum(axis=1) + np.abs(right) + 1e-300
+            before, fraction = float(np.sum((right / unit) ** 2)), 1.0
+            for _ in range(MAXIMUM_HALVINGS):
+                one[0, columns, 0] = base + fraction * step
+                self._evaluate(one, where, only, g, gz)
+                after = float(np.sum((g[0, rows, 0] / unit) ** 2))
+                if self._admissible(one, where) and (after < before or before < 1e-24):
+                    break
+                fraction *= 0.5
+            else:
+                # Round-off keeps the residual from falling where the step is as small as that.
+                small = np.all(np.abs(step) <= 1e-7 * (np.abs(base) + np.abs(step)))
+                return Status.CONVERGED.value if small else Status.NO_CONVERGENCE.value
+        return Status.NO_CONVERGENCE.value
+
+    def _admissible(self, z: Array, p: Array) -> bool:
+        conditions = len(self.kernels.derived.admissible)
+        a = np.ones((1, conditions, 1))
+        if conditions:
+            with np.errstate(all="ignore"):
+                self.kernels.admissible(z, self.inputs, p, np.zeros(1, dtype=np.int64), a)
+        return bool((a > 0).all())
+
+
+class _Table:
+    """Expressions over a model's constants and the equilibrium, with their derivatives."""
+
+    def __init__(self, expressions: list[sp.Expr], kernels: Kernels):
+        derived = kernels.derived
+        names, rest = [symbol(name) for name in derived.constants], symbol(EQUILIBRIUM)
+        self.count, self.active = len(expressions), len(derived.active)
+        flat: list[sp.Expr] = []
+        for expression in expressions:
+            flat += [expression, sp.diff(expression, rest)]
+            flat += [sp.diff(expression, symbol(name)) for name in derived.active]
+        used = set().union(*(e.free_symbols for e in flat)) if flat else set()
+        self.used = [k for k, item in enumerate(names) if item in used]
+        self.function = sp.lambdify([*(names[k] for k in self.used), rest], flat, "numpy")
+
+    def __call__(self, p: Array, rest: Array) -> tuple[Array, Array, Array]:
+        """Values ``(L, k)``, derivatives ``(L, k, na)`` and slopes by the equilibrium ``(L, k)``.
+
+        Lane by lane: a library's loop over an array may round by its place in it.
+        """
+        table = np.zeros((p.shape[0], self.count, 2 + self.active))
+        with np.errstate(all="ignore"):
+            for lane in range(p.shape[0]):
+                for k in range(self.count):
+                    row = self.function(*p[lane, self.used], rest[lane, k])
+                    size = 2 + self.active
+                    table[lane, k] = row[k * size : (k + 1) * size]
+        return table[:, :, 0], table[:, :, 2:], table[:, :, 1]
+
+
+def _measured(expression: sp.Expr, record: Record, channels: set[str]) -> sp.Expr:
+    """Put in what channels show at the first sample."""
+    values = {}
+    for item in expression.free_symbols:
+        channel, order = split_derivative(item)
+        if channel in channels:
+            # One sample is no start: its noise is taken off as for a derivative.
+            signal = signal_of(record, channel, max(order, 1))
+            values[item] = float(signal.evaluate(np.zeros(1), record.rate, order)[0])
+    return expression.xreplace({item: sp.Float(value) for item, value in values.items()})
+
+
+def _guess(model: Model, dof: str) -> sp.Expr:
+    known = (*model.parameters, *model.conditions, *model.inputs)
+    where = f"model {model.name!r}, guess of {dof!r}"
+    return parse(model.dofs[dof].guess, {name: symbol(name) for name in known}, model.inputs, where)

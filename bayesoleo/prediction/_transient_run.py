@@ -1,0 +1,320 @@
+"""Prediction of one transient run, with sensitivities.
+
+Predict one transient run: a start, a mesh chosen once, solutions on it, outputs at samples.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Any, cast
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.model._kernels import Kernels
+from bayesoleo.model._model import Model
+from bayesoleo.prediction._anchors import Anchor
+from bayesoleo.prediction._inputs import RowCache, highest_derivatives, input_rows, signal_of
+from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
+from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._starts import InitialState, Motion
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._library_integrator import halved, integrate, resolving
+from bayesoleo.solvers._mesh import Mesh, equidistant, tableau
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Boundary, Solution
+from bayesoleo.solvers._schemes import DEFAULT_SCHEME
+from bayesoleo.solvers._state_space import StateSpace
+from bayesoleo.solvers._transient import solve_transient, state_rows, transient_sensitivities
+
+#: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
+WHOLE = 128
+#: Steps are not cut for the sake of inputs below so many samples of them, nor below this angle at
+#: the highest frequency that an input holds, which a method of fifth order follows to 1e-4.
+SAMPLES_A_STEP, ANGLE = 4, 0.75
+#: Steps of that angle beyond which a library's integrator, step by step, would take minutes.
+MOST_INTEGRATED = 5_000
+#: Where steps are chosen by the inputs alone they are halved until the motion changes by less than
+#: this part of its size, and are no more than so many.
+SETTLED, MOST_STEPS = 3e-5, 400_000
+#: Steps of equal length where equations have no explicit form for an integrator to choose by.
+FALLBACK = 512
+
+
+class TransientRun(RunPredictor):
+    """One transient run of one model.
+
+    The mesh is chosen where the run is first anchored and kept from then on, so that all later
+    solutions are functions of their own parameters alone.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    kernels : Kernels
+        Of that model.
+    record : Record
+        A transient run.
+    steps : int
+        Fineness: :data:`WHOLE` is the integrator's own mesh; twice as much halves its steps.
+    scheme_name : str
+        Discretisation by collocation; the thesis's differences have no counterpart here, and the
+        default stands in for them.
+    like : TransientRun, optional
+        The same run under another model, whose mesh and input rows are taken over.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        kernels: Kernels,
+        record: Record,
+        steps: int,
+        scheme_name: str,
+        like: TransientRun | None = None,
+    ):
+        self.model, self.kernels, self.record = model, kernels, record
+        derived = kernels.derived
+        self._check(record)
+        self.method = tableau(DEFAULT_SCHEME if scheme_name == "thesis" else scheme_name)
+        self.period, self.fineness = record.span, steps
+        self.known_rows: RowCache = {} if like is None else like.known_rows
+        self.position = record.position
+        self.sample_inputs = input_rows(
+            record, derived.inputs, self.position, "samples", self.known_rows
+        )
+        self.measured = np.stack([record.samples[name] for name in derived.outputs])
+        self.anchor: Anchor | None = None
+        self.active = np.array(
+            [derived.constants.index(name) for name in derived.active], dtype=np.int64
+        )
+        self.initial = InitialState(model, kernels, record)
+        self._input_names = derived.inputs
+        highest = highest_derivatives(derived.inputs)
+        #: Channels as this model takes them; the time is none.
+        self.curves: dict[str, Any] = {
+            name: signal_of(record, name, order)
+            for name, order in highest.items()
+            if name != "time"
+        }
+        self.space = StateSpace(
+            kernels,
+            derived.orders,
+            self._inputs,
+            len(derived.active),
+            len(derived.admissible),
+            affine=derived.affine,
+        )
+        #: The mesh as chosen, before it is cut finer; none yet where nobody chose one.
+        self.chosen: Mesh | None = None if like is None else like.chosen
+        self.motions: dict[str, Motion] = {} if like is None else like.known_motions()
+        self._adopt(self.chosen or equidistant(1))
+
+    def resampled(self, record: Record) -> TransientRun:
+        """The same run, anchor and mesh included, looked at at other times of the same span."""
+        other = copy(self)
+        other.record, other.position = record, record.position
+        other.sample_inputs = input_rows(record, self.kernels.derived.inputs, other.position)
+        other.measured = np.stack([record.samples[name] for name in self.kernels.derived.outputs])
+        if self.plan is not None:
+            other.plan = self.collocation.plan(other.position, self.steps, initial=True)
+        return other
+
+    def _inputs(self, time: Array) -> Array:
+        if time.size == 1 and all(name in self.curves for name, _ in self._input_names):
+            now, known = float(time[0]), self.curves
+            rows = [known[name].at_once(now, k) for name, k in self._input_names]
+            # A column also where a model has no input.
+            return np.array(rows, dtype=float).reshape(-1, 1)
+        return input_rows(self.record, self.kernels.derived.inputs, time / self.period)
+
+    def _adopt(self, mesh: Mesh) -> None:
+        """Work on a mesh, cut as fine as asked for."""
+        fine = halved(mesh, max(round(np.log2(self.fineness / WHOLE)), 0))
+        derived = self.kernels.derived
+        self.collocation = Collocation(self.method, derived.orders, fine)
+        self.steps, self.scheme = fine.steps, self.collocation
+        self.points = self.scheme.phases(fine.steps)
+        grid = f"{self.method.name} {hash(fine.edges.tobytes())}"
+        self.boundary = Boundary(
+            equations=self.kernels,
+            scheme=self.scheme,
+            period=self.period,
+            inputs=input_rows(self.record, derived.inputs, self.points, grid, self.known_rows),
+            conditions=len(derived.admissible),
+            active=len(derived.active),
+        )
+        self.plan = (
+            self.collocation.plan(self.position, fine.steps, initial=True) if derived.dofs else None
+        )
+
+    def _choose(self, mesh: Mesh) -> None:
+        """Keep a mesh for good, cut where the inputs change faster than its steps can follow."""
+        self.chosen = resolving(
+            mesh, lambda position: self._inputs(position * self.period), self.method, self._shortest
+        )
+        self._adopt(self.chosen)
+
+    @property
+    def _shortest(self) -> float:
+        """Part of the time below which steps are not cut for the sake of inputs."""
+        of_samples = SAMPLES_A_STEP / (self.record.time.size - 1)
+        return min([of_samples, *(ANGLE / angle for angle in self._angles() if angle > 0)])
+
+    def _angles(self) -> list[float]:
+        """Angle by which the highest frequency of each input turns in all the time."""
+        bands = [getattr(curve, "band", None) for curve in self.curves.values()]
+        return [2 * np.pi * band.upper * self.period for band in bands if band is not None]
+
+    def found(self) -> dict[str, Any]:
+        """As of a periodic run, and the mesh."""
+        return {**super().found(), "chosen": self.chosen}
+
+    def restore(self, found: dict[str, Any]) -> None:
+        """Take over what :meth:`found` gave."""
+        super().restore(found)
+        if self.chosen is not None:
+            self._adopt(self.chosen)
+
+    # -- solving ---------------------------------------------------------------------------
+
+    def set_anchor(self, p: Array) -> Status:
+        """Solve at constants ``p (np,)`` and keep the solution as the start of later ones.
+
+        The first call chooses the mesh.
+        """
+        if not self.kernels.derived.dofs:
+            return Status.CONVERGED
+        start = self.initial(p[None])
+        if start.status[0] != Status.CONVERGED.value:
+            return Status(int(start.status[0]))
+        solution = self._first(p, start.state[0]) if self.anchor is None else self.solve(p[None])
+        if isinstance(solution, Status):
+            return solution
+        if solution.status[0] == Status.CONVERGED.value:
+            solution, x_p, _ = transient_sensitivities(
+                self.boundary, p[None], solution, start.by_parameter
+            )
+            if solution.status[0] == Status.CONVERGED.value:
+                moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+                self.anchor = Anchor(p.copy(), solution.x[0], moved)
+        return Status(int(solution.status[0]))
+
+    def _first(self, p: Array, state: Array) -> Solution | Status:
+        """The first solution, on a mesh of its own unless one was taken over."""
+        rows: Motion = lambda position: self._known(position, state)  # noqa: E731
+        if self.chosen is None and max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED:
+            equal = self._by_inputs(p, state, rows)
+            if equal.status[0] == Status.CONVERGED.value:
+                return equal
+            # Where a force jumps, an integrator's own steps may still get across.
+            self.chosen = None
+        if self.chosen is None or not self.motions:
+            found = integrate(self.space, p, state, self.period)
+            if not found.status.ok and found.status is not Status.SINGULAR:
+                return found.status
+            if self.chosen is None:
+                self._choose(found.mesh or equidistant(FALLBACK))
+            if found.states is not None:
+                rows = self._integrated(found.states, p)
+        start = self._unknowns(rows)
+        start[:, 0, : self.scheme.state_size] = state
+        return solve_transient(self.boundary, p[None], start)
+
+    def _by_inputs(self, p: Array, state: Array, rows: Motion) -> Solution:
+        """The first solution on equal steps that follow the inputs: the longest that suffice."""
+        steps = int(np.ceil(1.0 / self._shortest))
+        solution, place = self._on_equal(steps, p, state, rows), np.linspace(0.0, 1.0, 16 * WHOLE)
+        while 2 * steps <= MOST_STEPS and solution.status[0] == Status.CONVERGED.value:
+            coarse, motion = solution, self._motion_of(solution)
+            solution = self._on_equal(2 * steps, p, state, motion)
+            if solution.status[0] == Status.CONVERGED.value:
+                states, finer = state_rows(self.kernels.derived.orders), self._motion_of(solution)
+                if _rests(finer(place)[states], motion(place)[states]):
+                    self._keep_equal(steps)
+                    return coarse
+            steps *= 2
+        return solution
+
+    def _keep_equal(self, steps: int) -> None:
+        self.chosen = equidistant(steps)
+        self._adopt(self.chosen)
+
+    def _on_equal(self, steps: int, p: Array, state: Array, rows: Motion) -> Solution:
+        """A solution on equal steps, which are kept."""
+        self._keep_equal(steps)
+        start = self._unknowns(rows)
+        start[:, 0, : self.scheme.state_size] = state
+        return solve_transient(self.boundary, p[None], start)
+
+    def _motion_of(self, solution: Solution) -> Motion:
+        """Rows of a solution on the present mesh at positions."""
+        scheme, steps, step = self.collocation, self.steps, self.boundary.step(self.steps)
+
+        def rows(position: Array) -> Array:
+            plan = scheme.plan(position, steps, initial=True)
+            return scheme.sample(solution.x[..., None], plan, step)[0, :, 0]
+
+        return rows
+
+    def _unknowns(self, rows: Motion) -> Array:
+        """The scheme's unknowns ``(1, n, w)`` of a motion."""
+        nodes = self.collocation.nodes(self.steps)
+        return self.scheme.from_motion(rows(nodes)[None], rows(self.points)[None])
+
+    def _integrated(self, states: Motion, p: Array) -> Motion:
+        def rows(position: Array) -> Array:
+            time = position * self.period
+            return cast(Array, self.space.complete(time, states(time)[None], p[None])[0][0])
+
+        return rows
+
+    def _known(self, position: Array, state: Array) -> Array:
+        """Rows ``(nz, N)`` of the known motions; what is not known stays as it starts."""
+        derived, first, value = self.kernels.derived, 0, 0
+        rows = np.zeros((len(derived.states), position.size))
+        for dof, order in zip(derived.dofs, derived.orders, strict=True):
+            motion = self.motions[dof](position) if dof in self.motions else None
+            if motion is not None and motion.shape[0] == order + 1:
+                rows[first : first + order + 1] = motion
+            else:
+                rows[first] = state[value]
+            first, value = first + order + 1, value + order
+        return rows
+
+    def solve(self, p: Array) -> Solution:
+        """Solutions for constants ``p (L, np)``, each started from the anchor alone."""
+        if self.anchor is None:
+            shape = (p.shape[0], self.steps, self.scheme.width)
+            failed = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
+            return Solution(np.full(shape, np.nan), failed, np.zeros(p.shape[0], dtype=np.int64))
+        start = self.initial(p)
+        x = self.anchor.predict(p[:, self.active] - self.anchor.p[self.active])
+        x[:, 0, : self.scheme.state_size] = start.state
+        solution = solve_transient(self.boundary, p, x)
+        bad = start.status != Status.CONVERGED.value
+        return Solution(
+            solution.x, np.where(bad, start.status, solution.status), solution.iterations
+        )
+
+    def predict(self, p: Array, *, derivatives: bool = False) -> PredictedSamples:
+        """Outputs at the raw samples for constants ``p (L, np)``."""
+        if not self.kernels.derived.dofs:
+            status = np.zeros(p.shape[0], dtype=np.int64)
+            return self._at_samples(p, None, None, status, derivatives)
+        solution = self.solve(p)
+        x_p: Array | None = None
+        if derivatives:
+            start = self.initial(p).by_parameter
+            solution, x_p, _ = transient_sensitivities(self.boundary, p, solution, start)
+        return self._at_samples(p, solution.x, x_p, solution.status, derivatives)
+
+    def _at(self, phase: Array) -> Any:
+        """Plan of the collocation for positions."""
+        return self.collocation.plan(phase, self.steps, initial=True)
+
+
+def _rests(now: Array, before: Array) -> bool:
+    """Whether rows ``(nz, N)`` of a motion have changed by next to nothing."""
+    size = np.abs(now).max(axis=1)
+    return bool((np.abs(now - before).max(axis=1) <= SETTLED * size).all())

@@ -1,0 +1,561 @@
+"""One-step collocation, with its compiled loops.
+
+Compiled loops of one-step collocation: rows at stages, samples between nodes, elimination of a
+step's stages.
+
+Unknowns are ``x (L, n, w)``, with the highest derivatives at the stages behind the state of each
+step; steps have the lengths ``h (n,)``; ``a``, ``b`` and ``c`` are the method's weights, ``aa`` and
+``ba`` those of the second integral.
+
+One-step collocation, as linear maps between unknowns, stage values and samples.
+
+The unknowns of a step are the state at its left node (value, and velocity of a second-order dof)
+and the highest derivative of each dof at each stage: ``x (L, n, w)`` with ``w = D + s d``.
+Everything else - stage values, samples between nodes, sensitivities - is linear in them, so the
+same maps serve solutions and their derivatives. Steps are of one length unless a mesh says
+otherwise; ``step`` is the mean length throughout, period over number of steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesoleo._compiled import BLOCK as POINTS
+from bayesoleo._types import Array, Flags, Integers
+from bayesoleo.errors import InputError
+from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
+from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together, jit
+from bayesoleo.solvers._mesh import Mesh, Tableau
+
+
+@jit
+def sample(
+    x: Array, lanes: Integers, index: Integers, position: Array, w0: Array, w1: Array, w2: Array,
+    h: float, orders: Integers, z: Array,
+) -> None:  # fmt: skip
+    """``z (L, nz, C, N)`` at positions inside steps from the unknowns ``x (L, n, w, C)``."""
+    d, s = orders.size, w0.shape[0]
+    D = orders.sum()
+    for lane in lanes:
+        for column in range(x.shape[3]):
+            now = x[lane, :, :, column]
+            row = state = 0
+            for j in range(d):
+                value, rate = z[lane, row, column], z[lane, row + 1, column]
+                last = state + orders[j] - 1
+                for i in range(index.size):
+                    value[i] = now[index[i], state]
+                    rate[i] = 0.0
+                if orders[j] == 2:
+                    top = z[lane, row + 2, column]
+                    for i in range(index.size):
+                        value[i] += h * position[i] * now[index[i], last]
+                        rate[i] = now[index[i], last]
+                        top[i] = 0.0
+                for stage in range(s):
+                    own = D + stage * d + j
+                    if orders[j] == 1:
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * w1[stage, i] * highest
+                            rate[i] += w0[stage, i] * highest
+                    else:
+                        for i in range(index.size):
+                            highest = now[index[i], own]
+                            value[i] += h * h * w2[stage, i] * highest
+                            rate[i] += h * w1[stage, i] * highest
+                            z[lane, row + 2, column, i] += w0[stage, i] * highest
+                row += orders[j] + 1
+                state += orders[j]
+
+
+@jit
+def sample_block(
+    x: Array, lane: int, block: int, index: Integers, position: Array, w0: Array, w1: Array,
+    w2: Array, h: float, orders: Integers, needed: Flags, z: Array,
+) -> None:  # fmt: skip
+    """The same for one lane and one block of samples, with plans cut into blocks: ``index (blocks,
+    POINTS)`` and weights ``(blocks, s, POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are
+    ``needed``; without a view of any array, which would cost more than what it is for."""
+    d, s = orders.size, w0.shape[1]
+    D = orders.sum()
+    row = state = 0
+    for j in range(d):
+        order = orders[j]
+        last, top = state + order - 1, row + order
+        if needed[row]:
+            for i in range(POINTS):
+                z[row, i] = x[lane, index[block, i], state]
+            for stage in range(s if order == 1 else 0):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+        if order == 2 and needed[row]:
+            for i in range(POINTS):
+                z[row, i] += h * position[block, i] * x[lane, index[block, i], last]
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row, i] += h * h * w2[block, stage, i] * x[lane, index[block, i], own]
+        if order == 2 and needed[row + 1]:
+            for i in range(POINTS):
+                z[row + 1, i] = x[lane, index[block, i], last]
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[row + 1, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+        if needed[top]:
+            for i in range(POINTS):
+                z[top, i] = 0.0
+            for stage in range(s):
+                own = D + stage * d + j
+                for i in range(POINTS):
+                    z[top, i] += w0[block, stage, i] * x[lane, index[block, i], own]
+        row, state = top + 1, state + order
+
+
+@jit
+def rows(
+    x: Array, lanes: Integers, h: Array, a: Array, aa: Array, c: Array, orders: Integers, z: Array
+) -> None:
+    """``z (L, nz, n s)`` at the stages, with steps of the lengths ``h (n,)``."""
+    d, s, n = orders.size, c.size, x.shape[1]
+    D = orders.sum()
+    low, rate, once, twice = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    own = np.empty((s, n))
+    for lane in lanes:
+        row = state = 0
+        for j in range(d):
+            for m in range(n):
+                low[m] = x[lane, m, state]
+                rate[m] = x[lane, m, state + orders[j] - 1]
+            for stage in range(s):
+                for m in range(n):
+                    own[stage, m] = x[lane, m, D + stage * d + j]
+            for i in range(s):
+                _integrals(own, h, a[i], aa[i], once, twice)
+                top = z[lane, row + orders[j]]
+                for m in range(n):
+                    top[m * s + i] = own[i, m]
+                below = z[lane, row + orders[j] - 1]
+                for m in range(n):
+                    below[m * s + i] = rate[m] + once[m]
+                if orders[j] == 2:
+                    for m in range(n):
+                        z[lane, row, m * s + i] = low[m] + (h[m] * c[i] * rate[m] + twice[m])
+            row += orders[j] + 1
+            state += orders[j]
+
+
+@jit
+def _integrals(
+    own: Array, h: Array, first: Array, second: Array, once: Array, twice: Array
+) -> None:
+    """First and second integrals over steps of stage values ``own (s, n)``."""
+    s, n = own.shape
+    once[:] = 0.0
+    twice[:] = 0.0
+    for stage in range(s):
+        for m in range(n):
+            once[m] += first[stage] * own[stage, m]
+            twice[m] += second[stage] * own[stage, m]
+    for m in range(n):
+        once[m] *= h[m]
+        twice[m] *= h[m] * h[m]
+
+
+#: Steps of the mesh whose stages are eliminated together, innermost in memory.
+BLOCK = 32
+
+
+@jit
+def linear(
+    gz: Array, right: Array, x: Array, newton: bool, jumps: Array, lanes: Integers, h: Array,
+    a: Array, aa: Array, b: Array, ba: Array, c: Array, orders: Integers, initial: bool, dx: Array,
+    monodromy: Array, ok: Flags,
+) -> None:  # fmt: skip
+    """Eliminate every step's stages, close the period, and recover the stages."""
+    d, s = orders.size, b.size
+    D, n, k = orders.sum(), dx.shape[1], right.shape[2]
+    size = s * d
+    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((2, size, BLOCK))
+    stages = np.empty((size, D + k, n))
+    transfer = np.empty((D, D + k, n))
+    states = np.empty((D, k, n))
+    for lane in lanes:
+        good = True
+        for first in range(0, n, BLOCK):
+            count = min(BLOCK, n - first)
+            _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+            if not eliminate_together(work, scale, count, size):
+                _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
+                good = good and eliminate_each(work, count, size)
+            for line in range(size):
+                for column in range(D + k):
+                    for t in range(count):
+                        stages[line, column, first + t] = work[line, size + column, t]
+        if good:
+            _transfer(stages, h, b, ba, orders, transfer)
+            if newton:
+                _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
+            if jumps.shape[3] == n:
+                transfer[:, D:] += jumps[lane]
+            good = close_and_sweep(transfer, monodromy[lane], states, initial)
+        ok[lane] = good
+        if good:
+            _recover(stages, states, dx[lane])
+
+
+@jit
+def _assemble(
+    gz: Array, right: Array, first: int, count: int, h: Array, a: Array, aa: Array, c: Array,
+    orders: Integers, work: Array,
+) -> None:  # fmt: skip
+    """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
+    d, s = orders.size, c.size
+    D, k = orders.sum(), right.shape[1]
+    size = s * d
+    for i in range(s):
+        begin = first * s + i
+        for e in range(d):
+            line = i * d + e
+            row = state = 0
+            for j in range(d):
+                for stage in range(s):
+                    once, twice = a[i, stage], aa[i, stage]
+                    own = 1.0 if stage == i else 0.0
+                    column = stage * d + j
+                    if orders[j] == 1:
+                        for t in range(count):
+                            point = begin + t * s
+                            work[line, column, t] = (
+                                h[first + t] * once * gz[e, row, point]
+                                + own * gz[e, row + 1, point]
+                            )
+                    else:
+                        for t in range(count):
+                            point, length = begin + t * s, h[first + t]
+                            total = length * length * twice * gz[e, row, point]
+                            total += length * once * gz[e, row + 1, point]
+                            work[line, column, t] = total + own * gz[e, row + 2, point]
+                for t in range(count):
+                    work[line, size + state, t] = -gz[e, row, begin + t * s]
+                if orders[j] == 2:
+                    for t in range(count):
+                        point = begin + t * s
+                        work[line, size + state + 1, t] = -(
+                            h[first + t] * c[i] * gz[e, row, point] + gz[e, row + 1, point]
+                        )
+                row += orders[j] + 1
+                state += orders[j]
+            for column in range(k):
+                for t in range(count):
+                    work[line, size + D + column, t] = -right[e, column, begin + t * s]
+
+
+@jit
+def _transfer(
+    stages: Array, h: Array, b: Array, ba: Array, orders: Integers, transfer: Array
+) -> None:
+    """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
+    d, s, n = orders.size, b.size, transfer.shape[2]
+    transfer[:] = 0.0
+    state = 0
+    for j in range(d):
+        last = state + orders[j] - 1
+        transfer[last, last] = 1.0
+        if orders[j] == 2:
+            transfer[state, state] = 1.0
+            for m in range(n):
+                transfer[state, last, m] = h[m]
+        for stage in range(s):
+            for column in range(transfer.shape[1]):
+                for m in range(n):
+                    transfer[last, column, m] += h[m] * b[stage] * stages[stage * d + j, column, m]
+                if orders[j] == 2:
+                    for m in range(n):
+                        transfer[state, column, m] += (
+                            h[m] * h[m] * ba[stage] * stages[stage * d + j, column, m]
+                        )
+        state += orders[j]
+
+
+@jit
+def _add_jumps(
+    x: Array, h: Array, b: Array, ba: Array, orders: Integers, initial: bool, transfer: Array
+) -> None:
+    """Add the jump from each step's end to the next node to the right-hand side (one column).
+
+    A transient's last step has no next node.
+    """
+    d, s, n = orders.size, b.size, x.shape[0]
+    D = orders.sum()
+    state = 0
+    for j in range(d):
+        last = state + orders[j] - 1
+        for m in range(n - 1 if initial else n):
+            following = m + 1 if m + 1 < n else 0
+            once = twice = 0.0
+            for stage in range(s):
+                value = x[m, D + stage * d + j]
+                once += b[stage] * value
+                twice += ba[stage] * value
+            transfer[last, D, m] += x[m, last] + h[m] * once - x[following, last]
+            if orders[j] == 2:
+                transfer[state, D, m] += (
+                    x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
+                )
+        state += orders[j]
+
+
+@jit
+def _recover(stages: Array, states: Array, dx: Array) -> None:
+    """Stage unknowns from the node states: ``dx (n, w, k)``."""
+    D, k, n = states.shape
+    total = np.empty(n)
+    for column in range(k):
+        for i in range(D):
+            for m in range(n):
+                dx[m, i, column] = states[i, column, m]
+        for line in range(stages.shape[0]):
+            for m in range(n):
+                total[m] = stages[line, D + column, m]
+            for i in range(D):
+                for m in range(n):
+                    total[m] += stages[line, i, m] * states[i, column, m]
+            for m in range(n):
+                dx[m, D + line, column] = total[m]
+
+
+@dataclass(frozen=True)
+class SamplePlan:
+    """Steps of the mesh, positions in them and interpolation weights, each (s, N), of N phases.
+
+    Positions and weights contain the length of their step over the mean length.
+    """
+
+    index: NDArray[np.int64]
+    position: Array
+    w0: Array
+    w1: Array
+    w2: Array
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """A collocation scheme for dofs of given orders.
+
+    Parameters
+    ----------
+    method : Tableau
+        Stages and weights.
+    orders : tuple of int
+        Order (1 or 2) of each dof.
+    mesh : Mesh, optional
+        Steps of different lengths; then the number of steps ``n`` is the mesh's. Otherwise any
+        number of equal steps.
+    """
+
+    method: Tableau
+    orders: tuple[int, ...]
+    mesh: Mesh | None = None
+
+    @property
+    def state_size(self) -> int:
+        """Number D of state components."""
+        return sum(self.orders)
+
+    @property
+    def width(self) -> int:
+        """Unknowns in a step, w."""
+        return self.state_size + self.method.stages * len(self.orders)
+
+    @property
+    def order(self) -> int:
+        """Order of the error at the nodes."""
+        return self.method.order
+
+    @property
+    def program(self) -> unrolled.Program | None:
+        """Compiled pieces of a Newton step, where there is code for these orders."""
+        return unrolled.collocation(self.method, self.orders)
+
+    def phases(self, n: int) -> Array:
+        """Phases in cycles of the ``N = n s`` points at which equations hold, shape (N,)."""
+        if self.mesh is not None:
+            return self._mesh_of(n).points(self.method.c)
+        return ((np.arange(n)[:, None] + self.method.c) / n).ravel()
+
+    def nodes(self, n: int) -> Array:
+        """Phases in cycles at which the steps begin, shape (n,)."""
+        return np.arange(n) / n if self.mesh is None else self._mesh_of(n).edges[:-1]
+
+    def _mesh_of(self, n: int) -> Mesh:
+        assert self.mesh is not None
+        if self.mesh.steps != n:
+            raise InputError(
+                "wrong number of steps", value=n, hint=f"the mesh has {self.mesh.steps}"
+            )
+        return self.mesh
+
+    def lengths(self, n: int, step: float) -> Array:
+        """Length of each step, s, shape (n,)."""
+        return np.full(n, step) if self.mesh is None else step * self._mesh_of(n).relative
+
+    def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array:
+        """Unknowns that represent a given motion.
+
+        Parameters
+        ----------
+        rows_at_nodes, rows_at_points : ndarray, shapes (L, nz, n) and (L, nz, N)
+            Values and derivatives of all dofs.
+
+        Returns
+        -------
+        ndarray, shape (L, n, w)
+        """
+        lanes, _, n = rows_at_nodes.shape
+        x = np.zeros((lanes, n, self.width))
+        stages = rows_at_points.reshape(lanes, rows_at_points.shape[1], n, self.method.stages)
+        row = state = 0
+        d = len(self.orders)
+        for j, order in enumerate(self.orders):
+            x[:, :, state : state + order] = np.moveaxis(rows_at_nodes[:, row : row + order], 1, 2)
+            x[:, :, self.state_size + j :: d] = stages[:, row + order]
+            row, state = row + order + 1, state + order
+        return x
+
+    def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
+        """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
+        method = self.method
+        h = self.lengths(x.shape[1], step)
+        rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
+
+    def plan(self, phase: Array, n: int, *, initial: bool = False) -> SamplePlan:
+        """Where in the mesh given phases lie; worth keeping for fixed samples.
+
+        Parameters
+        ----------
+        phase : ndarray, shape (N,)
+            Cycles, of which only the fraction counts; of a transient (``initial``) parts of its
+            time, from 0 to 1.
+        n : int
+            Steps of the mesh.
+        initial : bool
+            Whether the phases are a transient's.
+
+        Returns
+        -------
+        SamplePlan
+        """
+        inside = phase if initial else phase % 1.0
+        if self.mesh is None:
+            scaled = inside * n
+            index = np.minimum(scaled.astype(np.int64), n - 1)
+            return self.plan_in(index, scaled - index)
+        return self.plan_in(*self._mesh_of(n).locate(inside))
+
+    def plan_in(self, index: NDArray[np.int64], position: Array) -> SamplePlan:
+        """Given steps ``(N,)`` and positions in them, from 0 to 1: on one side of an edge."""
+        w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
+        if self.mesh is not None:
+            relative = self.mesh.relative[index]
+            position, w1, w2 = relative * position, relative * w1, relative**2 * w2
+        return SamplePlan(index, position, w0, w1, w2)
+
+    def sample(self, x: Array, plan: SamplePlan, step: float) -> Array:
+        """Values and derivatives at planned phases.
+
+        Parameters
+        ----------
+        x : ndarray, shape (L, n, w, C)
+            Unknowns, or their derivatives, in C columns.
+        plan : SamplePlan
+            Of N phases.
+        step : float
+            Mean length of a step, s.
+
+        Returns
+        -------
+        ndarray, shape (L, nz, C, N)
+        """
+        nz = self.state_size + len(self.orders)
+        z = np.empty((x.shape[0], nz, x.shape[3], plan.index.size))
+        everyone = np.arange(x.shape[0])
+        sample(
+            x, everyone, plan.index, plan.position, plan.w0, plan.w1, plan.w2, step, self._orders, z
+        )
+        return z
+
+    def linear(
+        self,
+        gz: Array,
+        right: Array,
+        x: Array | None,
+        lanes: NDArray[np.int64],
+        step: float,
+        *,
+        initial: bool = False,
+        jumps: Array | None = None,
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Solve ``G dx = -right`` with the periodic closure.
+
+        Parameters
+        ----------
+        gz : ndarray, shape (L, d, nz, N)
+            Partial derivatives of the equations at the points.
+        right : ndarray, shape (L, d, k, N)
+            Residuals, or derivatives with respect to k parameters.
+        x : ndarray, shape (L, n, w), optional
+            Present unknowns; given, their jumps from step to step are removed too (a Newton step).
+        lanes : ndarray of int
+            Which of the L to solve.
+        step : float
+            Mean length of a step, s.
+        initial : bool
+            Hold the first state instead of closing the period.
+        jumps : ndarray, shape (L, D, k, n), optional
+            Added to the state at the end of each step.
+
+        Returns
+        -------
+        dx : ndarray, shape (L, n, w, k)
+        monodromy : ndarray, shape (L, D, D)
+        ok : ndarray of bool, shape (L,)
+        """
+        count, n = gz.shape[0], gz.shape[3] // self.method.stages
+        dx = np.zeros((count, n, self.width, right.shape[2]))
+        monodromy = np.full((count, self.state_size, self.state_size), np.nan)
+        ok = np.ones(count, dtype=np.bool_)
+        present = np.zeros((1, 1, 1)) if x is None else x
+        added = np.zeros((1, 1, 1, 0)) if jumps is None else jumps
+        method = self.method
+        h = self.lengths(n, step)
+        linear(
+            gz, right, present, x is not None, added, lanes, h, method.a, method.a @ method.a,
+            method.b, method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
+        )  # fmt: skip
+        for lane in lanes if not initial else ():
+            if sparse.needs_factorisation(bool(ok[lane]), monodromy[lane]):
+                ends = np.zeros((self.state_size, right.shape[2], n))
+                if x is not None:
+                    ends[:, 0] += self._jumps(x[lane], h)
+                if jumps is not None:
+                    ends += jumps[lane]
+                found = sparse.collocation_step(gz[lane], right[lane], ends, method, self.orders, h)
+                ok[lane] = found is not None
+                dx[lane] = 0.0 if found is None else found
+        return dx, monodromy, ok
+
+    def _jumps(self, x: Array, h: Array) -> Array:
+        """From each step's end to the next node, shape (D, n), of unknowns ``x (n, w)``."""
+        _, end = sparse.step_maps(self.method, self.orders, h)
+        following = np.roll(x[:, : self.state_size], -1, axis=0)
+        return np.asarray((np.einsum("mdw,mw->md", end, x) - following).T)
+
+    @property
+    def _orders(self) -> NDArray[np.int64]:
+        return np.array(self.orders, dtype=np.int64)

@@ -1,0 +1,536 @@
+"""Newton's method on all steps of a period at once, compiled.
+
+The equations of a period, linearised, and the recursion through its steps that solves them.
+
+Models and schemes come as compiled pieces of fixed signature (``bayesoleo.compiled`` and
+``solvers.schemes.unrolled``), so this is compiled once.
+
+Newton's method on one period, compiled: the same iteration as in ``solve``, with everything a
+lane needs in the processor's cache, and last steps with old derivatives.
+
+Starts that follow from one solution and its derivatives, made where they are needed.
+
+For a batch of parameter vectors all starts together are larger than a processor's cache; the
+solution and its derivatives are not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numba import carray
+
+from bayesoleo._compiled import BLOCK, after, call_kernel, caller, pointer
+from bayesoleo._types import Array, Integers
+from bayesoleo.solvers._elimination import (
+    LARGEST_GROWTH,
+    close as solve_closure,
+    close_balanced,
+    jit,
+)
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._period_arrangement import (
+    LinearStart,
+    Options,
+    Sizes,
+    Sweep,
+    SweepKernels,
+    SweepLayout,
+    Work,
+    total,
+    unit,
+)
+from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
+from bayesoleo.solvers._unrolled_program import SIGNATURES
+
+#: A pivot that asks for an exchange of rows, or a recursion that grows so much that its rounding
+#: errors would spoil the closure: neither is a failure of the problem, only of this elimination.
+NEEDS_EXCHANGE = -1
+
+CONVERGED = Status.CONVERGED.value
+INADMISSIBLE = Status.INADMISSIBLE.value
+SINGULAR = Status.SINGULAR.value
+NOT_FINITE = Status.NOT_FINITE.value
+
+_call_rows, _call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
+_call_eliminate = caller(SIGNATURES["eliminate"])
+_call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
+_call_product, _call_begin = caller(SIGNATURES["product"]), caller(SIGNATURES["begin"])
+_call_update = caller(SIGNATURES["update"])
+
+
+@jit
+def keep(source: Array, target: Array) -> None:
+    _copy(pointer(source, 0), pointer(target, 0), source.size)
+
+
+@jit
+def _copy(source: Any, target: Any, count: int) -> None:
+    """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
+    count references; and indices that may be negative allow no vector instructions."""
+    source, target = carray(source, (count,)), carray(target, (count,))
+    for i in range(count):
+        target[i] = source[i]
+
+
+@jit
+def take(base: Array, dx: Array, fraction: float, now: Array) -> None:
+    """``now = base + fraction dx``, two different arrays."""
+    size = now.size
+    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
+    begin = carray(pointer(base, 0), (size,))
+    for i in range(size):
+        to[i] = begin[i] + fraction * change[i]
+
+
+@jit
+def move(now: Array, dx: Array) -> None:
+    """``now += dx``. In :func:`take` they would overlap, which forbids vector instructions."""
+    size = now.size
+    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
+    for i in range(size):
+        to[i] += change[i]
+
+
+@jit
+def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> int:
+    """Equations at the present unknowns, and the recursion that solves them linearised."""
+    steps, stages = sizes.block, sizes.stages
+    reach = steps + (sizes.front + 1) * WIDTH
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
+    work.sums[:] = 0.0
+    bad, outside = 0, 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
+        _call_rows(pieces.rows, (x, length, z, steps))
+        if sizes.conditions > 0:
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
+            outside += _outside(out, sizes, count)
+        call_kernel(pieces.jacobian, (z, inputs, p, out, points))
+        if b == u.shape[0] - 1:
+            _silence(sizes, sweep.lengths, b, count, work.z, work.out)
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        arguments = out, x, length, z, sums, transfer, count
+        bad += _call_eliminate(pieces.eliminate, arguments)
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
+    if outside > 0:
+        return INADMISSIBLE
+    finite = True
+    for k in range(2 * sizes.d):
+        work.measures[k] = total(work.sums[k]) / (sizes.steps * stages)
+        finite = finite and work.measures[k] < np.inf
+    if not finite:
+        return NOT_FINITE
+    return NEEDS_EXCHANGE if bad > 0 else CONVERGED
+
+
+@jit
+def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
+    """Equations alone at the present unknowns, solved with the last derivatives; whether the
+    unknowns are admissible."""
+    steps, stages = sizes.block, sizes.stages
+    reach = steps + (sizes.front + 1) * WIDTH
+    points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
+    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
+    z, out = pointer(work.z, 0), pointer(work.out, 0)
+    outside = 0
+    for b in range(u.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
+        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
+        _call_rows(pieces.rows, (x, length, z, steps))
+        if sizes.conditions > 0:
+            call_kernel(pieces.admissible, (z, inputs, p, out, points))
+            outside += _outside(out, sizes, count)
+        call_kernel(pieces.residual, (z, inputs, p, out, points))
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        _call_substitute(pieces.substitute, (out, x, length, transfer, count))
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
+    return outside == 0
+
+
+@jit
+def _gather(now: Any, row: int, x: Any, unknowns: int, reach: int) -> None:
+    """Copy a block's unknowns, and those before it that its steps reach."""
+    for k in range(unknowns):
+        _copy(after(now, k * row), after(x, k * REACH), reach)
+
+
+@jit
+def _outside(a: Any, sizes: Sizes, count: int) -> int:
+    """How many points break a condition; one that is not a number shows in the equations."""
+    outside = 0
+    for k in range(sizes.conditions):
+        for stage in range(sizes.stages):
+            values = carray(after(a, k * BLOCK + stage * sizes.block), (count,))
+            for i in range(count):
+                outside += values[i] <= 0.0
+    return outside
+
+
+@jit
+def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out: Array) -> None:
+    """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
+
+    They are equations of a step that stands elsewhere, and can be solved; nothing uses the result.
+    """
+    steps = sizes.block
+    begin = (sizes.rows - 1) * WIDTH - b * steps
+    for stage in range(sizes.stages):
+        for i in range(steps):
+            short = begin <= i < begin + WIDTH and lengths[i - begin] < lengths[0]
+            if i >= count or short:
+                for k in range(sizes.d):
+                    out[k, stage * steps + i] = 0.0
+                for k in range(sizes.nz):
+                    z[k, stage * steps + i] = 0.0
+
+
+@jit
+def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
+    """Invert the closure of the period, from the recursion's matrices alone."""
+    inverse, closure, products = work.inverse, work.closure, work.products
+    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
+    _call_product(pieces.product, (history, pointer(products, 0), whole, rest, WIDTH))
+    product = products[WIDTH]
+    _set_identity(inverse)
+    regular, growth = solve_closure(product, inverse, closure)
+    if not regular or growth > LARGEST_GROWTH:
+        _set_identity(inverse)
+        regular, growth = close_balanced(product, inverse, closure, work.scale)
+    if growth > LARGEST_GROWTH:
+        return NEEDS_EXCHANGE
+    return CONVERGED if regular else SINGULAR
+
+
+@jit
+def _set_identity(matrix: Array) -> None:
+    for i in range(matrix.shape[0]):
+        for k in range(matrix.shape[1]):
+            matrix[i, k] = 1.0 if i == k else 0.0
+
+
+@jit
+def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) -> None:
+    """First state of every chunk: that of the period from its closure, or zero."""
+    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
+    inverse, start = pointer(work.inverse, 0), pointer(work.start, 0)
+    _call_begin(pieces.begin, (history, inverse, start, whole, rest, 0 if initial else 1))
+
+
+@jit
+def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
+    """The Newton step block by block, and at positions that repeat a step."""
+    steps, dx = sizes.block, work.dx
+    per_row = sizes.new * (sizes.state + 1) * WIDTH
+    start, to = pointer(work.start, 0), pointer(work.dx_block, 0)
+    for b in range(sweep.inputs.shape[0]):
+        count = min(steps, sizes.rows * WIDTH - b * steps)
+        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        history = pointer(work.history, b * (steps // WIDTH) * per_row)
+        _call_update(update, (transfer, history, start, to, count // WIDTH, WIDTH))
+        begin = sizes.front * WIDTH + b * steps
+        for k in range(sizes.unknowns):
+            at = k * dx.shape[1] + begin
+            _copy(pointer(work.dx_block, k * BLOCK), pointer(dx, at), count)
+    for k in range(sizes.unknowns):
+        for i in range(sizes.front * WIDTH):
+            dx[k, i] = dx[k, sweep.again[i]]
+        for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
+            dx[k, i] = dx[k, sweep.again[i]]
+
+
+NO_CONVERGENCE = Status.NO_CONVERGENCE.value
+
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step
+#: from the last two is safe.
+LAST_STEP = 1e-7
+#: The same without quadratic contraction (at a kink), where a small step is all there is to see.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+#: Relative step from which on steps can be taken for those of a contraction.
+CHORD_FROM = 0.1
+#: Steps with old derivatives, half as expensive, before there are new ones.
+MOST_CHORDS = 2
+#: Contraction that is none.
+SLOW_CHORD = 0.1
+#: What the steps that are not taken would add up to.
+CHORD_LEFT = 1e-14
+WITHOUT_SIGN = np.int64(2**63 - 1)
+
+
+@jit
+def solve_lanes(
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, p: Array,
+    x: Array, line: LinearStart, status: Integers, iterations: Integers,
+) -> None:  # fmt: skip
+    """Newton's method for every lane of ``x (L, n, w)``, in place; see ``solve``."""
+    now = work.now
+    for lane in range(x.shape[0]):
+        for k in range(sizes.constants):
+            work.constants[k] = p[lane, k]
+        if line.base.size > 0:
+            _extrapolate(line, lane, now)
+        else:
+            for k in range(sizes.unknowns):
+                for i in range(sweep.source.size):
+                    now[k, i] = x[lane, sweep.source[i], k]
+        status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
+        if status[lane] != NEEDS_EXCHANGE:
+            _in_order(sizes, sweep, now, pointer(x, lane * sizes.steps * sizes.unknowns))
+
+
+@jit
+def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
+    """Copy a solution, step by step and unknown by unknown."""
+    unknowns, row = sizes.unknowns, now.shape[1]
+    x, swept = carray(x, (sizes.steps * unknowns,)), carray(pointer(now, 0), (now.size,))
+    for k in range(unknowns):
+        to = k
+        for c in range(WIDTH):
+            at = k * row + sizes.front * WIDTH + c
+            for _ in range(sweep.lengths[c]):
+                x[to] = swept[at]
+                to += unknowns
+                at += WIDTH
+
+
+@jit
+def _extrapolate(line: LinearStart, lane: int, now: Array) -> None:
+    """``now = base + slopes change``, two slopes at a time."""
+    size, count = now.size, line.change.shape[1]
+    to, base = carray(pointer(now, 0), (size,)), carray(pointer(line.base, 0), (size,))
+    for i in range(size):
+        to[i] = base[i]
+    for k in range(0, count - count % 2, 2):
+        first, second = line.change[lane, k], line.change[lane, k + 1]
+        a = carray(pointer(line.slopes, k * size), (size,))
+        b = carray(pointer(line.slopes, (k + 1) * size), (size,))
+        for i in range(size):
+            to[i] += first * a[i] + second * b[i]
+    for k in range(count - count % 2, count):
+        first, a = line.change[lane, k], carray(pointer(line.slopes, k * size), (size,))
+        for i in range(size):
+            to[i] += first * a[i]
+
+
+@jit
+def _iterate(
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options
+) -> tuple[int, int]:
+    """Newton's method from ``work.now``; returns how it ended and the number of steps."""
+    outcome, iteration = evaluate(pieces, sizes, sweep, work), 0
+    last, chords = np.inf, True
+    while outcome == CONVERGED and iteration < options.max_iterations:
+        iteration += 1
+        outcome = _step(pieces, sizes, sweep, work, options.initial)
+        if outcome != CONVERGED:
+            return outcome, iteration
+        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        if not size < np.inf:
+            return SINGULAR, iteration
+        if least < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
+            move(work.now, work.dx)
+            return CONVERGED, iteration
+        if chords and last < CHORD_FROM and _chord_suffices(size, last):
+            keep(work.now, work.base)
+            steps, last = _chords(pieces, sizes, sweep, work, options, size)
+            iteration += steps
+            if last == 0.0:
+                return CONVERGED, iteration
+            chords = last < size
+            if not chords:
+                keep(work.base, work.now)
+            outcome = evaluate(pieces, sizes, sweep, work)
+            continue
+        outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
+        last = size if fraction == 1.0 else np.inf
+        # A linear problem is solved by its first step.
+        if outcome == CONVERGED and merit < 1e-14 and iteration > 1:
+            return CONVERGED, iteration
+    return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
+
+
+@jit
+def _chords(
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
+) -> tuple[int, float]:
+    """Take the step, and further ones with the same derivatives and closure.
+
+    Returns their number and the last one's size: zero where they converged, infinite where they did
+    not contract.
+    """
+    last = size
+    for count in range(1, MOST_CHORDS + 1):
+        move(work.now, work.dx)
+        if not evaluate_again(pieces, sizes, sweep, work):
+            return count, np.inf
+        start_chunks(pieces, sizes, work, options.initial)
+        update(pieces.update, sizes, sweep, work)
+        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        if not size < SLOW_CHORD * last:
+            return count, np.inf
+        # What is left is a geometric series, twice as steep as seen where the first of the two
+        # steps was one of Newton's.
+        if least < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
+            move(work.now, work.dx)
+            return count, 0.0
+        last = size
+    return MOST_CHORDS, last
+
+
+@jit
+def _chord_suffices(size: float, last: float) -> bool:
+    """Whether one more step with these derivatives leaves round-off, if Newton's error is squared:
+    ``k size**2`` with ``k = size / last**2``, which old derivatives contract by ``2 k size``.
+    """
+    ratio = size / last
+    return 2.0 * size * ratio**4 < CHORD_LEFT
+
+
+@jit
+def _advance(
+    pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
+) -> tuple[int, float, float]:
+    """Take the step, halved while it is inadmissible or does not reduce the residual; returns how
+    that ended, the fraction taken and the residual's size after it."""
+    keep(work.now, work.base)
+    keep(work.measures, work.before)
+    fraction, outcome = 1.0, CONVERGED
+    for _ in range(MAXIMUM_HALVINGS):
+        take(work.base, work.dx, fraction, work.now)
+        outcome = evaluate(pieces, sizes, sweep, work)
+        if outcome == NEEDS_EXCHANGE:
+            return outcome, fraction, np.inf
+        if outcome == CONVERGED:
+            falls, merit = _reduces(work.before, work.measures, sizes.d)
+            # Close to the solution round-off keeps the residual from falling; the step's own size
+            # then decides.
+            if falls or size < 1e-5 or not monotone:
+                return outcome, fraction, merit
+        fraction *= 0.5
+    keep(work.base, work.now)
+    return (INADMISSIBLE if outcome == INADMISSIBLE else NO_CONVERGENCE), fraction, np.inf
+
+
+@jit
+def _step(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
+    """The Newton step at all positions, from the recursion of the last evaluation."""
+    outcome = CONVERGED if initial else close(pieces, sizes, work)
+    if outcome == CONVERGED:
+        start_chunks(pieces, sizes, work, initial)
+        update(pieces.update, sizes, sweep, work)
+    return outcome
+
+
+@jit
+def _size(x: Array, dx: Array, begin: int, measured: int, scratch: Array) -> tuple[float, float]:
+    """Largest change of a state, over what :func:`unit` says; not finite where one is not.
+
+    Also over its largest value, which digits are lost against.
+    """
+    size = least = 0.0
+    count = x.shape[1] - begin
+    for k in range(x.shape[0]):
+        at = k * x.shape[1] + begin
+        change = _largest(pointer(dx, at), count, 0.0, scratch)
+        if not change < np.inf:
+            return np.inf, np.inf
+        if k < measured and change > 0.0:
+            level = x[k, begin]
+            motion = _largest(pointer(x, at), count, level, scratch)
+            size = max(size, change / unit(motion, level, change))
+            least = max(least, change / max(motion + abs(level), change))
+    return size, least
+
+
+@jit
+def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
+    """Largest distance from a level, not a number where one is not.
+
+    Without their sign, floating-point numbers are ordered as the integers with their bits, and what
+    is not finite comes last: integers, which have no exceptions, are compared in vectors.
+    """
+    values, distances = carray(values, (count,)), carray(pointer(scratch, 0), (count,))
+    for i in range(count):
+        distances[i] = values[i] - level
+    bits, largest = scratch.view(np.int64), np.int64(0)
+    for i in range(count):
+        magnitude = bits[i] & WITHOUT_SIGN
+        largest = magnitude if magnitude > largest else largest
+    bits[0] = largest
+    return float(scratch[0])
+
+
+@jit
+def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
+    """Whether the residual fell, in units of the equations' terms, and its size in its own.
+
+    It falls in the larger of the terms before and after: terms before alone would be nothing for an
+    equation that a start at rest fulfils, and forbid to leave it. It is small against its own terms
+    only: an iteration that comes back from far away has a small residual against those it left.
+    """
+    old = new = left = 0.0
+    for e in range(d):
+        larger = max(before[d + e], after[d + e]) + 1e-300
+        old += before[e] / larger
+        new += after[e] / larger
+        left += after[e] / (after[d + e] + 1e-300)
+    return np.sqrt(new) < np.sqrt(old), np.sqrt(left)
+
+
+@dataclass(frozen=True, eq=False)
+class Extrapolation:
+    """Starts at ``x + x_p change``.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, w)
+        A solution's unknowns.
+    x_p : ndarray, shape (na, n, w)
+        Their derivatives.
+    """
+
+    x: Array
+    x_p: Array
+
+    def starts(self, change: Array) -> Array:
+        """Starts, shape (L, n, w), at changes of shape (L, na)."""
+        start = np.empty((change.shape[0], *self.x.shape))
+        slopes = self.x_p.reshape(self.x_p.shape[0], -1)
+        _extrapolate_lanes(self.x.ravel(), slopes, change, start.reshape(change.shape[0], -1))
+        return start
+
+    def swept(self, layout: SweepLayout) -> tuple[Array, Array]:
+        """The same in the order of a sweep: ``(w, positions)`` and ``(na, w, positions)``."""
+        known = self._swept.get("last")
+        if known is None or known[0] is not layout:
+            base = np.ascontiguousarray(self.x[layout.source].T)
+            slopes = np.ascontiguousarray(np.moveaxis(self.x_p[:, layout.source], 2, 1))
+            known = self._swept["last"] = layout, base, slopes
+        return known[1:]
+
+    @cached_property
+    def _swept(self) -> dict[str, tuple[SweepLayout, Array, Array]]:
+        return {}
+
+
+@jit
+def _extrapolate_lanes(x: Array, x_p: Array, change: Array, start: Array) -> None:
+    """Lane by lane: the order of summation of a matrix product would vary with the batch."""
+    for lane in range(change.shape[0]):
+        for i in range(x.size):
+            start[lane, i] = x[i]
+        for k in range(change.shape[1]):
+            for i in range(x.size):
+                start[lane, i] += change[lane, k] * x_p[k, i]

@@ -1,0 +1,343 @@
+"""Generated straight-line code for finite differences, and its compilation.
+
+Source for backward differences: the unknowns are the dofs at the nodes, the state those of past
+nodes.
+
+Straight-line code of one scheme for dofs of given orders: no inner loop is left but that over
+steps.
+
+A period is cut into :data:`WIDTH` chunks that are swept side by side: step ``t`` of all chunks is
+one vector instruction, and the recursion along the period, which has no parallelism of its own,
+costs no more than what is done node by node. Compiled once for a signature (scheme, orders), not
+once for a model. Rows of a block lie at constant distances, which lets the compiler prove that they
+do not overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+
+from bayesoleo._compiled import BLOCK, COMPILING, load
+from bayesoleo.solvers import _unrolled_collocation as collocation_code
+from bayesoleo.solvers._mesh import Tableau
+from bayesoleo.solvers._unrolled_collocation import (
+    REACH,
+    WIDTH,
+    Factors,
+    Source,
+    add_squares,
+    begin,
+    chain,
+    joined,
+    product,
+    rows_before,
+    solve,
+    solve_again,
+)
+
+
+def past_nodes(orders: Sequence[int]) -> list[tuple[int, int]]:
+    """How many nodes back, and which dof: three for one of second order, two for one of first."""
+    return [(past, j) for past in (1, 2, 3) for j in range(len(orders)) if past <= orders[j] + 1]
+
+
+def rows(orders: Sequence[int], first: Sequence[float], second: Sequence[float]) -> str:
+    nz = sum(orders) + len(orders)
+    source = Source(
+        "rows",
+        "x, h, z, count",
+        {"x": len(orders) * REACH, "h": BLOCK, "z": nz * BLOCK},
+    )
+    source.add("once = 1.0/h[0]")
+    source.add("twice = once*once")
+    source.loop("for i in range(count):")
+    for j, row in enumerate(rows_before(orders)):
+        for past in range(4):
+            source.add(f"x{past} = x[{j * REACH + (3 - past) * WIDTH} + i]")
+        source.add(f"z[{row * BLOCK} + i] = x0")
+        rate = joined([f"{first[past]!r}*x{past}" for past in range(4) if first[past]])
+        source.add(f"z[{(row + 1) * BLOCK} + i] = ({rate})*once")
+        if orders[j] == 2:
+            bend = joined([f"{second[past]!r}*x{past}" for past in range(4) if second[past]])
+            source.add(f"z[{(row + 2) * BLOCK} + i] = ({bend})*twice")
+    return "\n".join(source.lines)
+
+
+def elimination(
+    orders: Sequence[int], first: Sequence[float], second: Sequence[float], steps: int
+) -> str:
+    d, nz, columns = len(orders), sum(orders) + len(orders), len(past_nodes(orders)) + 1
+    factors = Factors(d * columns, d, steps)
+    source = Source(
+        "eliminate",
+        "out, x, h, z, sums, transfer, count",
+        {
+            "out": d * (1 + nz) * BLOCK,
+            "h": BLOCK,
+            "z": nz * BLOCK,
+            "sums": 2 * d * BLOCK,
+            "transfer": (d * columns + d * d) * steps,
+        },
+    )
+    source.add("bad = 0")
+    source.add("once = 1.0/h[0]")
+    source.add("twice = once*once")
+    source.loop("for i in range(count):")
+    entries = [[["" for _ in range(d)] for _ in range(d)] for _ in range(4)]
+    for e in range(d):
+        for j, row in enumerate(rows_before(orders)):
+            for k in range(orders[j] + 1):
+                source.add(f"g{k} = out[{(d + e * nz + row + k) * BLOCK} + i]")
+                source.add(f"t{e}_{row + k} = g{k}*z[{(row + k) * BLOCK} + i]")
+            source.add("g1 *= once")
+            if orders[j] == 2:
+                source.add("g2 *= twice")
+            for past in range(4):
+                terms = ["g0"] if past == 0 else []
+                terms += [f"({first[past]!r})*g1"] if first[past] else []
+                terms += [f"({second[past]!r})*g2"] if orders[j] == 2 and second[past] else []
+                entries[past][e][j] = f"w{past}_{e}_{j}"
+                source.add(f"w{past}_{e}_{j} = {joined(terms)}")
+        source.add(f"g{e}_ = out[{e * BLOCK} + i]")
+        add_squares(source, e, d, f"g{e}_", [f"t{e}_{k}" for k in range(nz)])
+    right = [
+        [f"-{entries[past][e][j]}" for past, j in past_nodes(orders)] + [f"-g{e}_"]
+        for e in range(d)
+    ]
+    solution = solve(source, entries[0], right, factors)
+    for e in range(d):
+        for k in range(columns):
+            source.add(f"transfer[{(e * columns + k) * steps} + i] = {solution[e][k]}")
+    source.indent = "    "
+    source.add("return bad")
+    return "\n".join(source.lines)
+
+
+def substitution(orders: Sequence[int], steps: int) -> str:
+    d, columns = len(orders), len(past_nodes(orders)) + 1
+    factors = Factors(d * columns, d, steps)
+    source = Source(
+        "substitute",
+        "out, x, h, transfer, count",
+        {"out": d * BLOCK, "transfer": (d * columns + d * d) * steps},
+    )
+    source.loop("for i in range(count):")
+    solution = solve_again(source, [f"-out[{e * BLOCK} + i]" for e in range(d)], factors)
+    for e in range(d):
+        source.add(f"transfer[{(e * columns + columns - 1) * steps} + i] = {solution[e]}")
+    return "\n".join(source.lines)
+
+
+def update(orders: Sequence[int]) -> str:
+    d, past = len(orders), len(past_nodes(orders))
+    columns, window = past + 1, 3 * d
+    source = Source(
+        "update",
+        "transfer, history, start, dx, rows, width",
+        {"history": 10**9, "start": past * WIDTH, "dx": d * BLOCK},
+    )
+    source.loop("for t in range(rows):")
+    source.add(f"base = t*{d * columns * WIDTH}")
+    source.add(f"at = t*{WIDTH}")
+    source.loop("for c in range(width):")
+    for k in range(past):
+        source.add(f"s{k} = start[{k * WIDTH} + c]")
+    for j in range(d):
+        at = [f"history[base + {((window + j) * columns + k) * WIDTH} + c]" for k in range(columns)]
+        terms = [at[past]] + [f"{at[k]}*s{k}" for k in range(past)]
+        source.add(f"d{j} = {joined(terms)}")
+    for j in range(d):
+        source.add(f"dx[{j * BLOCK} + at + c] = d{j}")
+    return "\n".join(source.lines)
+
+
+#: Systems up to this size are solved by straight-line code; its length grows as the cube.
+LARGEST = 6
+
+_P, _I = types.CPointer(types.float64), types.intp
+#: Of the pieces, see :class:`Program`.
+SIGNATURES = {
+    "rows": types.void(_P, _P, _P, _I),
+    "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
+    "chain": types.void(_P, _P, _I, _I),
+    "substitute": types.void(_P, _P, _P, _P, _I),
+    "follow": types.void(_P, _P, _I, _I),
+    "product": types.void(_P, _P, _I, _I, _I),
+    "begin": types.void(_P, _P, _P, _I, _I, _I),
+    "update": types.void(_P, _P, _P, _P, _I, _I),
+}
+
+
+@dataclass(frozen=True)
+class Program:
+    """Compiled pieces of a Newton step, for one block of steps each, by their addresses.
+
+    Parameters
+    ----------
+    rows : int
+        ``(x, h, z, count)``: values and derivatives of the dofs at the points.
+    eliminate : int
+        ``(out, x, h, z, sums, transfer, count)``: solves for a step's own unknowns, and adds
+        squares of residuals, and of all terms, to ``sums``; returns how many pivots were too small.
+    chain : int
+        ``(transfer, history, rows, width)``: runs the recursion of all chunks through the block.
+    substitute : int
+        ``(out, x, h, transfer, count)``: other equations' constants, by the last elimination.
+    follow : int
+        As ``chain``, for constants only.
+    product : int
+        ``(history, products, whole, rest, width)``: products of the chunks' matrices, of which
+        ``rest`` are of ``whole + 1`` steps.
+    begin : int
+        ``(history, inverse, start, whole, rest, closed)``: the chunks' first states.
+    update : int
+        ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
+        states.
+    orders : tuple of int
+        Order of each dof.
+    stages, unknowns, state, new, window, front : int
+        Points of a step; unknowns of a step; size of the recursion's state; how many of its
+        components a step makes anew; among how many of the history they stand; rows of steps before
+        a block that it looks at.
+    order : tuple of int
+        Where in the history the components of the state stand.
+    transfer : int
+        Rows of a block's transfer, and of the factors behind it.
+    """
+
+    rows: int
+    eliminate: int
+    chain: int
+    substitute: int
+    follow: int
+    product: int
+    begin: int
+    update: int
+    orders: tuple[int, ...]
+    stages: int
+    unknowns: int
+    state: int
+    new: int
+    window: int
+    front: int
+    order: tuple[int, ...]
+    transfer: int
+
+    @property
+    def steps(self) -> int:
+        """Steps in a block, a multiple of the width."""
+        return BLOCK // self.stages // WIDTH * WIDTH
+
+
+def _compile(parts: Sequence[str]) -> dict[str, int]:
+    source = "import numba\n\n\n" + "\n\n\n".join(parts) + "\n"
+    module = load(source)
+    addresses = {}
+    for name, signature in SIGNATURES.items():
+        compiler = numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})
+        function: Any = compiler(getattr(module, name))
+        _ALIVE.append(function)
+        addresses[name] = int(function.address)
+    return addresses
+
+
+#: An address does not keep what stands there.
+_ALIVE: list[Any] = []
+
+
+def differences(
+    orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
+) -> Program | None:
+    """Code for backward differences, or None where it would be too long."""
+    return _known(("differences", orders), lambda: _differences(orders, first, second))
+
+
+def collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
+    """Code for a collocation method, or None where it would be too long."""
+    return _known((method.name, orders), lambda: _collocation(method, orders))
+
+
+_PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
+
+
+def _known(key: tuple[str, tuple[int, ...]], make: Callable[[], Program | None]) -> Program | None:
+    with COMPILING:
+        if key not in _PROGRAMS:
+            _PROGRAMS[key] = make()
+        return _PROGRAMS[key]
+
+
+def _differences(
+    orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
+) -> Program | None:
+    d = len(orders)
+    if not 1 <= d <= 2:
+        return None
+    order = tuple((3 - past) * d + j for past, j in past_nodes(orders))
+    D = len(order)
+    pieces = _compile(
+        [
+            rows(orders, first, second),
+            elimination(orders, first, second, BLOCK),
+            chain(d, 3 * d, order, BLOCK),
+            substitution(orders, BLOCK),
+            chain(d, 3 * d, order, BLOCK, constants_only=True),
+            product(d, order),
+            begin(d, order),
+            update(orders),
+        ]
+    )
+    return Program(
+        **pieces,
+        orders=orders,
+        stages=1,
+        unknowns=d,
+        state=D,
+        new=d,
+        window=3 * d,
+        front=3,
+        order=order,
+        transfer=d * (D + 1) + d * d,
+    )
+
+
+def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
+    d, s, D = len(orders), method.stages, sum(orders)
+    if not 1 <= s * d <= LARGEST or D > 4:
+        return None
+    steps = BLOCK // s // WIDTH * WIDTH
+    pieces = _compile(
+        [
+            collocation_code.rows(orders, method, steps),
+            collocation_code.elimination(orders, method, steps),
+            chain(D, D, tuple(range(D)), steps),
+            collocation_code.substitution(orders, method, steps),
+            chain(D, D, tuple(range(D)), steps, constants_only=True),
+            product(D, range(D)),
+            begin(D, range(D)),
+            collocation_code.update(orders, s, steps),
+        ]
+    )
+    return Program(
+        **pieces,
+        orders=orders,
+        stages=s,
+        unknowns=D + s * d,
+        state=D,
+        new=D,
+        window=D,
+        front=0,
+        order=tuple(range(D)),
+        transfer=(D + s * d) * (D + 1) + (s * d) ** 2,
+    )
+
+
+def chunks(n: int) -> np.ndarray:
+    """Lengths of the chunks of a period of ``n`` steps, shape (WIDTH,), the longest first."""
+    return np.array([n // WIDTH + (c < n % WIDTH) for c in range(WIDTH)], dtype=np.int64)

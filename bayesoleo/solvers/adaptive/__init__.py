@@ -1,1 +1,0 @@
-"""Periodic solutions on a mesh of their own."""

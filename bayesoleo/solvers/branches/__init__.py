@@ -1,1 +1,0 @@
-"""Families of periodic solutions, their folds and doublings, and periods that are unknown."""

@@ -1,1 +1,0 @@
-"""Generated code of one scheme for dofs of given orders, compiled once for a signature."""

@@ -1,1 +1,0 @@
-"""Trajectories cut into short steps, continuous at the solution only: multiple shooting."""

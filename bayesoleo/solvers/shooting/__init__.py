@@ -1,1 +1,0 @@
-"""Periodic solutions by integrating from a start and closing the period."""

@@ -1,1 +1,0 @@
-"""Solutions from given states through a time."""

@@ -1,1 +1,0 @@
-"""Rounds of the closed loop: estimate the best candidates, confirm one, add it, go on."""

@@ -1,1 +1,0 @@
-"""Score effects at their null: what each would explain, how surely, and which look alike."""

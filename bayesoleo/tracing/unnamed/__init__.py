@@ -1,1 +1,0 @@
-"""Look for a smooth function where no named effect explains what is left."""

@@ -1,0 +1,275 @@
+"""Classes of effects are looked at again with everything else in the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fitted_states import NUMERICS, options
+from small_campaigns import damper, damper_campaign
+
+from bayesoleo.discovery import _review as review
+from bayesoleo.discovery._alternatives import followed, leads_as_far
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._loop import SearchOptions, close_loop, searched
+from bayesoleo.discovery._nonparametric_round import (
+    _several_in_one_balance,
+    _stands_by_itself,
+    with_nonparametric,
+)
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import Ranked, rank
+from bayesoleo.discovery._refit import refit
+from bayesoleo.discovery._round import Progress, Round
+from bayesoleo.discovery._score_tests import score_all
+from bayesoleo.discovery._state import fit_state
+from bayesoleo.effects import find_effect
+
+POLICY = SearchPolicy()
+
+
+def accepted(effect, same):
+    candidate = SimpleNamespace(effect=effect, target="stroke", family="friction")
+    score = SimpleNamespace(option=SimpleNamespace(candidate=candidate, key=(effect, "stroke")))
+    return Ranked(score, 1e-6, 0.9, True, same)
+
+
+def progress_of(*found):
+    """Rounds that accepted these one after the other, one that accepted none, and their model."""
+    keys = [(item.effect, item.target) for item in found]
+
+    def state(count):
+        steps = [
+            SimpleNamespace(effect=SimpleNamespace(id=e, family="friction"), target=t)
+            for e, t in keys[:count]
+        ]
+        return SimpleNamespace(assembly=SimpleNamespace(steps=steps, added=tuple(keys[:count])))
+
+    rounds = [
+        Round(state(k), (item,), {}, item, state(k + 1), "", 60.0) for k, item in enumerate(found)
+    ]
+    last = Round(state(len(found)), (), {}, None, None, "nothing is missing", 60.0)
+    return Progress(state(0), state(len(found)), (*rounds, last))
+
+
+def test_what_was_found_before_the_last_effect_gets_the_class_that_it_has_beside_it(monkeypatch):
+    first = accepted("cubic_stiffness", ("quintic_stiffness", "play"))
+    found = progress_of(first, accepted("coulomb_friction", ("dahl_friction",)))
+    estimate = object()
+    own = replace(first, same=("play", "preload"), refit=estimate)
+    place = SimpleNamespace(number=0, own=own, better=())
+    monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
+    told = review.reviewed(found, None, None, None, lambda _: None, replacing=False).rounds
+    assert told[0].accepted.same == ("play", "preload")
+    assert told[0].accepted.beside is estimate
+    assert told[0].ranking == (told[0].accepted,)
+    # It was judged with everything else in: there is nothing to look at again.
+    assert told[1] is found.rounds[1]
+    assert told[2] is found.rounds[2]
+
+
+@pytest.mark.parametrize("same", [(), ("play",)])
+def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
+    found = progress_of(accepted("cubic_stiffness", same))
+    monkeypatch.setattr(review, "place_of", lambda *_: pytest.fail("asked again"))
+    assert review.reviewed(found, None, None, None, lambda _: None) is found
+
+
+NAMES = (
+    "coulomb_friction", "stroke_dependent_damping", "cubic_stiffness", "quintic_stiffness",
+    "quadratic_damping", "end_stop_upper", "hertzian_contact_upper", "constant_force",
+)  # fmt: skip
+EFFECTS = tuple(map(find_effect, NAMES))
+
+
+def cubic_and_friction(x, v, _):
+    return 1000 * x + 4e6 * x**3 + 200 * v + 5 * np.sign(v)
+
+
+def added_first(roles, name):
+    """A search that added one effect, whatever the others would have done."""
+    state = fit_state(Assembly(damper(cubic=False)), roles, NUMERICS)
+    base = state.base()
+    scores = score_all(base, options(state, NAMES), jobs=1)[0]
+    score = next(one for one in scores if one.option.key[0] == name)
+    result = refit(base, score, NUMERICS)
+    after = fit_state(result.assembly, roles, NUMERICS)
+    item = next(one for one in rank(scores, 40.0, {id(score): result}) if one.effect == name)
+    return Progress(state, after, (Round(state, (item,), {}, item, after, "", 40.0),))
+
+
+def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(tmp_path):
+    """A quintic spring is taken first on purpose: it is a cubic one that is there."""
+    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
+    begun = added_first(roles, "quintic_stiffness")
+    loop = close_loop(
+        Assembly(damper(cubic=False)), roles, NUMERICS, effects=EFFECTS, known=begun, max_effects=2
+    )
+    assert set(loop.effects) == {"cubic_stiffness", "coulomb_friction"}
+    told = [entry.reason for entry in loop.rounds if "stands instead of" in entry.reason]
+    assert len(told) == 1
+    assert "it stands instead of quintic_stiffness" in told[0]
+    assert "±" in told[0]
+    assert loop.final.at_floor
+
+
+def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
+    """Friction and a cubic spring are there: damping of another law beside either leaves more."""
+    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
+    begun = added_first(roles, "cubic_stiffness")
+    second = added_first(roles, "coulomb_friction").rounds[0].accepted
+    third = added_first(roles, "quadratic_damping").rounds[0].accepted
+    found = [
+        leads_as_far(begun_with_two(begun, roles), item, roles, NUMERICS, EFFECTS, lambda _: None)
+        for item in (second, third)
+    ]
+    assert found == [True, False]
+
+
+def begun_with_two(begun, roles):
+    """A search that went on from its first effect."""
+    search = SearchOptions(roles, NUMERICS, EFFECTS, 0, 2, False, lambda _: None, lambda _: None)
+    found = searched(begun, search)
+    assert set(found.state.assembly.added) == {
+        ("cubic_stiffness", "force"), ("coulomb_friction", "force")
+    }  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gap", "remaining", "reached", "replaced"),
+    [
+        (100.0, 5000.0, False, False),  # decisive by the noise, and two per cent of what is left
+        (100.0, 5000.0, True, True),  # with it noise alone is left
+        (1000.0, 5000.0, False, True),
+        (3.0, 5.0, True, False),
+    ],
+)
+def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
+    monkeypatch, gap, remaining, reached, replaced
+):
+    monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+
+    def item(name, worth, left, at_noise):
+        estimate = SimpleNamespace(
+            worth=worth, inflation=1.0, remaining=left, reached=at_noise, policy=POLICY
+        )
+        return replace(accepted(name, ()), refit=estimate)
+
+    own = item("dahl_friction", 1000.0, remaining, False)
+    rival = item("lugre_friction", 1000.0 + gap, remaining - gap, reached)
+    assert review.Place(0, None, own, (rival,)).better == ((rival,) if replaced else ())
+
+
+def test_first_effects_that_were_nearly_as_good_are_followed():
+    names = ("near", "alike", "nearer", "far", "by_run")
+    worths = (93.0, 99.5, 99.0, 50.0, 120.0)
+    ranking = []
+    for name, worth in zip(names, worths, strict=True):
+        item = replace(accepted(name, ()), refit=SimpleNamespace(worth=worth, share=0.5))
+        item.score.option.candidate.family = "run-to-run" if name == "by_run" else "friction"
+        ranking.append(item)
+    taken = replace(accepted("taken", ("alike",)), refit=SimpleNamespace(worth=100.0, share=0.5))
+    added = [("taken", "stroke"), ("second", "stroke")]
+
+    def search(at_floor, found, first=taken):
+        families = ["run-to-run" if effect == "by_run" else "friction" for effect, _ in found]
+        steps = [SimpleNamespace(effect=SimpleNamespace(family=item)) for item in families]
+        assembly = SimpleNamespace(added=tuple(found), steps=steps)
+        state = SimpleNamespace(at_floor=at_floor, assembly=assembly)
+        opening = Round(None, (taken, *ranking), {}, first, None, "", 60.0)
+        return SimpleNamespace(rounds=(opening,), state=state)
+
+    def names_of(progress):
+        return [item.effect for item in followed(progress, POLICY)]
+
+    assert names_of(search(True, added)) == ["nearer"], "at the noise only what is nearly tied"
+    assert names_of(search(False, added[:1])) == ["nearer", "near"]
+    assert names_of(search(True, added[:1])) == [], "one effect led to the noise"
+    assert names_of(search(True, [])) == [] == names_of(search(True, [], None))
+    # What merely varies from run to run is a symptom: causes are followed beside it.
+    by_run = ranking[-1]
+    assert names_of(search(True, [("by_run", "stroke")], by_run)) == ["taken", "nearer"]
+
+
+def test_no_function_is_looked_for_where_noise_alone_is_left():
+    """A name that explained the excess by itself led to the floor: nothing is left to explain."""
+    opening = Round(
+        SimpleNamespace(assembly=SimpleNamespace(steps=())),
+        (), {}, accepted("stribeck_friction", ()), None, "", 60.0,
+    )  # fmt: skip
+    step = SimpleNamespace(effect=SimpleNamespace(family="friction"), target="stroke")
+    state = SimpleNamespace(at_floor=True, assembly=SimpleNamespace(steps=(step,)))
+    last = Round(state, (), {}, None, None, "nothing is missing", 60.0)
+    told: list[str] = []
+    assert with_nonparametric(last, opening, None, NUMERICS, callback=told.append) is last
+    assert not told
+
+
+@pytest.mark.parametrize(
+    ("family", "gain", "reached", "alone"),
+    [
+        ("friction", 0.95, False, True),
+        ("friction", 0.85, True, False),
+        ("run-to-run", 0.95, False, False),
+        ("run-to-run", 0.95, True, True),
+    ],
+)
+def test_what_takes_up_a_part_of_everything_stands_by_itself_only_at_the_noise(
+    family, gain, reached, alone
+):
+    found = replace(accepted("found", ()), gain=gain, refit=SimpleNamespace(reached=reached))
+    found.score.option.candidate.family = family
+    assert _stands_by_itself(Round(None, (found,), {}, found, None, "", 60.0), POLICY) is alone
+
+
+@pytest.mark.parametrize(
+    ("steps", "several"),
+    [
+        ([("friction", "stroke"), ("stiffness", "stroke")], True),
+        ([("friction", "stroke"), ("thermal", "heat_loss")], False),
+        ([("friction", "stroke"), ("run-to-run", "stroke")], False),
+    ],
+)
+def test_names_come_together_in_one_balance(steps, several):
+    """What varies by run is no part of one law; another balance has another."""
+    made = [
+        SimpleNamespace(effect=SimpleNamespace(family=family), target=target)
+        for family, target in steps
+    ]
+    assert _several_in_one_balance(made, POLICY) is several
+
+
+@pytest.mark.parametrize(("gap", "replaced"), [(-4.0, True), (-8.0, False), (8.0, True)])
+def test_a_cause_that_is_as_likely_stands_instead_of_what_varies_by_run(monkeypatch, gap, replaced):
+    monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+
+    def item(name, family, worth):
+        found = accepted(name, ())
+        found.score.option.candidate.family = family
+        estimate = SimpleNamespace(
+            worth=worth, inflation=1.0, remaining=0.0, reached=True, policy=POLICY
+        )
+        return replace(found, refit=estimate)
+
+    by_run, cause = item("varies_by_run", "run-to-run", 100.0), item("drag", "damping", 100.0 + gap)
+    assert bool(review.Place(0, None, by_run, (cause,)).better) == replaced
+    # The other way round nothing that varies by run stands instead of a cause.
+    assert not review.Place(0, None, cause, (by_run,)).better
+
+
+def test_the_next_rival_is_asked_where_runs_speak_against_the_best(monkeypatch):
+    found = progress_of(accepted("varies_by_run", ()), accepted("sensor_lag", ()))
+    asked = []
+
+    def replaced(progress, step, place, better, *_):
+        asked.append(better)
+        return progress if better == "friction" else None
+
+    place = SimpleNamespace(number=0, own=found.rounds[0].accepted, better=("drag", "friction"))
+    monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
+    monkeypatch.setattr(review, "_replaced", replaced)
+    assert review.reviewed(found, None, None, None, lambda _: None) is found
+    assert asked == ["drag", "friction"]

@@ -1,0 +1,104 @@
+"""Effects that are one in other words, significance that only an estimate shows, and certainty."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bayesoleo.discovery._loop import ClosedLoop
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._round import _hidden, _may_be_significant
+from bayesoleo.discovery._score_tests import Score, corrected_p, without_twins
+
+TESTS, POLICY = 60.0, SearchPolicy()
+LEVEL, SAME = POLICY.significance, POLICY.same_cosine
+
+
+def score(effect, column, *, family="damping", target="stroke", fall=100.0, inflation=1.0):
+    """A score of one unknown along a column."""
+    column = np.asarray(column, dtype=float)
+    candidate = SimpleNamespace(effect=effect, family=family, target=target, sign={}, shapes={})
+    option = SimpleNamespace(candidate=candidate, key=(effect, target))
+    rows = (column / np.linalg.norm(column))[None]
+    return Score(option, ("a",), np.ones(1), {}, fall, 0.5, inflation, rows, column, np.sqrt(fall))
+
+
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ({}, 1),
+        ({"family": "sensor"}, 2),
+        ({"target": "other"}, 2),
+        ({"column": [-1.0, -2.0]}, 1),
+        ({"column": [1.0, 2.1]}, 2),
+    ],
+    ids=["same", "another cause", "another place", "other sign", "another direction"],
+)
+def test_twins_do_the_same_in_one_place_by_one_cause(change, kept):
+    first = score("extension", [1.0, 2.0])
+    second = score("compression", **({"column": [1.0, 2.0]} | change))
+    found, twins = without_twins([first, second])
+    assert len(found) == kept
+    assert found[0] is first
+    place = second.option.candidate.target
+    said = {f"compression at {place}": "the same as extension in other words"}
+    assert twins == (said if kept == 1 else {})
+
+
+def ranked(one, gain):
+    """As a round ranks it."""
+    p = corrected_p(one, TESTS)
+    return SimpleNamespace(score=one, absorbs=False, p_value=p, gain=gain)
+
+
+def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
+    found = ranked(score("viscous", [1.0, 0.0], fall=50.0), 0.4)
+    hidden = ranked(score("lag", [0.0, 1.0], fall=90.0, inflation=60.0), 0.3)
+    noise = ranked(score("play", [1.0, 1.0], fall=5.0), 0.3)
+    small = ranked(score("preload", [1.0, 1.0], fall=90.0, inflation=60.0), 0.05)
+    assert found.p_value < LEVEL < hidden.p_value
+    assert _hidden([found, hidden, noise, small], [found], TESTS, POLICY) == [hidden]
+    assert _may_be_significant(small, TESTS, POLICY)
+    assert not _may_be_significant(noise, TESTS, POLICY)
+
+
+def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact", held_out=1):
+    """A loop that added effects, the first explaining so much."""
+    refit = SimpleNamespace(fall=fall, inflation=1.0)
+    option = SimpleNamespace(candidate=SimpleNamespace(family=family))
+    score = SimpleNamespace(option=option)
+    accepted = SimpleNamespace(
+        effect="play", target="stroke", same=same, refit=refit, beside=None, score=score
+    )
+    after = SimpleNamespace(accepted=None, ranking=[SimpleNamespace(p_value=left)], tests=TESTS)
+    added = [SimpleNamespace(accepted=accepted, ranking=[], tests=TESTS)] * effects
+    final = SimpleNamespace(
+        at_floor=floor,
+        too_quiet=(),
+        hold_errors=SimpleNamespace(entries=[None] * held_out),
+        assembly=SimpleNamespace(added=[("play", "stroke")] * effects),
+    )
+    return ClosedLoop((*added, after), None, final, None, ())
+
+
+@pytest.mark.parametrize(
+    ("change", "certain"),
+    [
+        ({}, True),
+        ({"same": ("preload",)}, False),
+        ({"floor": False}, False),
+        ({"left": LEVEL / 2}, False),
+        ({"effects": 2}, False),
+        ({"effects": 0}, False),
+        ({"family": "nonparametric"}, False),
+        ({"held_out": 0}, False),
+        # One in twenty of it would have to be found if a mere likeness had been named.
+        ({"fall": 0.9 * 14.2 / (1 - SAME)}, False),
+        ({"fall": 1.1 * 14.2 / (1 - SAME)}, True),
+    ],
+)
+def test_a_name_is_certain_where_nothing_else_could_be(change, certain):
+    # A hundredth shared by sixty tests leaves 1.7e-4 to each: 14.2 of chi-square.
+    assert loop(**change).certain is certain

@@ -1,0 +1,82 @@
+"""A verdict counts what effects of physics explain, and says nothing is well where noise is odd."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace as Stub
+
+import pytest
+
+from bayesoleo import _schema as schema
+from bayesoleo.discovery._loop import certainty_of, explained_by_physics, verdict_of
+
+
+def state(ratio, *families, floor=1.15, quiet=()):
+    """A model with effects of some families, whose one held-out run has a ratio."""
+    steps = [Stub(effect=Stub(id=family, family=family)) for family in families]
+    entries = [Stub(ratio_to_expected=ratio)]
+    return Stub(
+        assembly=Stub(steps=steps, added=[(family, "x") for family in families]),
+        at_floor=ratio < floor,
+        too_quiet=quiet,
+        hold_errors=Stub(entries=entries),
+        fit_errors=Stub(entries=[]),
+    )
+
+
+def added(family, before, after):
+    """A round that added an effect, whose id is its family here."""
+    candidate = Stub(candidate=Stub(family=family))
+    accepted = Stub(effect=family, target="x", score=Stub(option=candidate))
+    return Stub(before=before, after=after, accepted=accepted)
+
+
+NONE = state(100.0)
+
+
+def searched(*ratios_and_families):
+    """Rounds that lower the ratio by effects of some families, one after the other."""
+    rounds, present, families = [], NONE, []
+    for ratio, family in ratios_and_families:
+        families.append(family)
+        after = state(ratio, *families)
+        rounds.append(added(family, present, after))
+        present = after
+    return rounds, NONE, present
+
+
+def test_down_to_what_is_expected_is_found_whatever_was_added():
+    for family in ("friction", "nonparametric", "run-to-run"):
+        assert verdict_of(*searched((1.0, family))) == schema.EFFECT_ADDED
+    assert verdict_of([], state(1.0), state(1.0)) == schema.NOTHING_MISSING
+    assert verdict_of([], NONE, NONE) == schema.UNEXPLAINED
+
+
+def test_nine_tenths_must_be_explained_by_physics():
+    # Squared: 100 to 13.6 is 98 %, and to 50 three quarters.
+    assert verdict_of(*searched((13.6, "friction"))) == schema.EFFECT_ADDED
+    assert verdict_of(*searched((50.0, "friction"))) == schema.UNEXPLAINED
+    for symptom in ("run-to-run", "clock", "nonparametric"):
+        assert verdict_of(*searched((13.6, symptom))) == schema.UNEXPLAINED
+        mixed = searched((20.0, symptom), (13.6, "friction"))
+        assert verdict_of(*mixed) == schema.UNEXPLAINED
+        assert explained_by_physics(*mixed) == pytest.approx((20.0**2 - 13.6**2) / (100.0**2 - 1))
+        assert verdict_of(*searched((13.6, "friction"), (10.0, symptom))) == schema.EFFECT_ADDED
+
+
+def test_less_error_than_chance_allows_is_no_success():
+    quiet = state(0.16, quiet=("too little",))
+    assert verdict_of([], quiet, quiet) == schema.UNEXPLAINED
+    found = state(0.16, "run-to-run", quiet=("too little",))
+    assert verdict_of([added("run-to-run", NONE, found)], NONE, found) == schema.UNEXPLAINED
+    physics = state(0.16, "friction", quiet=("too little",))
+    assert verdict_of([added("friction", NONE, physics)], NONE, physics) == schema.UNEXPLAINED
+
+
+def test_certainty_of_names():
+    assert certainty_of(state(1.0), certain=False) is None
+    assert certainty_of(state(1.0, "friction"), certain=True) == schema.CERTAIN
+    assert certainty_of(state(1.0, "friction", "nonparametric"), certain=False) == schema.PROBABLE
+    assert certainty_of(state(13.6, "friction"), certain=False) == schema.LIKENESS
+    assert certainty_of(state(1.0, "nonparametric", "clock"), certain=False) == schema.NO_CAUSE
+    quiet = state(0.16, "friction", quiet=("too little",))
+    assert certainty_of(quiet, certain=False) == schema.LIKENESS

@@ -1,0 +1,251 @@
+"""What to measure next: on rivals that small motions cannot tell apart, and large ones can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fitted_states import NUMERICS, fitted
+from small_campaigns import damper, damper_campaign, oscillator_campaign
+
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._next_experiment import propose_runs
+from bayesoleo.discovery._open_questions import named, rivals_of, standing
+from bayesoleo.discovery._predicted_experiment import Limits, Motion, Rival, planned_runs
+from bayesoleo.discovery._round import examine
+from bayesoleo.effects import find_effect
+from bayesoleo.errors import InputError
+from bayesoleo.model import Output
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.systems import system
+
+FREE = (-np.inf, np.inf)
+STIFFNESS, NOISE = 1000.0, 40.0
+#: One amplitude: a linear and a cubic spring differ by a third harmonic below the noise.
+RUNS = (("a", 1.0, 0.010, "fit"), ("b", 2.0, 0.010, "fit"), ("c", 1.5, 0.010, "hold-out"))
+
+
+def truth(x, v, t):
+    return 200 * v + STIFFNESS * x
+
+
+def examined(reduced, model, *effects):
+    state = fitted(reduced, model)
+    return examine(
+        state,
+        _roles(reduced),
+        NUMERICS,
+        effects=[find_effect(name) for name in effects],
+        seed=0,
+        limit="ranked only",
+        callback=lambda _: None,
+    )
+
+
+def _roles(reduced):
+    from bayesoleo.discovery._assembly import assign
+
+    return assign(reduced.records)
+
+
+@pytest.fixture(scope="module")
+def springs(tmp_path_factory):
+    """Linear or cubic stiffness, one of them missing in the model."""
+    folder = tmp_path_factory.mktemp("springs")
+    reduced = damper_campaign(folder, truth, runs=RUNS, noise=NOISE, periods=16)
+    model = damper(cubic=False, linear=False)
+    outcome = examined(reduced, model, "linear_stiffness", "cubic_stiffness")
+    chosen = named(outcome, ["linear_stiffness", "cubic_stiffness"])
+    rivals, failed = rivals_of(outcome, chosen, NUMERICS)
+    assert not failed
+    return reduced, outcome, rivals
+
+
+@pytest.fixture(scope="module")
+def proposals(springs):
+    reduced, outcome, rivals = springs
+    limits = Limits.of(reduced.records, "displacement", ("force",))
+    limits = limits.given({"amplitude": (0.005, 0.05), "force": FREE})
+    return propose_runs(rivals, reduced.records, outcome.before.fit_errors, limits, jobs=1)
+
+
+def test_springs_alike_in_small_motions_are_told_apart_by_a_large_one(proposals):
+    best = proposals.trials[0]
+    assert best.amplitude == pytest.approx(0.05)
+    assert best.separation.weakest > 8
+    assert all(trial.separation.weakest < 2.5 for trial in proposals.repeats)
+    assert proposals.inseparable == ()
+
+
+def test_without_larger_motions_the_best_run_is_hardly_better_than_those_made(springs):
+    reduced, outcome, rivals = springs
+    found = propose_runs(rivals, reduced.records, outcome.before.fit_errors, jobs=1)
+    made = found.best_repeat.separation.weakest
+    assert found.trials[0].separation.weakest < 1.5 * made
+
+
+def test_the_shortlist_has_one_run_a_frequency_and_is_ordered(proposals):
+    short = proposals.shortlist(4)
+    assert len({trial.frequency for trial in short}) == len(short) == 4
+    information = [round(trial.separation.information, 2) for trial in proposals.trials]
+    assert information == sorted(information, reverse=True)
+
+
+def test_the_run_made_as_proposed_tells_as_much_as_was_foreseen(springs, tmp_path):
+    """The rivals' log Bayes factor on data of the new run, simulated without the package.
+
+    Each rival predicts the new run with what the campaign knows of it: its evidence there is a
+    normal density over the raw samples.
+    """
+    reduced, outcome, rivals = springs
+    limits = Limits.of(reduced.records, "displacement", ("force",))
+    amplitude = 0.022
+    limits = limits.given(
+        {"amplitude": (amplitude, amplitude), "frequency": (1.0, 1.0), "force": FREE}
+    )
+    errors = outcome.before.fit_errors
+    # The better rival leaves nothing but noise; the present model, without a spring, does.
+    rested = replace(
+        errors, entries=tuple(replace(e, average=replace(e.average, repeating=0.0))
+                              for e in errors.entries)
+    )  # fmt: skip
+    found = propose_runs(rivals, reduced.records, rested, limits, jobs=1)
+    (trial,) = found.trials
+    expected = trial.separation.log_bayes_factor[0, 1]
+    assert expected > 3
+    factors = []
+    for seed in range(6):
+        new = damper_campaign(
+            tmp_path / str(seed),
+            truth,
+            runs=(("next", 1.0, amplitude, "fit"),),
+            noise=NOISE,
+            periods=16,
+            seed=100 + seed,
+        ).records[0]
+        factors.append(_log_evidence(rivals[0], new) - _log_evidence(rivals[1], new))
+    # The mean of six, each of which scatters by about its root of twice the mean; what the campaign
+    # happened to say of the true parameter moves them all alike, by about as much as one does.
+    scatter = np.sqrt(2 * expected) * np.sqrt(1 + 1 / 6)
+    assert abs(np.mean(factors) - expected) < 3 * scatter
+    assert np.mean(factors) > 0.3 * expected
+
+
+def _log_evidence(rival, record):
+    """Log density of a run's samples, the parameters normal as estimated."""
+    from bayesoleo.prediction._predictor import Predictor
+
+    predictor = Predictor(rival.fit.model, [record], backend="numpy", jobs=1)
+    theta = np.array([rival.fit.values[name] for name in predictor.layout.names])
+    run = predictor.evaluate(theta)[0]
+    e, J = (record.samples["force"] - run.y[0]) / NOISE, run.sensitivity[0] / NOISE
+    order = [rival.fit.problem.names.index(name) for name in predictor.layout.names]
+    C = rival.fit.point.covariance[np.ix_(order, order)]
+    inner = np.linalg.inv(C) + J @ J.T
+    moved = J @ e
+    log_determinant = np.linalg.slogdet(inner)[1] + np.linalg.slogdet(C)[1]
+    return -0.5 * (e @ e - moved @ np.linalg.solve(inner, moved) + log_determinant)
+
+
+def test_a_motion_beyond_the_limits_is_not_proposed(springs):
+    reduced, outcome, rivals = springs
+    limits = Limits.of(reduced.records, "displacement", ("force",))
+    wide = limits.given({"amplitude": (0.005, 0.05), "rate": (0.0, 0.2), "travel": (-0.03, 0.03)})
+    for run in planned_runs(wide, reduced.records, "displacement"):
+        move = Motion.of_signal(run.waveform, run.frequency)
+        assert move.rate <= 0.2 * (1 + 1e-6)
+        assert move.highest <= 0.03 * (1 + 1e-6)
+        assert move.lowest >= -0.03 * (1 + 1e-6)
+    narrow = wide.given({"force": (-20.0, 20.0)})
+    found = propose_runs(rivals, reduced.records, outcome.before.fit_errors, narrow, jobs=1)
+    assert sum(found.left_out.values()) > 0
+    assert len(found.trials) < len(planned_runs(narrow, reduced.records, "displacement"))
+
+
+def test_a_force_driven_oscillator_is_served_too(tmp_path):
+    """A spring that hardens, or two: what is softer or harder in small motions shows in large."""
+    reduced = oscillator_campaign(
+        tmp_path,
+        restoring=lambda x, v: 0.8 * v + 100.0 * x + 3e4 * x**3,
+        runs=(("a", 1.0, 2.0, "fit"), ("b", 2.1, 3.0, "fit"), ("c", 1.8, 2.0, "hold-out")),
+    )
+    model = system("linear_oscillator")
+    outcome = examined(reduced, model, "cubic_stiffness", "quintic_stiffness")
+    rivals, failed = rivals_of(outcome, outcome.ranking, NUMERICS)
+    assert not failed
+    limits = Limits.of(reduced.records, "force", ("displacement",)).given(
+        {"amplitude": (0.5, 4.0), "displacement": FREE}
+    )
+    found = propose_runs(rivals, reduced.records, outcome.before.fit_errors, limits, jobs=1)
+    assert found.drive == "force"
+    assert found.trials[0].separation.weakest > found.trials[-1].separation.weakest
+    # A large swing needs a large force, or one near the resonance at 1.6 Hz.
+    swing = [trial.amplitude for trial in found.trials]
+    assert swing[0] > np.median(swing)
+
+
+def test_candidates_left_open_by_a_round_are_its_rivals(springs):
+    _, outcome, _ = springs
+    names = [item.effect for item in standing(outcome)]
+    assert sorted(names) == ["cubic_stiffness", "linear_stiffness"]
+
+
+def test_one_rival_is_no_question(springs):
+    reduced, outcome, rivals = springs
+    with pytest.raises(InputError, match="fewer than two rivals"):
+        propose_runs(rivals[:1], reduced.records, outcome.before.fit_errors)
+
+
+@pytest.mark.parametrize(
+    ("means", "planned"), [((-1e-2, 3e-2), 0.0), ((1e-4, 3e-4), 0.0), ((0.01, 0.012), 0.011)]
+)
+def test_the_noise_of_a_mean_is_not_asked_of_a_rig(means, planned):
+    record = record_of(system("duffing"), RunPlan("a", 1.0, {"force": motion(0.0, [1.0])}))
+    limits = Limits((1.0, 1.0), (1.0, 1.0), means, (-2.0, 2.0), (0.0, 100.0))
+    (run,) = planned_runs(limits, [record], "force")
+    assert run.mean == pytest.approx(planned)
+
+
+def test_transients_are_refused_by_name(springs):
+    reduced, outcome, rivals = springs
+    transient = replace(reduced.records[0], kind="transient", label="drop 1")
+    with pytest.raises(InputError, match="periodic runs only"):
+        propose_runs(rivals, [transient], outcome.before.fit_errors)
+
+
+def test_a_model_with_two_measured_inputs_is_refused_by_their_names(springs):
+    reduced, outcome, _ = springs
+    two = damper(cubic=False)
+    two = replace(
+        two,
+        inputs={"displacement": "m", "temperature": "K"},
+        outputs={
+            "force": Output({**two.outputs["force"].terms, "warm": "damping*temperature"}, "N")
+        },
+    )
+    records = [
+        replace(
+            record,
+            samples={**record.samples, "temperature": record.samples["displacement"]},
+            harmonics={**record.harmonics, "temperature": record.harmonics["displacement"]},
+            signal_noise={**record.signal_noise, "temperature": 0.0},
+        )
+        for record in reduced.records
+    ]
+    rival = Rival("two inputs", fit_model(two, records, NUMERICS))
+    with pytest.raises(InputError, match=r"one input only.*temperature"):
+        propose_runs([rival, rival], records, outcome.before.fit_errors)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"stroke": (0, 1)}, "no such limit.*amplitude, frequency, mean"),
+        ({"amplitude": (2.0, 1.0)}, "wrong way round"),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused(springs, given, message):
+    limits = Limits.of(springs[0].records, "displacement", ("force",))
+    with pytest.raises(InputError, match=message):
+        limits.given(given)
