@@ -331,7 +331,7 @@ class Fit(Stored):
         if isinstance(work, CampaignWork) and candidates is not None:
             raise InputError(
                 "named terms are for functions", key="candidates", value=list(candidates),
-                hint="write effects=(bayesoleo.effects._force_effect(…),)",
+                hint="write effects=(bayesoleo.effects.force_effect(…),)",
             )  # fmt: skip
         if isinstance(work, FunctionWork) and out is not None:
             raise InputError("a search of terms keeps nothing", key="out", hint="leave it out")
