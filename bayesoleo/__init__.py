@@ -16,16 +16,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from bayesoleo._session.campaign import Campaign as Campaign, load_campaign as load_campaign
-    from bayesoleo._session.problem import Problem as Problem
-    from bayesoleo._session.results import (
+    from bayesoleo._session import (
+        Campaign as Campaign,
         Explanation as Explanation,
         Fit as Fit,
         Posterior as Posterior,
+        Problem as Problem,
+        load_campaign as load_campaign,
         load_result as load_result,
     )
+    from bayesoleo._workflow import Settings as Settings
     from bayesoleo._workflow.model_files import load_model as load_model
-    from bayesoleo._workflow.settings import Settings as Settings
     from bayesoleo.data import write_campaign as write_campaign
     from bayesoleo.model import Model as Model, Output as Output, Parameter as Parameter
     from bayesoleo.systems import system as system

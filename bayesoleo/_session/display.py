@@ -64,7 +64,7 @@ def residuals(tree: xr.DataTree) -> xr.Dataset:
     Parameters
     ----------
     tree : DataTree
-        With ``observed_data``, ``prediction`` and ``residual``. Of a result with added effects,
+        With ``records``, ``prediction`` and ``residual``. Of a result with added effects,
         those of the extended model.
 
     Returns
@@ -75,7 +75,7 @@ def residuals(tree: xr.DataTree) -> xr.Dataset:
     """
     predictions = tree[schema.PREDICTION].to_dataset()
     left = tree[schema.RESIDUAL].to_dataset()
-    observed = tree[schema.OBSERVED_DATA].to_dataset().sel({schema.RUN: predictions[schema.RUN]})
+    observed = tree[schema.RECORDS].to_dataset().sel({schema.RUN: predictions[schema.RUN]})
     width = predictions.sizes[schema.SAMPLE]
     observed = observed.isel({schema.SAMPLE: slice(width)})
     end, data = schema.before(""), {}

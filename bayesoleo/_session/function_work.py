@@ -23,7 +23,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._display import LabelledResult, columns
 from bayesoleo._storage.result_files import provenance
 from bayesoleo._storage.resume import digest
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo._workflow.estimating import draw_from
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.errors import InputError
@@ -34,7 +34,7 @@ from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import Prior
 from bayesoleo.posterior._comparison import compare
-from bayesoleo.posterior._datatree import to_datasets
+from bayesoleo.posterior._datatree import block_groups, each_sample, to_datasets
 from bayesoleo.posterior._log_density import LogDensity
 
 Function = Callable[..., ArrayLike]
@@ -393,7 +393,7 @@ class FunctionWork:
             return xr.Dataset(data, coords=coords)
 
         groups = {
-            schema.OBSERVED_DATA: dataset({**self.inputs, self.output: y}),
+            schema.RECORDS: dataset({**self.inputs, self.output: y}),
             schema.POINT: to_dataset(fit.point, mbe=fit.mbe, units=units),
             schema.PREDICTION: dataset({name: predicted}),
             schema.RESIDUAL: dataset({name: y - predicted}),
@@ -421,11 +421,18 @@ class FunctionWork:
         found = to_datasets(
             samples, problem.priors, units=units, seed=settings.seed, density=density
         )
+        found |= block_groups(
+            samples, density, self._shown, seed=settings.seed, blocks=each_sample(density)
+        )
         groups = {name: tree[name].to_dataset() for name in tree.children} | found
         groups[schema.COMPARISON] = compare(groups)
         drawn = xr.DataTree.from_dict(groups)
         drawn.attrs.update({**tree.attrs, schema.SEED: settings.seed})
         return drawn
+
+    def _shown(self, _: int, shown: Integers) -> dict[str, Array]:
+        size = self.table[self.output].size
+        return {name: x[shown] for name, x in self.inputs.items() if np.shape(x) == (size,)}
 
     def predict(
         self, tree: xr.DataTree, data: Any, *, level: float = 0.95, noise: bool = True

@@ -96,6 +96,14 @@ class Blocks:
         return cls(starts, shown, 1 + label[starts] * together)
 
 
+def each_sample(density: LogDensity) -> list[Blocks]:
+    """Every sample as a block of its own, where the error model allows it."""
+    if density.errors.over_runs:
+        return cut(density)
+    sizes = [run.time.size for run in cast(ResidualProblem, density.problem).samples]
+    return [Blocks(np.arange(n), np.arange(n), 1 + np.arange(n)) for n in sizes]
+
+
 def cut(density: LogDensity) -> list[Blocks]:
     """The blocks of every run; whole runs where runs have errors in common."""
     samples = cast(ResidualProblem, density.problem).samples
@@ -113,6 +121,7 @@ def block_groups(
     *,
     units: Mapping[str, str] | None = None,
     seed: int = 0,
+    blocks: list[Blocks] | None = None,
 ) -> dict[str, xr.Dataset]:
     """Groups ``observed_data``, ``posterior_predictive``, ``log_likelihood``, ``constant_data``.
 
@@ -128,6 +137,8 @@ def block_groups(
         Of outputs and inputs.
     seed : int
         Seeds the predicted errors.
+    blocks : list of Blocks, optional
+        How each run is cut; by default as by :func:`cut`.
 
     Returns
     -------
@@ -136,7 +147,7 @@ def block_groups(
         inputs ``(block)``; coordinates ``run`` and ``period`` say what a block is.
     """
     problem, units = cast(ResidualProblem, density.problem), units or {}
-    blocks, shape = cut(density), samples.log_density.shape
+    blocks, shape = blocks or cut(density), samples.log_density.shape
     measured = _measured(problem)
     likelihood, predicted = _evaluate(samples, density, blocks, measured, seed)
     coords = _block_coordinates(problem.runs, blocks)

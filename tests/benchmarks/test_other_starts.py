@@ -26,5 +26,5 @@ def test_an_ordinary_estimate_is_not_doubted():
     made = make("linear", 1, toleranced=True)
     said: list[str] = []
     fit = fit_model(made.model, made.campaign.records, NUMERICS, progress=said.append)
-    assert not doubtful(fit.problem, fit.point)
+    assert not doubtful(fit.problem, fit.point, fit.policy)
     assert not any("other starts" in text for text in said)

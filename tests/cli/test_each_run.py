@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
-from bayesoleo import estimation
 from bayesoleo._storage.result_files import read_tree
 from bayesoleo.errors import InputError
+from bayesoleo.estimation import _between_runs
 
 
 def test_each_run_gets_its_line_and_the_runs_are_compared(run, campaign, model, tmp_path):
@@ -33,7 +33,7 @@ def test_estimates_are_written_where_the_runs_cannot_be_compared(
     def refuse(each):
         raise InputError("nothing can be compared", run="slow")
 
-    monkeypatch.setattr(estimation, "between_runs", refuse)
+    monkeypatch.setattr(_between_runs, "between_runs", refuse)
     arguments = ["estimate", campaign, "--model", model, "--each", "--quiet", "--jobs", 1]
     result = run(*arguments, "--out", tmp_path)
     assert result.exit_code == 0, result.output

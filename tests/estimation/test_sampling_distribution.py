@@ -115,9 +115,9 @@ def test_stopped_calculation_goes_on_to_the_same_result(line, tmp_path, monkeypa
     )
     assert len(list(tmp_path.glob("slot-*.npz"))) == 3
     made = []
-    block = module._Work.block
+    block = module._ReplicationTask.block
     monkeypatch.setattr(
-        module._Work, "block", lambda self, n: made.append(list(n)) or block(self, n)
+        module._ReplicationTask, "block", lambda self, n: made.append(list(n)) or block(self, n)
     )
     again = sampling_distribution(problem, TRUTH, out=tmp_path, jobs=2, **options)
     # of the stored ones only the last, cut short, is made again

@@ -74,6 +74,21 @@ def test_posterior(line_fit: bo.Fit) -> None:
     assert posterior.tree.attrs[schema.SEED] == 1
 
 
+def test_each_sample_of_a_function_is_a_data_point(line_fit: bo.Fit, table) -> None:
+    tree = line_fit.sample(seed=1).tree
+    observed, drawn = tree[schema.OBSERVED_DATA], tree[schema.POSTERIOR_PREDICTIVE]
+    assert list(observed.data_vars) == list(drawn.data_vars) == ["y"]
+    np.testing.assert_array_equal(observed["y"], np.asarray(table["y"]))
+    assert arviz.loo(tree).n_data_points == observed["y"].size
+    for plot in (
+        arviz.plot_ppc_dist,
+        arviz.plot_ppc_pit,
+        arviz.plot_ppc_interval,
+        arviz.plot_loo_pit,
+    ):
+        plot(tree, backend="none")
+
+
 def test_missing_term_is_found(line_fit: bo.Fit, tmp_path: Path) -> None:
     found = line_fit.explain(candidates=TERMS)
     assert found.effects == ("cubic",)

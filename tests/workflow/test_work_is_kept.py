@@ -143,7 +143,7 @@ def test_a_late_stage_that_fails_leaves_the_others(
 
 
 def test_a_figure_that_fails_leaves_the_page(campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr("bayesoleo.plots._records", broken)
+    monkeypatch.setattr("bayesoleo.plots.records", broken)
     with pytest.raises(UnfinishedError, match="figure of the data could not be drawn"):
         workflow.trace(campaign, damper(), SETTINGS, out=tmp_path)
     summary, page = read_back(tmp_path)
