@@ -214,7 +214,7 @@ def test_a_hum_in_transients_is_named_with_frequency_and_size(tmp_path):
 def test_what_does_not_hum_is_not_offered_a_frequency(tmp_path):
     state, _ = shaken(tmp_path, lambda t, _: 0.0)
     scales = scales_of(state.fit, None, ("position",))
-    assert scales.hum is None
+    assert scales.dominant_frequency is None
     offered = {option.candidate.effect for option in state.assembly.options(scales)}
     assert "humming_force" not in offered
 

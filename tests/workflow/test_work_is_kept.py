@@ -276,7 +276,7 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
 from small_campaigns import damper
-from bayesoleo import workflow
+from bayesoleo import _workflow as workflow
 from bayesoleo.effects import find_effect
 from bayesoleo._workflow import Settings
 
