@@ -19,4 +19,5 @@ from ._parts import (
     Constant as Constant,
     Scales as Scales,
     ShapeParameter as ShapeParameter,
+    velocity_grid as velocity_grid,
 )

@@ -1,5 +1,6 @@
 from ._branches import (
     follow_branch as follow_branch,
+    limit_cycle as limit_cycle,
 )
 from ._inputs import (
     dynamics_of as dynamics_of,

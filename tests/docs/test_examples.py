@@ -7,10 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from bayesoleo._workflow.simulating import demo_campaign
 from bayesoleo.data._campaign_toml import read_declaration
 from bayesoleo.model import Model
 
 ROOT = Path(__file__).resolve().parents[2]
+#: The campaign that ``bayesoleo demo`` leaves.
+DEMO = "bayesoleo-demo/campaign"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 
@@ -30,6 +33,8 @@ def test_python_of_a_page_runs_from_top_to_bottom(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # pages save figures
+    if any(DEMO in body for body in blocks(page, "python")):
+        demo_campaign(DEMO)
     namespace: dict[str, object] = {}
     for number, body in enumerate(blocks(page, "python"), 1):
         exec(compile(body, f"{page.name}, Python block {number}", "exec"), namespace)
