@@ -1,10 +1,10 @@
-"""Generated source: where it is kept, and the one way in which compiled kernels are called.
+"""Generated source, its folder on disk, and the call of compiled kernels.
 
-A kernel evaluates a block of points that lie next to each other in memory: ``kernel(z, u, p, out,
-count)`` with pointers to rows of :data:`BLOCK` numbers. All kernels share this signature, so what
-calls them - a Newton iteration, an integrator - is compiled once, not once for every model, and a
-call costs nanoseconds. Rows at distances that the compiler knows can be proven not to overlap: that
-is what turns the loop over points into vector instructions.
+A kernel evaluates a block of points that are adjacent in memory: ``kernel(z, u, p, out, count)``
+with pointers to rows of :data:`BLOCK` numbers. All kernels share this signature, so their callers -
+a Newton iteration, an integrator - are compiled once, not once for every model, and a call costs
+nanoseconds. The compiler can prove that rows at known distances do not overlap, and so turns the
+loop over points into vector instructions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from functools import cached_property
 from math import prod
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import numba
 import numpy as np
@@ -29,9 +29,11 @@ import platformdirs
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Integers
+
+#: Compiles a function for other compiled code and for Python, without the interpreter lock.
+jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 #: Points in a block, and the distance between rows.
 BLOCK = 64
@@ -69,9 +71,7 @@ class BlockKernel:
         """Of the compiled function, for :func:`caller`."""
         return int(self.pointer.address)
 
-    def __call__(
-        self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *results: Array
-    ) -> None:
+    def __call__(self, z: Array, u: Array, p: Array, lanes: Integers, *results: Array) -> None:
         """Evaluate lanes of ``z (L, nz, N)``, ``u (nu, N)``, ``p (L, np)`` into one or two arrays
         of shape (L, …, N)."""
         if self.rows:
@@ -95,9 +95,7 @@ class ArrayKernel:
     def __init__(self, function: Callable[..., None], rows: int, sizes: tuple[int, int, int]):
         self.function, self.rows, self.sizes = function, rows, sizes
 
-    def __call__(
-        self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *results: Array
-    ) -> None:
+    def __call__(self, z: Array, u: Array, p: Array, lanes: Integers, *results: Array) -> None:
         """As :meth:`BlockKernel.__call__`."""
         flat = [_flat(result) for result in results]
         for lane in lanes:
@@ -125,6 +123,28 @@ class ArrayKernel:
 
 
 Kernel = BlockKernel | ArrayKernel
+
+
+class ImplicitEquations(Protocol):
+    """Kernels of implicit equations ``g(z, u, p) = 0`` (``bayesoleo.model._kernels.Kernels``)."""
+
+    @property
+    def residual(self) -> Any: ...
+    @property
+    def jacobian(self) -> Any: ...
+    @property
+    def parameters(self) -> Any: ...
+    @property
+    def admissible(self) -> Any: ...
+
+
+class PiecewiseEquations(ImplicitEquations, Protocol):
+    """Kernels of equations whose outputs are their switching functions."""
+
+    @property
+    def output(self) -> Any: ...
+    @property
+    def output_jacobian(self) -> Any: ...
 
 
 class _Callback(types.WrapperAddressProtocol):
@@ -214,7 +234,7 @@ def caller(signature: Any) -> Any:
 call_kernel: Any = caller(SIGNATURE)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@jit
 def _fill(
     kernel: int, z: Array, u: Array, p: Array, lanes: Integers, first: Array, second: Array
 ) -> None:

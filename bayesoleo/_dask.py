@@ -1,7 +1,7 @@
 """Independent tasks on this machine's threads, on processes of it, or on many machines, by Dask.
 
-Nothing is written by workers: they return results, and whoever asked for them keeps them. A worker
-that is lost costs the tasks that it was busy with, which others then do.
+Workers return results and write nothing; the caller stores them. If a worker is lost, others repeat
+the tasks with which it was busy.
 """
 
 from __future__ import annotations

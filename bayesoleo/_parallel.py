@@ -1,4 +1,4 @@
-"""One way to spread independent work over threads.
+"""Distribution of independent work over threads.
 
 Kernels release the interpreter lock, so threads are enough inside one process.
 """

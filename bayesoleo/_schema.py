@@ -1,7 +1,7 @@
-"""Canonical names of everything that is stored, and the check of the summary.
+"""Canonical names of all stored quantities, and the check of the summary.
 
-One DataTree goes from the closed loop to the disk, the plots and the report. Whoever writes or
-reads it takes the names of its groups, dims, variables and root attributes from here, so that a
+One DataTree goes from the closed loop to the disk, the plots and the report. Every writer and
+reader takes the names of its groups, dims, variables and root attributes from here, so that a
 misspelt one is an ``AttributeError`` at once.
 """
 

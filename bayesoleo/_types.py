@@ -1,8 +1,8 @@
-"""Types of arrays that all modules share, and of their shapes.
+"""Array types that all modules share, and the notation of their shapes.
 
-``Float[Array, "runs outputs"]`` is an array of real numbers with two dimensions; of one dimension
+``Float[Array, "runs outputs"]`` is an array of real numbers with two dimensions; for one dimension
 the text begins with a space. Within a class or a function, dimensions of one name have one size;
-those whose names begin with an underscore may differ. Type checkers see the array only; tests hold
+those whose names begin with an underscore may differ. Type checkers see the array only; tests check
 results against the shapes.
 """
 

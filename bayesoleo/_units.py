@@ -1,8 +1,8 @@
-"""Units: what a file is written in, and SI.
+"""Conversion of units in files to SI.
 
-Any unit that pint reads, and those that test rigs write and pint does not: ``psia`` and ``bara``
-(absolute), ``psig`` and ``barg`` (above ambient). All become pascal with no offset, because the
-ambient pressure is not in the unit: a gauge pressure stays one.
+Any unit that pint reads is allowed, and those that test rigs write and pint does not: ``psia`` and
+``bara`` (absolute), ``psig`` and ``barg`` (above ambient). All become pascal with no offset,
+because the ambient pressure is not in the unit: a gauge pressure remains one.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError
 
 #: Pint's base units, by the SI name that a reader expects.
@@ -80,11 +81,11 @@ class Unit:
     factor: float
     shift: float = 0.0
 
-    def to_si(self, value: ArrayLike) -> NDArray[np.float64]:
+    def to_si(self, value: ArrayLike) -> Array:
         """SI values of ``value``, any shape."""
         return np.asarray(value, dtype=float) * self.factor + self.shift
 
-    def from_si(self, value: ArrayLike) -> NDArray[np.float64]:
+    def from_si(self, value: ArrayLike) -> Array:
         """Inverse of :meth:`to_si`."""
         return (np.asarray(value, dtype=float) - self.shift) / self.factor
 

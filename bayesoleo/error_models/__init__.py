@@ -1,4 +1,4 @@
-"""Error models: what the errors of the outputs have in common."""
+"""Error models: the covariance of the errors of the outputs."""
 
 import lazy_loader
 

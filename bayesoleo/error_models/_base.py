@@ -1,15 +1,15 @@
-"""What every error model says: its own quantities, their prior, and how likely residuals are.
+"""Interface of all error models: own quantities, their prior, and the likelihood of residuals.
 
-A problem's residuals ``e = y - yhat`` are normal with a covariance over the samples of a run (and
-over outputs) that depends on a few quantities of the error model's own: variances, correlation
-times, shares. They are sampled beside the parameters, in coordinates without bounds. Runs are
-independent of each other given these quantities.
+A problem's residuals ``e = y - yhat`` are normal. Their covariance over the samples of a run, and
+over outputs, depends on a few quantities of the error model: variances, correlation times, shares.
+These are sampled with the parameters, in unbounded coordinates. Given them, runs are independent of
+each other.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, cast
 
@@ -19,18 +19,15 @@ from scipy.special import ndtr, ndtri
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, Int, Integers
 from bayesoleo.errors import InputError
-from bayesoleo.model._priors import Prior, Transform
+from bayesoleo.model._priors import Prior, Transform, Uniform
 
-#: Spread of the logarithm of a variance before anything is known of it: walkers start from the
-#: residuals' own size, and Newton's method needs a scale only.
+#: Initial scale of the logarithm of a variance for Newton's method; walkers start from the mean
+#: squares of the residuals.
 _LOG_VARIANCE_SD = 0.3
 
 
-Counts = Integers
-
-
 class Measured(Protocol):
-    """What an error model asks of a problem."""
+    """Interface of a problem, as an error model uses it."""
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -41,7 +38,7 @@ class Measured(Protocol):
         """The ``N`` runs."""
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> Integers:
         """Number of samples, shape (N, s)."""
 
 
@@ -66,10 +63,10 @@ class RunSamples:
     time : ndarray, shape (n,)
         Ascending; in seconds, or in the unit of a regression's abscissa.
     frequency : float or None
-        Of the motion that repeats itself, in cycles per unit of ``time``; None for a run that does
-        not.
+        Frequency of a periodic motion, in cycles per unit of ``time``; None for a run that does not
+        repeat.
     origin : float
-        Cycles from the crest of what drives the run to the first sample.
+        Cycles from the crest of the run's input to the first sample.
     """
 
     time: Array
@@ -80,8 +77,8 @@ class RunSamples:
     def phase(self) -> Array:
         """Cycles since the first sample, shape (n,).
 
-        A run that does not repeat itself goes through half a cycle, so that a periodic function of
-        phase can end elsewhere than it began.
+        A run that does not repeat covers half a cycle, so that a periodic function of phase can
+        have different values at its start and end.
         """
         since = self.time - self.time[0]
         if self.frequency is not None:
@@ -90,8 +87,9 @@ class RunSamples:
 
 
 class Probit:
-    """Map of a share between zero and one: the normal quantile, whose tails at both ends fall as a
-    normal's do where those of a logit only fall exponentially."""
+    """Map of a share between zero and one by the normal quantile.
+
+    A uniform share has normal tails in this coordinate; those in a logit are exponential."""
 
     def natural(self, u: Array) -> Array:
         """Share at the coordinate."""
@@ -113,17 +111,17 @@ class Quantity:
     Parameters
     ----------
     name : str
-        As it is stored.
+        Name in stored results.
     low, high : float
-        Its support.
+        Bounds of its support.
     prior : Prior or None
-        None where it is flat, which only the logarithm of a variance is.
+        None where it is flat, which is allowed for logarithms of variances only.
     unit : str
         SI; ``"{}"`` stands for the output's own.
     long_name : str
-        What it is.
+        Description.
     share : bool
-        Whether it is a part of a whole.
+        Whether it is a fraction between zero and one.
     """
 
     name: str
@@ -149,7 +147,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Frame:
-    """What an error model knows of a problem.
+    """Outputs, runs, samples and priors of a problem, for its error model.
 
     Parameters
     ----------
@@ -158,7 +156,7 @@ class Frame:
     counts : ndarray of int, shape (N, s)
         Samples.
     samples : tuple of RunSamples, length N, or None
-        When they were taken, where the problem says.
+        Times of the samples, if the problem gives them.
     log_variance_prior : mapping of str to Prior
         Prior of the logarithm of an output's variance where it is not flat.
     """
@@ -171,7 +169,7 @@ class Frame:
 
     @classmethod
     def of(cls, problem: Measured, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
-        """Of a problem; one without residuals by sample suits models that need sums only."""
+        """Frame of a problem; without residuals by sample it suits models that need sums only."""
         samples = getattr(problem, "samples", None)
         return cls(
             tuple(problem.outputs),
@@ -193,13 +191,31 @@ class Frame:
             for output in self.outputs
         )
 
+    def shares(self, name: Callable[[str], str], text: str) -> tuple[Quantity, ...]:
+        """One share for each output, uniform from 0 to 1; ``text`` describes it, with ``{}``."""
+        return tuple(
+            Quantity(
+                name(output), 0.0, 1.0, Uniform(0.0, 1.0), share=True, long_name=text.format(output)
+            )
+            for output in self.outputs
+        )
+
+    def lengths(
+        self, name: Callable[[str], str], prior: Prior, unit: str, text: str
+    ) -> tuple[Quantity, ...]:
+        """One positive time or length for each output; ``text`` describes it, with ``{}``."""
+        return tuple(
+            Quantity(name(output), 0.0, prior=prior, unit=unit, long_name=text.format(output))
+            for output in self.outputs
+        )
+
     def sampled(self) -> tuple[RunSamples, ...]:
         """When the samples were taken.
 
         Raises
         ------
         InputError
-            If the problem does not say.
+            If the problem does not give them.
         """
         if self.samples is None:
             raise InputError(
@@ -221,13 +237,13 @@ class ErrorModel(ABC):
     Attributes
     ----------
     word : str
-        What it is called where it is chosen.
+        Name by which it is chosen.
     by_sums : bool
-        Whether sums of squares by run and output are all it needs.
+        Whether sums of squares by run and output suffice.
     over_runs : bool
-        Whether runs have errors in common, so that :meth:`of_runs` needs all of them at once.
+        Whether runs share errors, so that :meth:`of_runs` needs all of them at once.
     data_points : str
-        What a block's log density is conditional on, as results say it.
+        Data on which a block's log density is conditional, in words, for results.
     quantities : tuple of Quantity, length m
         The first ``s`` are the logarithms of the outputs' total variances.
     """
@@ -243,7 +259,7 @@ class ErrorModel(ABC):
 
     @abstractmethod
     def _declare(self) -> tuple[Quantity, ...]:
-        """The quantities, those of the variances first."""
+        """Quantities, those of the variances first."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -365,23 +381,23 @@ class ErrorModel(ABC):
     def variance(self, natural: Array, run: str) -> Array:
         """Total variances of the outputs in a run, shape (W, s), from quantities (W, m).
 
-        A run that is not among the problem's is a new one.
+        A label that is not among the problem's denotes a new run.
         """
         return np.exp(natural[:, : len(self.frame.outputs)])
 
     def draw(
         self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
     ) -> Array:
-        """Errors as they would be if a run were repeated.
+        """Draw errors of a repetition of a run.
 
         Parameters
         ----------
         natural : ndarray, shape (W, m)
             Quantities in their units.
         run : str
-            Whose; one that is not among the problem's is a new one.
+            Label of the run; one that is not among the problem's is a new run.
         samples : RunSamples
-            When ``n`` samples are taken, which need not be those of the problem's run.
+            Times of the ``n`` samples, which need not be those of the problem's run.
         rng : numpy.random.Generator
 
         Returns
@@ -395,11 +411,11 @@ class ErrorModel(ABC):
 
 @dataclass(frozen=True)
 class ProfiledErrorModel(ABC):
-    """Covariance of the ``s`` outputs' errors as point estimators eliminate it in each iteration.
+    """Covariance of the ``s`` outputs' errors, which point estimators eliminate in each iteration.
 
-    It says three things of residuals ``e``: which covariance ``V`` maximises the objective at fixed
-    parameters (the staged elimination), how likely they are given one, and which rows of a
-    least-squares problem they make when whitened by it. ``V`` is kept as (s,) where it is diagonal.
+    For residuals ``e`` it gives the covariance ``V`` that maximises the objective at fixed
+    parameters (the staged elimination), their likelihood given ``V``, and the rows of a
+    least-squares problem that result from whitening by ``V``. A diagonal ``V`` is kept as (s,).
 
     References
     ----------
@@ -407,20 +423,20 @@ class ProfiledErrorModel(ABC):
     *Nonlinear Parameter Estimation*, section 4-9, for the determinant criterion.
     """
 
-    def check(self, counts: Counts) -> None:
+    def check(self, counts: Integers) -> None:
         """Raise an :class:`InputError` if samples by run and output, (N, s), do not suit."""
         return
 
     @abstractmethod
     def moments(self, evaluation: Residuals) -> Array:
-        """What the likelihood knows of the residuals."""
+        """Moments of the residuals that determine the likelihood."""
 
     @abstractmethod
-    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+    def stage(self, moments: Array, counts: Integers, unknowns: int, bias_corrected: bool) -> Array:
         """``V`` that maximises the objective at fixed parameters, (s,) or (s, s)."""
 
     @abstractmethod
-    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Integers) -> float:
         """Logarithm of the likelihood with ``V`` held."""
 
     @abstractmethod
@@ -432,9 +448,9 @@ class ProfiledErrorModel(ABC):
         """``V^-1 e`` of each output."""
 
     def eliminated(
-        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Integers
     ) -> Array:
-        """What eliminating ``V`` takes from the Hessian, (l, l): ``H_tv H_vv^-1 H_vt``.
+        """Schur complement ``H_tv H_vv^-1 H_vt`` (l, l) that eliminating ``V`` subtracts.
 
         References
         ----------
@@ -449,9 +465,9 @@ def normal_blocks(white: Array, log_sd: Array, starts: Integers) -> Array:
     Parameters
     ----------
     white : ndarray, shape (L, s, n)
-        Independent, of unit variance.
+        Whitened samples: independent, of unit variance.
     log_sd : ndarray, shape (L, s)
-        Logarithm of the standard deviation that was divided by.
+        Logarithm of the standard deviation by which they were divided.
     starts : ndarray of int, shape (B,)
         First sample of each block.
 

@@ -5,14 +5,14 @@ r"""Correlated errors: white noise and an Ornstein-Uhlenbeck process, in time O(
     e(t) = \epsilon(t) + x(t), \qquad \operatorname{cov}(e_i, e_j) =
     v \left[ (1 - \rho)\, \delta_{ij} + \rho \exp(-|t_i - t_j| / \tau) \right].
 
-``v`` is the total variance, :math:`\rho` the share that is correlated and :math:`\tau` the time it
-is correlated over. Without white noise (:math:`\rho = 1`) samples that are equally spaced are
-AR(1). Alone that would not do: noise of the sensor is white, what a model lacks is not, and their
-sum would look short-lived to a process that has to be both.
+``v`` is the total variance, :math:`\rho` the correlated share and :math:`\tau` the correlation
+time. Without white noise (:math:`\rho = 1`) equally spaced samples are AR(1). That alone would not
+suffice: sensor noise is white and model error is not, and a single process fitted to their sum
+would underestimate the correlation time.
 
-Between two samples the process keeps :math:`\exp(-\Delta t / \tau)` of itself, whatever
-:math:`\Delta t` is: gaps and unequal sampling need no care. A Kalman filter with one state
-whitens a record in one pass.
+Between two samples the process decays by :math:`\exp(-\Delta t / \tau)` for any :math:`\Delta t`,
+so gaps and unequal sampling need no special treatment. A Kalman filter with one state whitens a
+record in one pass.
 
 References
 ----------
@@ -27,29 +27,27 @@ import math
 from collections.abc import Sequence
 from typing import cast
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from bayesoleo import _schema as schema
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import Frame, Quantity, RunSamples
 from bayesoleo.error_models._independent import ByOutput
-from bayesoleo.model._priors import LogNormal, Uniform
+from bayesoleo.model._priors import LogNormal
 
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
-# Steps of sampling that a correlation time is likely to exceed.
+# Number of sampling intervals that a correlation time is likely to exceed.
 _LEAST_STEPS = 4
-# Sampling steps that differ by less than this part of their median are the same.
+# Sampling intervals that differ by less than this part of their median count as equal.
 _EQUAL = 1e-6
-jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit
 def _log_likelihood(residual: Array, kind: Integers, steps: Array, eta: Array, out: Array) -> None:
-    """Log-likelihood of rows ``(L, n)``; ``kind (n - 1)`` says which of ``steps`` lies between."""
+    """Log-likelihood of rows ``(L, n)``; ``kind (n - 1)`` indexes ``steps``, the intervals."""
     n = residual.shape[1]
     decay = np.empty(steps.size)
     for lane in range(residual.shape[0]):
@@ -107,11 +105,11 @@ def _whiten(
 
 
 class CorrelatedErrors(ByOutput):
-    """White noise and an Ornstein-Uhlenbeck process for each output; every run starts anew.
+    """White noise and an Ornstein-Uhlenbeck process for each output; independent between runs.
 
-    Flat in the logarithm of the total variance, uniform in the share that is correlated, and
-    log-normal in its time, with four sampling intervals and the longest record two standard
-    deviations either side of the middle.
+    The prior is flat in the logarithm of the total variance, uniform in the correlated share, and
+    log-normal in the correlation time, with four sampling intervals and the longest record two
+    standard deviations either side of the median.
     """
 
     word = "correlated"
@@ -122,38 +120,21 @@ class CorrelatedErrors(ByOutput):
         self._steps = [_kinds(np.diff(run.time)) for run in frame.sampled()]
 
     def _declare(self) -> tuple[Quantity, ...]:
-        outputs, samples = self.frame.outputs, self.frame.sampled()
+        frame, samples = self.frame, self.frame.sampled()
         shortest = min(float(np.median(np.diff(run.time))) for run in samples)
         longest = max(float(run.time[-1] - run.time[0]) for run in samples)
-        # Shorter than a step it would be white noise once more, of a share that no data know.
+        # A process shorter than a sampling interval would be white noise, of an undetermined share.
         shortest = min(_LEAST_STEPS * shortest, 0.5 * longest)
         reach = max(0.25 * float(np.log(longest / shortest)), 0.5)
         time = LogNormal(float(np.sqrt(shortest * longest)), reach)
-        shares = tuple(
-            Quantity(
-                schema.correlated_share(output),
-                0.0,
-                1.0,
-                Uniform(0.0, 1.0),
-                share=True,
-                long_name=f"share of the error variance of {output} that is correlated in time",
-            )
-            for output in outputs
-        )
-        times = tuple(
-            Quantity(
-                schema.correlation_time(output),
-                0.0,
-                prior=time,
-                unit="s",
-                long_name=f"correlation time of the error of {output}",
-            )
-            for output in outputs
-        )
-        return (*self.frame.log_variances(), *shares, *times)
+        share_text = "share of the error variance of {} that is correlated in time"
+        shares = frame.shares(schema.correlated_share, share_text)
+        time_text = "correlation time of the error of {}"
+        times = frame.lengths(schema.correlation_time, time, "s", time_text)
+        return (*frame.log_variances(), *shares, *times)
 
     def log_new(self, share: Array, log_length: Array) -> Array:
-        """Of the filter that has settled, at the usual sampling interval."""
+        """Innovation variance of the settled filter, at the usual sampling interval."""
         part, white = ndtr(share), ndtr(-share)
         with np.errstate(over="ignore", under="ignore"):
             left = -np.expm1(-2 * self._usual * np.exp(-log_length))  # 1 - a^2
@@ -168,9 +149,7 @@ class CorrelatedErrors(ByOutput):
         _log_likelihood(residual, *self._steps[run], eta, out)
         return out
 
-    def blocks_of_output(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_output(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         white, log_sd = np.empty_like(residual), np.empty_like(residual)
         for lane in range(len(residual)):
             rows = slice(lane, lane + 1)
@@ -194,14 +173,14 @@ class CorrelatedErrors(ByOutput):
 
 
 def _kinds(steps: Array) -> tuple[np.ndarray, Array]:
-    """Which of the different sampling steps each one is, and their lengths."""
+    """Index of each sampling interval among the distinct ones, and their lengths."""
     unit = _EQUAL * float(np.median(steps))
     _, first, kind = np.unique(np.round(steps / unit), return_index=True, return_inverse=True)
     return kind.astype(np.int64), steps[first]
 
 
 def covariance(time: Sequence[float] | Array, v: float, share: float, tau: float) -> Array:
-    """The covariance itself, shape (n, n), for whoever wants to see it."""
+    """Covariance matrix of the errors, shape (n, n)."""
     t = np.asarray(time, dtype=float)
     kernel = np.exp(-np.abs(t[:, None] - t) / tau)
     return cast(Array, v * ((1 - share) * np.eye(t.size) + share * kernel))

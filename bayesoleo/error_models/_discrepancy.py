@@ -1,20 +1,20 @@
-r"""A discrepancy that repeats itself: white noise and a Gaussian process over phase.
+r"""Periodic model discrepancy: white noise and a Gaussian process over phase.
 
 .. math::
 
     e(t) = \epsilon(t) + \delta(f t), \qquad
     \operatorname{cov}(\delta(\phi), \delta(\phi')) = v \rho\, k_\ell(\phi - \phi').
 
-What a model lacks is itself an answer to the motion. In a periodic steady state that motion
-repeats, so the discrepancy :math:`\delta` is the same function of phase in every period: more
-periods tell it apart from noise, but never average it away, which a process in time would let them
-do. Each run has its own :math:`\delta`; size and length are common to an output's runs.
+Model discrepancy is a function of the motion. In a periodic steady state the motion repeats, so the
+discrepancy :math:`\delta` is the same function of phase in every period. More periods separate it
+from noise but never average it out, whereas they would average out a process in time. Each run has
+its own :math:`\delta`; variance and length are common to the runs of an output.
 
-The correlation is Matérn's of order 3/2 around the circle, with length :math:`\ell` in cycles: once
-differentiable, because friction and contacts leave kinks. It is written as a Fourier series that is
-cut off, so a record costs one projection on its harmonics and, unless it holds whole periods of
-equal steps, one small factorisation. Of a run
-that does not repeat itself the record is half a cycle, over which a periodic function can be any.
+The correlation is Matérn's of order 3/2 around the circle, with length :math:`\ell` in cycles. It
+is once differentiable, because friction and contacts leave kinks. A truncated Fourier series
+represents it, so a record costs one projection on its harmonics and, unless it holds whole periods
+of equal steps, one small factorisation. The record of a run that does not repeat is taken as half a
+cycle, over which a periodic function is unrestricted.
 
 References
 ----------
@@ -29,26 +29,24 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array
+from bayesoleo._compiled import jit
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import Frame, Quantity, RunSamples
 from bayesoleo.error_models._independent import ByOutput
-from bayesoleo.model._priors import LogNormal, Uniform
+from bayesoleo.model._priors import LogNormal
 
-#: Harmonics of the series: the shortest length that it shows is about a fiftieth of a cycle.
+#: Harmonics of the series: the shortest length that it resolves is about a fiftieth of a cycle.
 HARMONICS = 24
 #: Prior of the length in cycles: within a factor of four of a tenth.
 _LENGTH = LogNormal(0.1, 0.7)
-# Products of two functions of the basis, over those with themselves, that count as none.
+# Products of two basis functions, relative to their squares, that count as zero.
 _NONE = 1e-10
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
-jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 def spectrum(length: Array) -> Array:
@@ -139,7 +137,7 @@ def _log_likelihood(
 def _without_products(
     projected: Array, squares: Array, count: int, gram: Array, weight: Array, eta: Array, out: Array
 ) -> None:
-    """The same where no two functions of the basis have a product."""
+    """The same for an orthogonal basis."""
     size = gram.shape[0]
     for lane in range(projected.shape[0]):
         share = 0.5 * math.erfc(-eta[lane, 1] / SQRT_2)
@@ -156,7 +154,7 @@ def _without_products(
 
 
 def without_products(gram: Array) -> bool:
-    """Whether functions of the basis have none with each other: whole periods of equal steps.
+    """Whether the basis is orthogonal, as over whole periods of equal steps.
 
     Parameters
     ----------
@@ -168,10 +166,10 @@ def without_products(gram: Array) -> bool:
 
 
 class DiscrepancyErrors(ByOutput):
-    """White noise and a Gaussian process over phase for each output; every run has its own.
+    """White noise and a Gaussian process over phase for each output; independent between runs.
 
-    Flat in the logarithm of the total variance, uniform in the share of the discrepancy, log-normal
-    in its length.
+    The prior is flat in the logarithm of the total variance, uniform in the share of the
+    discrepancy, and log-normal in its length.
     """
 
     word = "discrepancy"
@@ -185,36 +183,18 @@ class DiscrepancyErrors(ByOutput):
         ]
 
     def _declare(self) -> tuple[Quantity, ...]:
-        outputs = self.frame.outputs
-        shares = tuple(
-            Quantity(
-                schema.discrepancy_share(output),
-                0.0,
-                1.0,
-                Uniform(0.0, 1.0),
-                share=True,
-                long_name=f"share of the error variance of {output} that repeats every period",
-            )
-            for output in outputs
-        )
-        lengths = tuple(
-            Quantity(
-                schema.discrepancy_length(output),
-                0.0,
-                prior=_LENGTH,
-                unit="1",
-                long_name=f"length in cycles over which the discrepancy of {output} is alike",
-            )
-            for output in outputs
-        )
+        share_text = "share of the error variance of {} that repeats every period"
+        shares = self.frame.shares(schema.discrepancy_share, share_text)
+        length_text = "length in cycles over which the discrepancy of {} is alike"
+        lengths = self.frame.lengths(schema.discrepancy_length, _LENGTH, "1", length_text)
         return (*self.frame.log_variances(), *shares, *lengths)
 
     def log_new(self, share: Array, log_length: Array) -> Array:
-        """The white part: of a curve that repeats itself nothing is new for long."""
+        """Variance of the white part: a repeating curve is known after its first period."""
         return np.asarray(log_ndtr(-share))
 
     def _phase(self, run: RunSamples) -> Array:
-        """Where a run's samples lie in its cycle."""
+        """Phase of a run's samples, in cycles."""
         return run.phase
 
     def of_output(self, run: int, residual: Array, eta: Array) -> Array:
@@ -226,10 +206,8 @@ class DiscrepancyErrors(ByOutput):
         self._kernels[run](projected, squares, residual.shape[1], gram, weight, eta, out)
         return out
 
-    def blocks_of_output(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
-        # The density of all blocks up to one, less that of all before it.
+    def blocks_of_output(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
+        # Log density of all blocks up to one, less that of all before it.
         table, weight = self._tables[run], spectrum(np.exp(eta[:, 2]))
         lanes, size = len(residual), table.shape[1]
         gram, projected, squares = np.zeros((size, size)), np.zeros((lanes, size)), np.zeros(lanes)

@@ -1,13 +1,9 @@
-"""Linearised residuals and most likely values of an error model's quantities.
+"""Linearised residuals, and the most likely values of an error model's quantities.
 
-Gradient and Hessian of a density from one batch of rows.
-
-Where the quantities of an error model are most likely, with the residuals held.
-
-Residuals and sensitivities compressed to the few numbers that a step needs.
-
-The QR factors of ``[sensitivity, residual]`` hold everything that the normal equations hold, at
-half their loss of digits: forming ``A`` squares the condition number.
+The QR factors of ``[sensitivity, residual]`` hold the same information as the normal equations at
+half the loss of digits: forming ``A`` squares the condition number. The quantities of an error
+model are maximised over with the residuals held, with gradient and Hessian of the density from one
+batch of rows.
 """
 
 from __future__ import annotations
@@ -16,9 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.error_models._base import Residuals
 
 #: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding
@@ -29,15 +24,15 @@ STEP = 0.25
 def derivatives(
     height: Callable[[Array], Array], phi: Array, factor: Array
 ) -> tuple[float, Array, Array]:
-    """Height, gradient and Hessian by central differences in ``z`` of ``phi + factor @ z``.
+    """Value, gradient and Hessian by central differences in ``z`` of ``phi + factor @ z``.
 
     Parameters
     ----------
     height : callable
-        Of rows, shape (W, d), shape (W,). Called once, with ``d^2 + d + 1`` rows.
+        Log density (W,) of rows (W, d). Called once, with ``d^2 + d + 1`` rows.
     phi : ndarray, shape (d,)
     factor : ndarray, shape (d, d)
-        Makes ``z`` a vector of standard deviations, roughly.
+        Scales ``z`` to about standard deviations.
 
     Returns
     -------
@@ -63,26 +58,26 @@ def derivatives(
     return float(centre), gradient, hessian
 
 
-# Differences are taken over so much, in coordinates of about unit spread.
+# Finite-difference step, in coordinates of about unit spread.
 _SCALE = 0.2
-# A walker need not start at the top: the sampler goes on from here.
+# Tolerance of the maximum; a walker need not start exactly there.
 _GAIN, _ITERATIONS = 1e-3, 40
-# Longest step, and furthest from the first guess: beyond it a share is zero or one for any purpose.
+# Longest step, and largest distance from the first guess; beyond it a share is practically 0 or 1.
 _RADIUS, _REACH = 3.0, 12.0
-# Least curvature a step is taken by.
+# Least curvature that a step divides by.
 _FLAT = 1e-2
 
 
 def climb(height: Callable[[Array], Array], guesses: Sequence[Array]) -> Array:
-    """The best of the maxima that are reached from some guesses.
+    """Highest of the maxima that are reached from some guesses.
 
-    Newton's method, all rows of an iteration in one call: for three coordinates a library's
-    minimiser, which asks for one row at a time, spends its time on itself.
+    Newton's method evaluates all rows of an iteration in one call. For three coordinates a
+    library's minimiser, which evaluates one row at a time, would be dominated by its overhead.
 
     Parameters
     ----------
     height : callable
-        Of coordinates (W, m), shape (W,); what is not finite is taken for very low.
+        Log density (W,) of coordinates (W, m); values that are not finite count as very low.
     guesses : sequence of ndarray, shape (m,)
 
     Returns
@@ -97,7 +92,7 @@ def climb(height: Callable[[Array], Array], guesses: Sequence[Array]) -> Array:
 
 
 def _top(height: Callable[[Array], Array], guess: Array) -> tuple[float, Array]:
-    """Height and place of the maximum next to a guess."""
+    """Value and position of the maximum next to a guess."""
     eta, lengths = np.array(guess, dtype=float), 0.5 ** np.arange(10)
     scale = _SCALE * np.eye(eta.size)
     before = float(height(eta[None])[0])
@@ -117,18 +112,19 @@ def _top(height: Callable[[Array], Array], guess: Array) -> tuple[float, Array]:
 
 
 def _uphill(gradient: Array, hessian: Array, flat: float) -> Array:
-    """Newton's step with all curvatures turned downwards: it leads away from saddles."""
+    """Newton's step with all curvatures made negative, so that it leads away from saddles."""
     curvature, axes = np.linalg.eigh(hessian)
     return axes @ ((axes.T @ gradient) / np.maximum(np.abs(curvature), flat))
 
 
 # Rows of one block of a tall matrix.
 _BLOCK = 1024
-#: Singular values below this part of the largest are zero but for the derivatives' rounding, which
-#: reaches 1e-13 of a column where they are differences. Certified sets need down to 1e-9.
+#: Singular values below this part of the largest count as zero. Rounding of derivatives reaches
+#: 1e-13 of a column where they are differences; certified data sets need values down to 1e-9.
 RANK = 1e-11
-# Part of an unknown, its column of unit length, that lies in directions without a singular value:
-# those are known to the derivatives' rounding over the least singular value that counts.
+# Share of an unknown, with its column of unit length, in undetermined directions, above which it
+# counts as undetermined. Directions are known to the rounding of derivatives over the least
+# singular value that counts.
 _TAKES_PART = 1e-3
 
 
@@ -164,9 +160,9 @@ class LinearisedResidual:
 
 
 def triangle(matrix: Array) -> Array:
-    """Triangular factor of a tall matrix: blocks that stay in the cache first, then their factors.
+    """Triangular factor of a tall matrix: blocks that fit the cache first, then their factors.
 
-    Orthogonal whatever the cut, and small enough for a linear algebra library to start no threads.
+    The blocks are small enough for a linear algebra library to start no threads.
     """
     height, width = matrix.shape
     if height <= width:
@@ -182,15 +178,15 @@ def triangle(matrix: Array) -> Array:
 def least_squares(rows: Array, target: Array, rank: float | None = None) -> Array:
     """Solution of ``rows @ x = target`` in the least-squares sense, of minimum norm if not unique.
 
-    Columns are brought to unit length first, so that the rank is judged without regard to units.
+    Columns are brought to unit length first, so that the rank does not depend on units.
 
     Parameters
     ----------
     rows : ndarray, shape (k, l)
     target : ndarray, shape (k,) or (k, m)
     rank : float, optional
-        Singular values below this part of the largest are taken for zero; by default those that the
-        factorisation's own rounding would leave.
+        Singular values below this part of the largest count as zero; by default the rounding level
+        of the factorisation.
 
     Returns
     -------
@@ -224,16 +220,15 @@ def inverse_gram(rows: Array, rank: float | None = None) -> Array:
     return masked(*pseudo_inverse_gram(rows, rank))
 
 
-def masked(covariance: Array, undetermined: NDArray[np.bool_]) -> Array:
+def masked(covariance: Array, undetermined: Flags) -> Array:
     """A covariance (l, l) with NaN in the rows and columns of some unknowns, shape (l,)."""
     return np.where(undetermined | undetermined[:, None], np.nan, covariance)
 
 
-def pseudo_inverse_gram(rows: Array, rank: float | None = None) -> tuple[Array, NDArray[np.bool_]]:
-    """Moore and Penrose's inverse of ``rows' rows``, and which unknowns have none of their own.
+def pseudo_inverse_gram(rows: Array, rank: float | None = None) -> tuple[Array, Flags]:
+    """Moore-Penrose inverse of ``rows' rows``, and the unknowns that are undetermined.
 
-    Columns are brought to unit length first, as in :func:`least_squares`: a rank must not depend on
-    units.
+    Columns are brought to unit length first, as in :func:`least_squares`.
 
     Parameters
     ----------
@@ -260,6 +255,6 @@ def pseudo_inverse_gram(rows: Array, rank: float | None = None) -> tuple[Array, 
     open_part = np.sqrt(np.sum(directions[count:] ** 2, axis=0))
     with np.errstate(over="ignore", invalid="ignore"):
         inverse = root @ root.T
-    # A column of 1e-160 has a variance beyond all numbers: the rows do not determine its unknown.
+    # A column of 1e-160 has a variance that overflows: the rows do not determine its unknown.
     endless = ~np.isfinite(np.diag(inverse))
     return inverse, (open_part > _TAKES_PART) | endless

@@ -1,22 +1,16 @@
-r"""One covariance over the outputs: full, or given.
+r"""One covariance over the outputs, the same for every sample: estimated in full, or given.
 
-One full covariance over the outputs, the same for every sample.
-
-``V = D R D`` with variances ``D^2``, flat in their logarithms, and a correlation matrix ``R`` that
-is uniform over all there are. Its coordinates are :math:`\operatorname{artanh}` of canonical
-partial correlations, which any numbers make a valid ``R`` of.
-
-References
-----------
-Verbeek (1993), eqs. 2.27-2.28. Lewandowski, Kurowicka and Joe (2009), "Generating random
-correlation matrices based on vines and extended onion method", *Journal of Multivariate Analysis*
-100, sections 2 and 3 (uniform is their :math:`\eta = 1`).
-
-Errors of known covariance: point estimates weighted by what was measured beforehand.
+The estimated covariance is ``V = D R D`` with variances ``D^2``, whose prior is flat in their
+logarithms, and a correlation matrix ``R`` with a uniform prior over all correlation matrices. The
+coordinates of ``R`` are :math:`\operatorname{artanh}` of canonical partial correlations: any real
+values give a valid ``R``. A given covariance weights point estimates by noise that was measured
+beforehand.
 
 References
 ----------
-Verbeek (1993), eqs. 2.25 and 2.33.
+Verbeek (1993), eqs. 2.25, 2.27-2.28 and 2.33. Lewandowski, Kurowicka and Joe (2009), "Generating
+random correlation matrices based on vines and extended onion method", *Journal of Multivariate
+Analysis* 100, sections 2 and 3 (uniform is their :math:`\eta = 1`).
 """
 
 from __future__ import annotations
@@ -26,14 +20,12 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import betaln
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import (
-    Counts,
     ErrorModel,
     Frame,
     ProfiledErrorModel,
@@ -48,13 +40,13 @@ from bayesoleo.error_models._independent import staged_variance
 from bayesoleo.errors import InputError
 
 _LOG_2_PI = float(np.log(2 * np.pi))
-# Correlations of a start are kept so far from one that their coordinates are finite.
+# Largest correlation of a start, so that its coordinate is finite.
 _MOST = 0.999
-# A covariance of outputs that repeat each other is singular; this part of its trace keeps it apart.
+# Ridge, as part of the trace: the covariance of linearly dependent outputs is singular.
 _RIDGE = 1e-14
 
 
-def _check_same_samples(counts: Counts, key: str, instead: str) -> None:
+def _check_same_samples(counts: Integers, key: str, instead: str) -> None:
     """Raise an :class:`InputError` unless all outputs of a run have as many samples, (N, s)."""
     if (counts != counts[:, :1]).any():
         raise InputError(
@@ -168,9 +160,7 @@ class FullErrors(ErrorModel):
                 total[lane] -= 0.5 * np.sum(row_of_lane * row_of_lane)
         return total
 
-    def blocks_of_run(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_run(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         s = len(self.frame.outputs)
         factor, sd = self._factor(eta), np.exp(0.5 * eta[:, :s])
         white = np.linalg.solve(factor, residual / sd[:, :, None])
@@ -210,28 +200,28 @@ class FullErrors(ErrorModel):
 class ProfiledFullErrors(ProfiledErrorModel):
     """One full covariance for all samples: the determinant criterion (eqs. 2.27-2.28)."""
 
-    def check(self, counts: Counts) -> None:
+    def check(self, counts: Integers) -> None:
         _check_same_samples(counts, "objective", "diagonal")
 
     def moments(self, evaluation: Residuals) -> Array:
         residual = np.stack(evaluation.residual)
         return residual @ residual.T
 
-    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+    def stage(self, moments: Array, counts: Integers, unknowns: int, bias_corrected: bool) -> Array:
         floor = np.diag(
             staged_variance(np.diag(moments), counts, unknowns, bias_corrected=bias_corrected)
         )
         degrees = counts[0] - unknowns / len(counts) if bias_corrected else counts[0]
         return np.asarray(moments / degrees + _RIDGE * floor)
 
-    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Integers) -> float:
         determinant = np.linalg.slogdet(covariance)[1]
         return float(
             -0.5 * (counts[0] * determinant + np.trace(np.linalg.solve(covariance, moments)))
         )
 
     def rows(self, evaluation: Residuals, unit: Array, covariance: Array) -> tuple[Array, Array]:
-        # One factor of all outputs side by side holds their products with each other as well.
+        # One factor of all outputs side by side also holds their cross products.
         columns = zip(evaluation.sensitivity, evaluation.residual, strict=True)
         factor = triangle(np.column_stack([part for j, e in columns for part in (j * unit, e)]))
         outputs, width = len(covariance), unit.size + 1
@@ -243,7 +233,7 @@ class ProfiledFullErrors(ProfiledErrorModel):
         return tuple(np.linalg.solve(covariance, np.stack(residual)))
 
     def eliminated(
-        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Integers
     ) -> Array:
         root = _root(covariance)
         residual = root @ np.stack(evaluation.residual)
@@ -261,7 +251,7 @@ def _root(covariance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class GivenErrors(ProfiledErrorModel):
-    """Known covariances, one for each sample or one for all (eqs. 2.25 and 2.33).
+    """Given covariances, one for each sample or one for all (eqs. 2.25 and 2.33).
 
     Parameters
     ----------
@@ -305,7 +295,7 @@ class GivenErrors(ProfiledErrorModel):
             f"({outputs}, {outputs}), one or one for each sample",
         )
 
-    def check(self, counts: Counts) -> None:
+    def check(self, counts: Integers) -> None:
         sizes = counts.sum(axis=0)
         if isinstance(self.roots, tuple):
             fits = all(r.size in (1, n) for r, n in zip(self.roots, sizes, strict=True))
@@ -329,13 +319,13 @@ class GivenErrors(ProfiledErrorModel):
         white = self._whiten([e[:, None] for e in evaluation.residual])
         return np.array([float(np.sum(white * white))])
 
-    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+    def stage(self, moments: Array, counts: Integers, unknowns: int, bias_corrected: bool) -> Array:
         if isinstance(self.roots, tuple):
             return np.array([float(np.mean(r**-2.0)) for r in self.roots])
         lower = np.linalg.inv(self.roots)
         return np.asarray((lower @ lower.swapaxes(1, 2)).mean(axis=0))
 
-    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Integers) -> float:
         if isinstance(self.roots, tuple):
             logs = sum(
                 float(np.log(r).sum()) * (n / r.size)

@@ -1,8 +1,6 @@
-"""Errors that are independent between outputs.
+"""Errors that are independent between outputs, each output with quantities of its own.
 
-Error models whose outputs are independent of each other, each with its own few quantities.
-
-Independent errors: one variance for each output, one for all, or one for each output and run.
+Independent errors have one variance for each output, one for all, or one for each output and run.
 
 References
 ----------
@@ -17,12 +15,10 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import (
-    Counts,
     ErrorModel,
     Frame,
     ProfiledErrorModel,
@@ -36,20 +32,20 @@ from bayesoleo.error_models._fitting import LinearisedResidual, climb
 from bayesoleo.errors import InputError
 from bayesoleo.model._priors import LogNormal
 
-#: Coordinates of a share from which the climb to its most likely value starts: a fifth, a half, and
+#: Starting coordinates of a share in the search for its most likely value: a fifth, a half, and
 #: nine tenths.
 _SHARES = (-0.85, 0.0, 1.3)
 
 
 class ByOutput(ErrorModel):
-    """White noise and a part that is not, for each output: total variance, share, and a length.
+    """White and coloured noise for each output: total variance, coloured share, and a length.
 
-    Of output ``b`` three numbers say all: ``ln v_b``, the normal quantile of the share, and the
-    logarithm of the length. The first is not a coordinate itself: samples determine far better what
-    is new in each of them, given those before, than the total variance of which the part that is
-    alike over long stretches is seen a few times only. The coordinate is the logarithm of the
-    variance of what is new; the step between the two depends on the other coordinates alone, so
-    that densities over both are equal.
+    Output ``b`` has three quantities: ``ln v_b``, the normal quantile of the share, and the
+    logarithm of the length. The first is not a coordinate itself. Samples determine the innovation
+    variance, given the samples before, far better than the total variance, because a record holds
+    few correlation lengths of the coloured part. The coordinate is the logarithm of the innovation
+    variance. Its difference from ``ln v_b`` depends on the other coordinates alone, so that
+    densities over both are equal.
     """
 
     data_points = "one period of one run, given the periods before it"
@@ -68,9 +64,7 @@ class ByOutput(ErrorModel):
         """
 
     @abstractmethod
-    def blocks_of_output(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_output(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         """Log density of blocks of one output, each given those before it, shape (L, B)."""
 
     @abstractmethod
@@ -79,7 +73,7 @@ class ByOutput(ErrorModel):
 
     @abstractmethod
     def log_new(self, share: Array, log_length: Array) -> Array:
-        """Logarithm of the variance of what is new in a sample over the total, shape (W,)."""
+        """Logarithm of the innovation variance over the total variance, shape (W,)."""
 
     def _places(self, b: int) -> list[int]:
         s = len(self.frame.outputs)
@@ -94,7 +88,7 @@ class ByOutput(ErrorModel):
         return part
 
     def _direct(self, eta: Array, sign: int) -> Array:
-        """All of these from all coordinates (sign -1), or back (+1)."""
+        """Direct quantities from coordinates (sign -1), or back (+1)."""
         out = np.array(eta, dtype=float)
         for b in range(len(self.frame.outputs)):
             first, share, length = (np.ascontiguousarray(out[:, k]) for k in self._places(b))
@@ -118,9 +112,7 @@ class ByOutput(ErrorModel):
             total += self.of_output(run, row, self._part(eta, b))
         return total
 
-    def blocks_of_run(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_run(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         parts = [
             self.blocks_of_output(
                 run, np.ascontiguousarray(residual[:, b]), self._part(eta, b), starts
@@ -138,7 +130,7 @@ class ByOutput(ErrorModel):
 
     @abstractmethod
     def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
-        """The part that is not white, of unit variance, shape (W, n); length (W,)."""
+        """Draw the coloured part, of unit variance, shape (W, n); length (W,)."""
 
     def draw(
         self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
@@ -177,8 +169,8 @@ class ByOutput(ErrorModel):
         return sd
 
 
-#: How much logarithms of variances differ between runs: e-fold a standard deviation either way of
-#: 0.3, which reaches from runs that are alike to one whose noise is three times another's.
+#: Prior spread of the logarithms of variances between runs: 0.3 within a factor of e for one
+#: standard deviation, from equal runs to noise that differs threefold.
 _SPREAD_PRIOR = LogNormal(0.3, 1.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
 # A model that reproduces its data exactly has no residual variance; its logarithm must stay finite.
@@ -191,13 +183,13 @@ def sums_of_squares(evaluation: Residuals) -> Array:
         return np.array([float(np.sum(residual * residual)) for residual in evaluation.residual])
 
 
-def output_counts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def output_counts(counts: Integers) -> Integers:
     """Number of samples of each output over all runs, shape (s,), from counts of shape (N, s)."""
     return np.asarray(counts, dtype=np.int64).sum(axis=0)
 
 
 def staged_variance(
-    sums: Array, counts: NDArray[np.int64], unknowns: int = 0, *, bias_corrected: bool = False
+    sums: Array, counts: Integers, unknowns: int = 0, *, bias_corrected: bool = False
 ) -> Array:
     """Variance of each output that maximises the objective at fixed parameters.
 
@@ -235,7 +227,7 @@ def staged_variance(
     return np.maximum(sums / degrees, _SMALLEST_VARIANCE)
 
 
-def log_likelihood(sums: Array, variance: Array, counts: NDArray[np.int64]) -> float:
+def log_likelihood(sums: Array, variance: Array, counts: Integers) -> float:
     """Logarithm of the likelihood (Verbeek 1993, eqs. 2.31-2.32).
 
     Parameters
@@ -254,9 +246,7 @@ def log_likelihood(sums: Array, variance: Array, counts: NDArray[np.int64]) -> f
         return float(-0.5 * np.sum(counts * np.log(variance) + sums / variance))
 
 
-def log_likelihood_by_run(
-    sum_of_squares: Array, counts: NDArray[np.int64], log_variance: Array
-) -> Array:
+def log_likelihood_by_run(sum_of_squares: Array, counts: Integers, log_variance: Array) -> Array:
     """Normalised log-likelihood of every run.
 
     Parameters
@@ -306,9 +296,7 @@ class IndependentErrors(ErrorModel):
     def of_sums(self, sums: Array, eta: Array) -> Array:
         return log_likelihood_by_run(sums, self.frame.counts, eta)
 
-    def blocks_of_run(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_run(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         log_sd = 0.5 * eta
         return normal_blocks(residual * np.exp(-log_sd)[:, :, None], log_sd, starts)
 
@@ -328,10 +316,10 @@ class ProfiledIndependentErrors(ProfiledErrorModel):
     def moments(self, evaluation: Residuals) -> Array:
         return sums_of_squares(evaluation)
 
-    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+    def stage(self, moments: Array, counts: Integers, unknowns: int, bias_corrected: bool) -> Array:
         return staged_variance(moments, counts, unknowns, bias_corrected=bias_corrected)
 
-    def log_likelihood(self, moments: Array, covariance: Array, counts: Counts) -> float:
+    def log_likelihood(self, moments: Array, covariance: Array, counts: Integers) -> float:
         return log_likelihood(moments, covariance, counts)
 
     def rows(self, evaluation: Residuals, unit: Array, covariance: Array) -> tuple[Array, Array]:
@@ -341,7 +329,7 @@ class ProfiledIndependentErrors(ProfiledErrorModel):
         return tuple(e / v for e, v in zip(residual, covariance, strict=True))
 
     def eliminated(
-        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Integers
     ) -> Array:
         cross = _cross(evaluation, unit) / covariance[:, None]
         return np.asarray(2 * (cross / counts[:, None]).T @ cross)
@@ -349,15 +337,15 @@ class ProfiledIndependentErrors(ProfiledErrorModel):
 
 @dataclass(frozen=True)
 class ProfiledCommonErrors(ProfiledIndependentErrors):
-    """One variance for everything: where it is largest, so is the unweighted sum (eq. 2.35)."""
+    """One variance for everything: it minimises the unweighted sum of squares (eq. 2.35)."""
 
-    def stage(self, moments: Array, counts: Counts, unknowns: int, bias_corrected: bool) -> Array:
+    def stage(self, moments: Array, counts: Integers, unknowns: int, bias_corrected: bool) -> Array:
         total, number = moments.sum(keepdims=True), counts.sum(keepdims=True)
         variance = staged_variance(total, number, unknowns, bias_corrected=bias_corrected)
         return np.repeat(variance, len(moments))
 
     def eliminated(
-        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Counts
+        self, evaluation: Residuals, unit: Array, covariance: Array, counts: Integers
     ) -> Array:
         cross = _cross(evaluation, unit).sum(axis=0) / covariance[0]
         return 2 * np.outer(cross, cross) / counts.sum()
@@ -372,9 +360,9 @@ def _cross(evaluation: Residuals, unit: Array) -> Array:
 class PerRunErrors(ErrorModel):
     """One variance for each output and run; their logarithms are normal about a common mean.
 
-    The mean is flat, and the scatter ``spread_log_variance`` is log-normal about 0.3. A variance of
-    each run's own without anything in common would leave the density of a run that was left out
-    undefined, and with it every comparison by leaving runs out.
+    The prior is flat in the mean and log-normal about 0.3 in the scatter ``spread_log_variance``.
+    With unrelated variances the density of a left-out run would be undefined, and with it
+    every cross-validation by run.
 
     References
     ----------
@@ -386,7 +374,7 @@ class PerRunErrors(ErrorModel):
     def __init__(self, frame: Frame) -> None:
         super().__init__(frame)
         runs, outputs = frame.counts.shape
-        # Place of each run's own among the coordinates.
+        # Positions of the runs' own variances among the coordinates.
         self._own = 2 * outputs + np.arange(runs * outputs).reshape(runs, outputs)
 
     def _declare(self) -> tuple[Quantity, ...]:
@@ -431,9 +419,7 @@ class PerRunErrors(ErrorModel):
             )[:, 0]
         return total
 
-    def blocks_of_run(
-        self, run: int, residual: Array, eta: Array, starts: NDArray[np.int64]
-    ) -> Array:
+    def blocks_of_run(self, run: int, residual: Array, eta: Array, starts: Integers) -> Array:
         log_sd = 0.5 * eta[:, self._own[run]]
         return normal_blocks(residual * np.exp(-log_sd)[:, :, None], log_sd, starts)
 
@@ -470,7 +456,7 @@ class PerRunErrors(ErrorModel):
         white = super().draw(natural, run, samples, rng)
         if run in self.frame.runs:
             return white
-        # Nothing is known of a new run's variance but how much others scatter.
+        # The variance of a new run follows the scatter of the others.
         outputs = len(self.frame.outputs)
         scatter = natural[:, outputs : 2 * outputs] * rng.standard_normal((len(natural), outputs))
         return np.exp(0.5 * scatter)[:, :, None] * white

@@ -1,22 +1,19 @@
-"""The error models by name: one line each.
-
-What the errors of the outputs have in common: one file and one word a model.
+"""The error models by name.
 
 Each model has up to two forms: quantities that are sampled with the parameters
 (:class:`ErrorModel`), and a covariance that point estimators eliminate in each iteration
 (:class:`ProfiledErrorModel`). A new model is one file and one line in the table below.
 
-=============== ====================================================================================
-word            errors
-=============== ====================================================================================
-``independent`` one variance for each output (Verbeek 1993, eqs. 2.29-2.30)
-``per-run``     one variance for each output and run
-``full``        one covariance over the outputs (eqs. 2.27-2.28)
-``correlated``  white noise and an Ornstein-Uhlenbeck process in time, for each output
-``discrepancy`` white noise and a Gaussian process over phase that repeats itself, for each output
-=============== ====================================================================================
-
-``shared-discrepancy`` is the last with a part of the process that all runs share.
+====================== =============================================================================
+word                   errors
+====================== =============================================================================
+``independent``        one variance for each output (Verbeek 1993, eqs. 2.29-2.30)
+``per-run``            one variance for each output and run
+``full``               one covariance over the outputs (eqs. 2.27-2.28)
+``correlated``         white noise and an Ornstein-Uhlenbeck process in time, for each output
+``discrepancy``        white noise and a periodic Gaussian process over phase, for each output
+``shared-discrepancy`` as ``discrepancy``, with a part of the process that all runs share
+====================== =============================================================================
 """
 
 from __future__ import annotations
@@ -42,7 +39,7 @@ from bayesoleo.model._priors import Prior
 
 @dataclass(frozen=True)
 class _Forms:
-    """The two forms of a model; None where it has only the other."""
+    """The sampled and the eliminated form of a model; None where it lacks one."""
 
     sampled: type[ErrorModel] | None
     profiled: type[ProfiledErrorModel] | None
@@ -58,7 +55,7 @@ _REGISTRY = {
     "common": _Forms(None, ProfiledCommonErrors),
     "given": _Forms(None, GivenErrors),
 }
-#: Those that are sampled; the first is the default.
+#: Names of the models that can be sampled; the first is the default.
 ERROR_MODELS: tuple[str, ...] = tuple(word for word, form in _REGISTRY.items() if form.sampled)
 
 
@@ -92,7 +89,7 @@ def error_model(
     word : str
         One of :data:`ERROR_MODELS`.
     problem : Problem
-        What is fitted. All but ``independent`` and ``per-run`` need one that gives residuals by
+        Problem to fit. All but ``independent`` and ``per-run`` need one that gives residuals by
         sample, :class:`~bayesoleo.estimation._problem.ResidualProblem`.
     log_variance_prior : mapping of str to Prior, optional
         By output, the prior of the logarithm of its variance; by default flat.

@@ -1,4 +1,4 @@
-r"""A discrepancy part of which all runs share.
+r"""Periodic model discrepancy of which runs share a part.
 
 .. math::
 
@@ -8,15 +8,15 @@ r"""A discrepancy part of which all runs share.
     \operatorname{cov}(\delta_r(\phi), \delta_r(\phi'))
     = v \rho (1 - \kappa)\, k_\ell(\phi - \phi').
 
-A run shows what a model lacks, and so do the others: what is missing in all of them is alike where
-they go through the same part of the motion. If each had a discrepancy of its own
-(:class:`~bayesoleo.error_models.DiscrepancyErrors`), more runs would average it
-away, and intervals would shrink about a value that stays off. Here :math:`\kappa` says how much of
-it they share; at zero each has its own. Phases count from the crest of what drives a run.
+An effect that the model lacks in all runs acts alike wherever they pass through the same part of
+the motion. If each run had an independent discrepancy
+(:class:`~bayesoleo.error_models.DiscrepancyErrors`), more runs would average it out, and intervals
+would shrink about a biased value. Here :math:`\kappa` is the shared fraction; at zero each run has
+its own discrepancy. Phases count from the crest of a run's input.
 
 Runs are then not independent. The common curve has few coefficients, so each run adds a term to
-one small system; the log-likelihood of a run is that *given the runs before it*, whose sum is
-that of all.
+one small system. The log-likelihood of a run is conditional on the runs before it; their sum is the
+joint log-likelihood.
 
 References
 ----------
@@ -30,11 +30,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import Frame, Quantity, RunSamples
 from bayesoleo.error_models._discrepancy import (
@@ -44,18 +43,16 @@ from bayesoleo.error_models._discrepancy import (
     spectrum,
     without_products,
 )
-from bayesoleo.model._priors import Uniform
 
 SQRT_2 = math.sqrt(2.0)
 _LOG_2_PI = float(np.log(2 * np.pi))
-# Least part of a run's own: less is rounded away.
+# Least share of a run's own discrepancy, for rounding.
 _LEAST_OWN = 1e-9
-jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit
 def _answer(factor: Array, right: Array, out: Array) -> float:
-    """Solution of ``L L' out = right``; the part of it after the first sweep has norm ``sum``."""
+    """Solve ``L L' out = right``; returns the squared norm after the forward sweep."""
     size, total = right.size, 0.0
     for i in range(size):
         value = right[i]
@@ -129,7 +126,7 @@ def _diagonal(
     projected: Array, squares: Array, counts: Integers, grams: Array, weight: Array, eta: Array,
     out: Array,
 ) -> None:  # fmt: skip
-    """The same where no two functions of the basis have a product."""
+    """The same for an orthogonal basis."""
     runs, lanes, size = projected.shape
     joint, common = np.empty(size), np.empty(size)
     for lane in range(lanes):
@@ -158,7 +155,7 @@ def _diagonal(
 
 @jit
 def _parts(eta: Array) -> tuple[float, float, float, float]:
-    """Shares of the discrepancy and of noise, a run's own part of it, and common over own."""
+    """Shares of discrepancy and noise, the run's own part, and the ratio of common to own part."""
     share, noise = 0.5 * math.erfc(-eta[1] / SQRT_2), 0.5 * math.erfc(eta[1] / SQRT_2)
     own = max(0.5 * math.erfc(eta[3] / SQRT_2), _LEAST_OWN)
     return share, noise, own, (1.0 - own) / own
@@ -167,8 +164,7 @@ def _parts(eta: Array) -> tuple[float, float, float, float]:
 class SharedDiscrepancyErrors(DiscrepancyErrors):
     """White noise, a Gaussian process over phase that all runs share, and one of each run.
 
-    Priors as of :class:`~bayesoleo.error_models.DiscrepancyErrors`; uniform
-    in the part of the discrepancy that is common.
+    Priors as of :class:`~bayesoleo.error_models.DiscrepancyErrors`; uniform in the shared fraction.
     """
 
     word = "shared-discrepancy"
@@ -181,31 +177,21 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
         self._kernel = _diagonal if without_products(self._stack) else _dense
 
     def _declare(self) -> tuple[Quantity, ...]:
-        common = tuple(
-            Quantity(
-                schema.discrepancy_common(output),
-                0.0,
-                1.0,
-                Uniform(0.0, 1.0),
-                share=True,
-                long_name=f"part of the discrepancy of {output} that all runs share",
-            )
-            for output in self.frame.outputs
-        )
-        return (*super()._declare(), *common)
+        text = "part of the discrepancy of {} that all runs share"
+        return (*super()._declare(), *self.frame.shares(schema.discrepancy_common, text))
 
     def _phase(self, run: RunSamples) -> Array:
         return run.phase + run.origin
 
     def start(self, residuals: Sequence[Array]) -> Array:
-        eta = super().start(residuals)  # of discrepancies of the runs' own
+        eta = super().start(residuals)  # for independent discrepancies
         eta[3 * len(self.frame.outputs) :] = 0.0
         return eta
 
     def of_blocks(
-        self, residuals: Sequence[Array], eta: Array, starts: Sequence[NDArray[np.int64]]
+        self, residuals: Sequence[Array], eta: Array, starts: Sequence[Integers]
     ) -> list[Array]:
-        """Whole runs: a period given those before it and all other runs would cost too much."""
+        """Blocks are whole runs; periods conditional on all other runs would cost too much."""
         if any(len(first) != 1 for first in starts):
             raise ValueError("blocks of runs that have errors in common are whole runs")
         every = np.stack(self._by_output(residuals, eta), axis=1)
@@ -218,7 +204,7 @@ class SharedDiscrepancyErrors(DiscrepancyErrors):
         return total
 
     def _by_output(self, residuals: Sequence[Array], eta: Array) -> list[Array]:
-        """Log-likelihood of each run given those before it, (L, N) by output."""
+        """Log-likelihood of each run given the runs before it, (L, N) by output."""
         outputs, lanes, found = len(self.frame.outputs), len(eta), []
         counts = np.array([e.shape[2] for e in residuals])
         for b in range(outputs):

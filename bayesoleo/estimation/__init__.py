@@ -1,4 +1,4 @@
-"""Which parameter values fit, and how sure is that, at a point."""
+"""Point estimates, their intervals and identifiability, and simulated experiments."""
 
 import lazy_loader
 

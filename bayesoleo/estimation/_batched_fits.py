@@ -1,19 +1,14 @@
-"""Fits of one problem to many data sets at once.
+"""Fits of one problem to many data sets at once: simulated experiments or bootstrap samples.
 
-Many data sets on their way to their estimates, one batch of linear algebra an iteration.
-
-Full steps only: what needs more care is given up here, and left to the estimator for one.
-
-Fit one problem to many data sets: replications of a simulated experiment, or bootstrap samples.
-
-Well-behaved data sets walk together, one batch of linear algebra an iteration. One that needs more
-than full steps - a step that does not help, a limit of the support, a solve that fails, equations
-near singularity - is handed to :func:`~bayesoleo.estimation.estimate`, alone and from the start.
-So both ways end at the same point, and only the hard cases pay for care.
+Well-behaved data sets are iterated together, with one batch of linear algebra for each iteration
+and full steps only. A data set leaves the batch when a step does not reduce its objective, when it
+reaches a bound of the support, when a solve fails, or when its equations are nearly singular. It is
+then fitted alone and from its start by :func:`~bayesoleo.estimation.estimate`. Both ways end at the
+same point, and only difficult data sets cost more.
 
 References
 ----------
-Verbeek (1993), eqs. 2.18-2.20 (what replications are for) and 3.17-3.23 (the steps).
+Verbeek (1993), eqs. 2.18-2.20 (use of replications) and 3.17-3.23 (the steps).
 """
 
 from __future__ import annotations
@@ -23,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo._parallel import single_blas_thread, thread_map
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
@@ -53,9 +48,9 @@ class Lanes:
     theta: Array
     variance: Array
     covariance: Array
-    status: NDArray[np.int64]
-    iterations: NDArray[np.int64]
-    done: NDArray[np.bool_]
+    status: Integers
+    iterations: Integers
+    done: Flags
 
     def keep(self, lane: int, point: PointEstimate) -> None:
         """Take over what the careful estimator found."""
@@ -148,7 +143,7 @@ class BatchedFit:
 
     def _proposal(
         self, theta: Array, equations: BatchNormalEquations, variance: Array
-    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    ) -> tuple[Array, Flags, Flags]:
         """Scaled steps (L, l), which of them may be taken in full, and which are small."""
         scale, step = self.scale, self.step
         unit = scale.unit(theta)
@@ -175,7 +170,7 @@ class BatchedFit:
     def _store(
         self,
         lanes: Lanes,
-        where: NDArray[np.int64],
+        where: Integers,
         theta: Array,
         equations: BatchNormalEquations,
         iteration: int,
@@ -204,7 +199,7 @@ def _inverse(precision: Array) -> Array:
         )
 
 
-def _rows_of(equations: BatchNormalEquations, which: NDArray[np.bool_]) -> BatchNormalEquations:
+def _rows_of(equations: BatchNormalEquations, which: Flags) -> BatchNormalEquations:
     return BatchNormalEquations(
         equations.gram[which],
         equations.slope[which],
@@ -214,11 +209,11 @@ def _rows_of(equations: BatchNormalEquations, which: NDArray[np.bool_]) -> Batch
 
 
 def _only(
-    which: NDArray[np.bool_],
-    alive: NDArray[np.int64],
+    which: Flags,
+    alive: Integers,
     theta: Array,
     equations: BatchNormalEquations,
-) -> tuple[NDArray[np.int64], Array, BatchNormalEquations]:
+) -> tuple[Integers, Array, BatchNormalEquations]:
     return alive[which], theta[which], _rows_of(equations, which)
 
 
@@ -258,9 +253,9 @@ class Replications:
         return len(self.theta)
 
     @property
-    def ok(self) -> NDArray[np.bool_]:
+    def ok(self) -> Flags:
         """Which estimates converged, shape (R,)."""
-        return cast(NDArray[np.bool_], self.status == Status.CONVERGED)
+        return cast(Flags, self.status == Status.CONVERGED)
 
     @property
     def sd(self) -> Array:
@@ -367,7 +362,7 @@ def estimate_many(
 
 
 def _with_measured(
-    found: Replications, names: tuple[str, ...], starts: Array, measured: NDArray[np.bool_]
+    found: Replications, names: tuple[str, ...], starts: Array, measured: Flags
 ) -> Replications:
     """The same in all unknowns: those that were held are where they started, and have no scatter of
     their own."""

@@ -1,26 +1,20 @@
 """The estimators BE, MVE, MMVE and MBE, and the Levenberg-Marquardt step, by name.
 
-The estimators' steps: each says only how the prior enters the linear equations.
+An estimator decides how the prior enters the linear equations of a step. In scaled unknowns
+(``w = 1``) every step solves ``min |J d - e|^2 + |P d - r|^2``, with whitened sensitivities ``J``
+and residuals ``e``. The estimator chooses the rows ``P``, how these change from step to step, and
+the right-hand side ``r``: the slope of the prior for BE, zero for the others.
 
-In scaled unknowns (``w = 1``) every step solves ``min |J d - e|^2 + |P d - r|^2``, with whitened
-sensitivities ``J`` and residuals ``e``. An estimator is the choice of the rows ``P``, of how they
-are carried on, and of whether the prior pulls: ``r`` is its slope for BE and zero for the others.
+Levenberg-Marquardt also adds a weight to ``J'J``. The weight follows the success of the last steps
+instead of the prior, so that the method also converges where a prior is too wide to scale anything.
+It is written as a trust region: the weight keeps the step within a given length.
 
 References
 ----------
 Verbeek (1993), eqs. 3.19-3.23, with Hendriks's MMVE.
 
-Levenberg-Marquardt as a trust region: the weight is what keeps a step within a known length.
-
-Like MBE it adds a weight to ``A``, but the weight follows success instead of the prior, so that it
-finds its way where a prior is far too wide to scale anything.
-
-References
-----------
 Levenberg (1944); Marquardt (1963); Moré (1978), "The Levenberg-Marquardt algorithm: implementation
 and theory", for the lengths, the secular equation and the update of the radius.
-
-The estimators by name.
 """
 
 from __future__ import annotations
@@ -40,14 +34,14 @@ from bayesoleo.estimation._least_squares import WhitenedEquations
 
 @dataclass(frozen=True)
 class Step[State]:
-    """What an estimator adds to the least-squares equations.
+    """Step of an estimator: the rows that it adds to the least-squares equations.
 
-    The state is whatever a step carries from one iteration to the next.
+    The state is carried from one iteration to the next.
     """
 
-    #: how a user asks for it
+    #: name of the estimator
     name: ClassVar[str] = ""
-    #: whether the prior stays where it was declared, and so belongs to the merit function
+    #: whether the prior keeps its declared centre, and so belongs to the merit function
     fixed_prior: ClassVar[bool] = False
     #: whether steps may shrink before the optimum is reached
     locks: ClassVar[bool] = False
@@ -58,9 +52,9 @@ class Step[State]:
     #: whether the prior enters at all
     weighted: ClassVar[bool] = True
 
-    #: whether it keeps steps within a length of its own
+    #: whether it bounds the length of steps itself
     limits_length: ClassVar[bool] = False
-    #: iterations after which it is given up
+    #: largest number of iterations
     most: ClassVar[int] = 100
     #: whether it takes the residual's second derivatives into account
     second_order: ClassVar[bool] = False
@@ -70,7 +64,7 @@ class Step[State]:
         """State before the first iteration, for the prior's precision ``root' root``, (l, l)."""
 
     def prepare(self, state: State, equations: WhitenedEquations) -> State:
-        """State with what the equations of this iteration ask for."""
+        """State updated for the equations of this iteration."""
         return state
 
     @abstractmethod
@@ -78,17 +72,17 @@ class Step[State]:
         """Rows ``P``, shape (l, l) or (0, l), for whitened sensitivities of shape (k, l)."""
 
     def accept(self, state: State, jacobian: Array, ratio: float, taken: Array) -> State:
-        """State after a step with these sensitivities, and its ratio of real to expected gain."""
+        """State after a step with these sensitivities and this ratio of actual to expected gain."""
         return state
 
     def refuse(self, state: State, step: Array) -> State | None:
-        """State with which to try a shorter step, or None to halve the step instead."""
+        """State for a shorter step, or None to halve the step instead."""
         return None
 
 
 @dataclass(frozen=True)
 class PriorStep(Step[Array]):
-    """A step whose state is the rows that it adds: at first the prior's."""
+    """A step whose state is the rows that it adds, initially those of the prior."""
 
     def begin(self, root: Array) -> Array:
         return root
@@ -176,7 +170,7 @@ class GaussNewtonStep(PriorStep):
 class NewtonStep(PriorStep):
     """Newton's method on the objective with ``v`` eliminated (Verbeek 1993, Appendix A).
 
-    All that it adds is in its equations: see
+    It adds no rows; its equations differ, see
     :func:`bayesoleo.estimation._objectives.newton_equations`.
     """
 
@@ -188,14 +182,14 @@ class NewtonStep(PriorStep):
         return np.zeros((0, jacobian.shape[1]))
 
 
-# A step may miss the radius by this part of it, which saves iterations of the secular equation.
+# Relative tolerance on the radius, which saves iterations of the secular equation.
 _SLACK = 0.1
 _MAX_SECULAR = 20
-# A radius that fell below this moves nothing.
+# Least radius: a shorter step changes nothing.
 _SMALLEST = 1e-100
-# Ratios of real to promised gain below which the radius shrinks, and from which it grows.
+# Ratios of actual to predicted gain below which the radius shrinks, and from which it grows.
 _POOR, _GOOD = 0.25, 0.75
-# What a refused step leaves of the radius, and one that gained little.
+# Factors on the radius after a refused step, and after one with little gain.
 _SHRINK, _HALF = 0.25, 0.5
 
 
@@ -210,7 +204,7 @@ class TrustRegion:
     length : ndarray, shape (l,)
         Longest columns of the sensitivities so far.
     weight : float
-        What multiplies the lengths in the rows that keep the present step within the radius.
+        Factor on the lengths in the rows that keep the present step within the radius.
     """
 
     radius: float
@@ -231,12 +225,12 @@ class LevenbergMarquardtStep(Step[TrustRegion]):
         return TrustRegion(np.nan, np.zeros(len(root)))
 
     def prepare(self, state: TrustRegion, equations: WhitenedEquations) -> TrustRegion:
-        # The staged variance shrinks by decades on the way; lengths must not change with it.
+        # The staged variance shrinks by decades in the iteration; lengths must not follow it.
         jacobian = equations.noise * equations.jacobian
         length = np.maximum(state.length, np.linalg.norm(jacobian, axis=0))
         length = np.where(length > 0, length, 1.0)
         radius = state.radius
-        if np.isnan(radius):  # the first step is at most as long as the start is large
+        if np.isnan(radius):  # the first step is at most as long as the start vector
             radius = float(np.linalg.norm(length * equations.place)) or 1.0
         free = ~equations.held
         weight = _weight((jacobian / length)[:, free], equations.noise * equations.residual, radius)
@@ -309,7 +303,7 @@ METHODS: dict[str, Step[Any]] = {
     )
 }
 
-# What people type.
+# Accepted spellings of the names.
 _SHORT = {"lm": "levenberg-marquardt", "gn": "gauss-newton"}
 
 

@@ -1,14 +1,4 @@
-r"""Scatter of parameters between runs: common mean and spread.
-
-Common mean and spread of estimates with known covariances, in units of order one.
-
-References
-----------
-Jackson, Riley and White (2011), "Multivariate meta-analysis: potential and promise", *Statistics in
-Medicine* 30, eqs. 2-5 (the likelihood). Viechtbauer (2007), "Confidence intervals for the amount of
-heterogeneity in meta-analysis", *Statistics in Medicine* 26 (the interval of a spread).
-
-How much do parameters really differ from run to run? A hierarchical view of per-run estimates.
+r"""Scatter of parameters between runs: common mean and spread of the estimates of each run.
 
 The estimate of run :math:`\kappa` is taken as normal about the run's own parameters, and these as
 normal about a common mean:
@@ -16,8 +6,9 @@ normal about a common mean:
 .. math:: \hat\theta_\kappa \sim N(\theta_\kappa, S_\kappa), \qquad \theta_\kappa \sim N(\mu, T).
 
 The spread :math:`T` is estimated by restricted maximum likelihood, the mean by generalised least
-squares, and each run's parameters are pulled towards the mean as far as their own uncertainty
-suggests (empirical Bayes). No model is solved: this takes milliseconds.
+squares. The parameters of each run are shrunk towards the mean according to their own uncertainty
+(empirical Bayes). Computations are in units of order one. No model is solved, so this takes
+milliseconds.
 
 References
 ----------

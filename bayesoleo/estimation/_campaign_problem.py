@@ -1,4 +1,4 @@
-"""A model over reduced runs, as a problem that can be fitted."""
+"""Estimation problem of a model and the reduced runs of a campaign."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
@@ -36,7 +35,7 @@ class CampaignProblem:
     """
 
     def __init__(
-        self, predictor: Predictor, free: NDArray[np.int64] | None = None, full: Array | None = None
+        self, predictor: Predictor, free: Integers | None = None, full: Array | None = None
     ):
         self.predictor = predictor
         self._last: tuple[Array, Evaluation] | None = None
@@ -80,7 +79,7 @@ class CampaignProblem:
         return self._full[self._free]
 
     @property
-    def branch_jumps(self) -> NDArray[np.int64]:
+    def branch_jumps(self) -> Integers:
         """Solutions so far, by run, that left the branch of the one they started from, (N,)."""
         return np.array([run.jumps for run in self.predictor.runs], dtype=np.int64)
 
@@ -154,7 +153,7 @@ class CampaignProblem:
             for r, record in enumerate(self.predictor.records)
         )
 
-    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+    def residuals(self, theta: Array, run: int) -> tuple[Array, Integers]:
         """Residuals (L, s, n) of one run at vectors (L, l) and statuses (L,), from the anchor."""
         samples = self.predictor.simulate(self.full(theta), run)
         return self.kept(run, self.predictor.runs[run].measured - samples.y), samples.status

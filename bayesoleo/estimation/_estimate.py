@@ -1,9 +1,4 @@
-"""Entry points of estimation: ``estimate`` and ``polish``.
-
-From where an estimator ended to a point estimate with its linearised covariance.
-
-Entry points: estimate the unknowns of a problem, and move on to the posterior's mode.
-"""
+"""Entry points of estimation: ``estimate`` fits a problem, ``polish`` finds the posterior mode."""
 
 from __future__ import annotations
 
@@ -42,8 +37,8 @@ from bayesoleo.estimation._scipy_methods import MOST_ITERATIONS, PREFIX, run_sci
 from bayesoleo.prediction._stability import Stability
 from bayesoleo.solvers._orbit import added
 
-# Residuals below this part of the largest sample are rounding: of a sum of hundreds of terms, or of
-# samples that were written with thirteen digits.
+# Residuals below this part of the largest sample are rounding errors of a sum of hundreds of terms,
+# or of samples that were written with thirteen digits.
 _ROUNDING = 1e-13
 
 
@@ -96,8 +91,7 @@ def summarise(
 
 
 def _exact(problem: EstimationProblem, variance: Array) -> tuple[str, ...]:
-    """Outputs whose residuals are as small as the rounding of their samples, where those are
-    known."""
+    """Outputs whose residuals are at the rounding level of their known samples."""
     data = getattr(problem, "data", None)
     if data is None:
         return ()
@@ -107,7 +101,7 @@ def _exact(problem: EstimationProblem, variance: Array) -> tuple[str, ...]:
 
 
 def _stability(problem: EstimationProblem, outcome: Outcome) -> Stability | None:
-    """Of the runs' periodic solutions at the estimate; None where there are none."""
+    """Stability of the runs' periodic solutions at the estimate; None where there are none."""
     matrices = outcome.evaluation.monodromy
     if not any(matrix is not None for matrix in matrices):
         return None
@@ -123,9 +117,7 @@ def _error_covariance(
 ) -> Array:
     """Covariance of the outputs' errors at the estimate, (s, s)."""
     counts, errors = output_counts(problem.counts), objective.errors
-    if isinstance(
-        errors, ProfiledCommonErrors
-    ):  # what weights all alike says nothing of their errors
+    if isinstance(errors, ProfiledCommonErrors):  # equal weights give no information on the errors
         sums = sums_of_squares(outcome.evaluation)
         unknowns = len(problem.names)
         staged = staged_variance(sums, counts, unknowns, bias_corrected=bias_corrected)
@@ -138,7 +130,7 @@ def _error_covariance(
 def _covariances(
     scale: PriorScale, outcome: Outcome, objective: Objective, error: Array
 ) -> tuple[Array, Array]:
-    """LinearisedResidual covariance of the unknowns with and without the prior, each (l, l).
+    """Linearised covariance of the unknowns with and without the prior, each (l, l).
 
     References
     ----------
@@ -165,7 +157,7 @@ def _covariances(
 Progress = Callable[[Iteration], None]
 Method = str | Step[Any]
 
-#: MBE finds its way where the prior says how far to go, Levenberg-Marquardt where it says nothing.
+#: MBE needs a prior that scales its steps; Levenberg-Marquardt converges without one.
 DEFAULT_METHODS: tuple[Method, ...] = ("mbe", "levenberg-marquardt")
 
 
@@ -187,18 +179,18 @@ def estimate(
     Parameters
     ----------
     problem : EstimationProblem
-        What is fitted.
+        Problem to fit.
     method : str or Step, or sequence of them, optional
         ``"be"``, ``"mve"``, ``"mmve"``, ``"mbe"``, ``"gauss-newton"``, ``"levenberg-marquardt"``,
-        ``"newton"``, or ``"scipy:"`` and the name of one of SciPy's optimisers. Of several, each
-        begins at the start until one converges. ``"be"``, ``"newton"`` and SciPy's end in a mode of
-        the posterior where the objective has a prior; the others in the maximum-likelihood point,
-        for which the prior only scales the steps: they hold nuisance parameters and constants known
-        to a tolerance where they start, and carry their uncertainty into the covariance. Unknowns
-        with a log-normal prior are stepped in their logarithm, but the mode is that of the density
-        per unit of the unknown itself.
+        ``"newton"``, or ``"scipy:"`` and the name of one of SciPy's optimisers. Several are
+        tried in order, each from the start, until one converges. ``"be"``, ``"newton"`` and SciPy's
+        find a mode of the posterior where the objective has a prior. The others find the
+        maximum-likelihood point and use the prior only to scale the steps: they hold nuisance
+        parameters and constants known to a tolerance at the start, and carry their uncertainty into
+        the covariance. Unknowns with a log-normal prior are stepped in their logarithm, but the
+        mode is that of the density per unit of the unknown itself.
     objective : str or Objective, optional
-        What is maximised: ``"diagonal"`` (the thesis's standard), ``"full"``, ``"given"``,
+        Objective to maximise: ``"diagonal"`` (the thesis's standard), ``"full"``, ``"given"``,
         ``"likelihood"``, ``"determinant"``, ``"weighted"`` or ``"unweighted"``; see
         :data:`bayesoleo.estimation.OBJECTIVES`.
     error_covariance : array_like or sequence of array_like, optional
@@ -212,10 +204,10 @@ def estimate(
         linearised standard deviation where that is larger.
     max_iterations : int, optional
         By default 100, and 1000 for Levenberg-Marquardt and for SciPy's optimisers, which take
-        many small steps where the others would have given up.
+        many small steps where the others would stop.
     resolution : float, optional
-        Converged also where the optimum is nearer than this many standard deviations: what is
-        below, the data cannot tell. Zero asks for digits alone.
+        Converged also where the optimum is nearer than this many standard deviations, because the
+        data cannot resolve smaller differences. Zero requires the relative step.
     bias_corrected : bool, optional
         Divide the sums of squares by ``n - l/s`` instead of ``n``.
     progress : callable, optional
@@ -260,7 +252,7 @@ def estimate(
 def _one(
     problem: EstimationProblem, method: Method, start: Array, objective: Objective, limits: _Limits
 ) -> PointEstimate:
-    """By one method; one that forgets the priors holds what was measured beside the data."""
+    """Estimate by one method; one that disregards priors holds the nuisance parameters."""
     measured = measured_of(problem)
     if measured.any() and not _counts_prior(method, objective):
         section = without_measured(problem, start, measured)
@@ -272,14 +264,14 @@ def _one(
 
 
 def _counts_prior(method: Method, objective: Objective) -> bool:
-    """Whether an estimator ends where the prior wants it, too."""
+    """Whether the prior belongs to an estimator's objective."""
     by_scipy = isinstance(method, str) and method.startswith(PREFIX)
     return objective.prior and (by_scipy or find_method(method).fixed_prior)
 
 
 @dataclass(frozen=True)
 class _Limits:
-    """When an estimator stops, and whom it tells."""
+    """Stopping rule of an estimator, and its progress callback."""
 
     tolerance: float
     max_iterations: int | None
@@ -290,7 +282,7 @@ class _Limits:
     def run(
         self, problem: EstimationProblem, method: Method, start: Array, objective: Objective
     ) -> tuple[str, Outcome]:
-        """Name of the estimator, and how it ended."""
+        """Name of the estimator, and its outcome."""
         common: dict[str, Any] = {
             "tolerance": self.tolerance,
             "bias_corrected": self.bias_corrected,
@@ -314,7 +306,7 @@ class _Limits:
 
 
 def _height(point: PointEstimate) -> float:
-    """By which failed estimates are compared: what they have reached in the likelihood."""
+    """Log-likelihood that a failed estimate reached, to compare failures."""
     with np.errstate(divide="ignore"):
         return -float(np.nan_to_num(np.log(point.variance), nan=np.inf).sum())
 

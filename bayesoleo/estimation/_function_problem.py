@@ -1,11 +1,8 @@
-"""Explicit regression ``y = f(x, theta)`` as a problem.
+"""Explicit regression ``y = f(x, theta)`` as a problem with one run and one output.
 
-Call a function of one parameter vector for many of them.
-
-``function(x, theta)`` with ``theta[i]`` a number usually works unchanged where ``theta[i]`` is a
-column of numbers, because NumPy broadcasts. Whether it does is tried, not assumed.
-
-An explicit regression ``y = f(x, theta)`` as a problem with one run and one output.
+The function is written for one parameter vector. Because NumPy broadcasts, it usually also accepts
+a column of numbers for each ``theta[i]``, and then evaluates many vectors in one call. This is
+tested for each function, and a loop is used where it fails.
 """
 
 from __future__ import annotations
@@ -15,9 +12,9 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
@@ -220,7 +217,7 @@ class FunctionProblem:
         return ("1",)
 
     @property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Integers:
         """Number of samples, shape (1, 1)."""
         return np.array([[self._y.size]], dtype=np.int64)
 
@@ -303,7 +300,7 @@ class FunctionProblem:
         place = x.astype(float) if usable else np.arange(self._y.size, dtype=float)
         return (RunSamples(place, None),)
 
-    def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
+    def residuals(self, theta: Array, run: int) -> tuple[Array, Integers]:
         """Residuals (L, 1, n) at vectors (L, l), and statuses (L,)."""
         rows = np.stack([self._residual(vector) for vector in np.asarray(theta, dtype=float)])
         failed = ~np.isfinite(rows).all(axis=1)

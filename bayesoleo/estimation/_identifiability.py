@@ -1,15 +1,11 @@
-"""Identifiability: directions that the data determine, posterior against prior.
+"""Identifiability: directions that the data determine, and posterior against prior.
 
-Directions in which the data know much and little, in the model's own words.
+The Hessian of the objective, with each unknown in units of its own scale, has principal axes. The
+data determine the combination of parameters along a stiff axis, and do not along a sloppy one
+(Verbeek 1993, eqs. 2.44 and 2.45; the axes after Gutenkunst et al. 2007).
 
-The curvature of the objective, with every unknown in units of a scale of its own, has principal
-axes. Along a stiff one the data fix a combination of parameters, along a sloppy one they do not
-(Verbeek 1993, eqs. 2.44 and 2.45; the axes are ours, after Gutenkunst et al. 2007).
-
-Which parameters did the data say nothing about? Posterior against prior, parameter by parameter.
-
-A narrow interval may be the prior's own. The ratio of posterior to prior standard deviation tells:
-near one, the data added nothing, and the estimate is what was put in.
+A narrow interval may come from the prior alone. The ratio of posterior to prior standard deviation
+shows this parameter by parameter: near one, the data added no information.
 """
 
 from __future__ import annotations

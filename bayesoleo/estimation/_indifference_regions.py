@@ -1,17 +1,13 @@
-"""Indifference regions: parameters that fit as well as the estimate, within a given loss.
+"""Indifference regions: parameters that fit as well as the estimate, within a loss ``epsilon``.
 
-Where a function that rises from zero first reaches a level, along rays from one point.
+Regions are computed in two ways: exactly, by following the objective along rays from the estimate,
+and by its second-order Taylor expansion, as ellipses. Where the two differ, intervals from a
+covariance are misleading.
 
-The region of equal fit in one plane of two parameters: its contour and its ellipse.
-
-The contour is drawn along the valley: at values of the first parameter the second is brought to the
-valley's floor, and from there the walls are climbed to both sides. So a valley may bend, as that of
-a product of parameters does, which rays from the estimate would leave at the first bend.
-
-Indifference regions: all parameters that fit as well as the estimate, give or take ``epsilon``.
-
-Exact, by following the objective outwards, and by Taylor's second order, as ellipses. Where the two
-differ, an interval from a covariance says something that is not so.
+The contour in one plane of two parameters follows the valley of the objective. For given values of
+the first parameter, the second is minimised over, and the limits are then searched to both sides of
+that minimum. A valley may therefore bend, as for a product of two parameters; rays from the
+estimate would leave it at the first bend.
 
 References
 ----------
@@ -27,13 +23,12 @@ from typing import cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from bayesoleo import _schema as schema
 from bayesoleo._display import LabelledResult
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._identifiability import axes_text, over_variances, principal_axes
 from bayesoleo.estimation._objectives import curvature, inverse_scaled
@@ -49,9 +44,7 @@ _ITERATIONS = 40
 _TOLERANCE = 1e-3
 
 
-def first_crossing(
-    function: Callable[[Array, NDArray[np.int64]], Array], rays: int, level: float
-) -> Array:
+def first_crossing(function: Callable[[Array, Integers], Array], rays: int, level: float) -> Array:
     """Radius on each ray, in units of the expected one; infinite where the level is not reached.
 
     Parameters
@@ -258,7 +251,7 @@ class Plane:
         curvature = max(self.block[1, 1], _LEAST_CURVATURE / self.spread[1] ** 2)
         expected = np.sqrt(2 * rest / curvature)
 
-        def climb(radius: Array, index: NDArray[np.int64]) -> Array:
+        def climb(radius: Array, index: Integers) -> Array:
             theta = floor[index].copy()
             theta[:, second] += sign * radius * expected[index]
             return (self._falls(theta) - fall[index]) / rest[index]

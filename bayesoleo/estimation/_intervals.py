@@ -1,12 +1,9 @@
-"""Intervals of an estimate: by linearisation, and over a set of experiments.
+"""Covariances and intervals of an estimate, by linearisation and over a set of experiments.
 
-What noise of a known size does to an estimate, by linearisation.
-
-All matrices are formed with columns of unit length: physical parameters range over twelve decades.
-
-Gaussian approximation of the joint posterior of parameters and log variances at a mode.
-
-Intervals of an estimate: by linearisation, and over a set of experiments.
+The linearised covariance propagates noise of a known variance to the estimate. Its matrices are
+formed with columns of unit length, because physical parameters range over twelve decades. At a
+mode, the same curvature gives the Gaussian approximation of the joint posterior of parameters and
+log variances.
 """
 
 from __future__ import annotations

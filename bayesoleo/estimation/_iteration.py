@@ -1,21 +1,16 @@
 """The iteration that all estimators share, with step lengths and history.
 
-The way of an estimator, and how it ended.
+One iteration estimates the variances, takes a step, and halves the step if it does not improve the
+merit.
 
-How long a step should be, judged by the one before it.
-
-Linear equations that lack the residual's second derivatives can overshoot or fall short for ever,
-each step lowering the merit a little. Two steps on one line tell by how much.
-
-References
-----------
-Aitken (1926), "On Bernoulli's numerical solution of algebraic equations".
-
-The one loop of all estimators: stage the variances, take a step, halve it if it does not help.
+Linear equations that lack the second derivatives of the residual can overshoot or undershoot in
+every step, each improving the merit only a little. Two successive steps along one line give the
+factor by which to lengthen or shorten the next.
 
 References
 ----------
-Verbeek (1993), section 3.3; the halving is his "monitoring tool" and should rarely act.
+Verbeek (1993), section 3.3; step halving is his "monitoring tool" and should rarely act. Aitken
+(1926), "On Bernoulli's numerical solution of algebraic equations" (the factor).
 """
 
 from __future__ import annotations
@@ -26,10 +21,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._parallel import single_blas_thread
-from bayesoleo._types import Array, Float
+from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._independent import output_counts
 from bayesoleo.estimation._bayesian_estimators import Step
 from bayesoleo.estimation._least_squares import PriorScale, WhitenedEquations, is_cut
@@ -270,7 +264,7 @@ class _Loop:
     ) -> None:
         self.problem, self.step, self.objective = problem, step, objective
         self.bias_corrected, self.progress = bias_corrected, progress
-        self.counts: NDArray[np.int64] = output_counts(problem.counts)
+        self.counts: Integers = output_counts(problem.counts)
         self.scale = PriorScale.of(problem.priors, problem.names)
         self.state = step.begin(self.scale.root)
         self.history: list[Iteration] = []

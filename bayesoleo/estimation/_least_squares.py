@@ -1,26 +1,20 @@
-"""Scaled unknowns, batched equations and bounded least-squares steps.
+"""Scaled unknowns, batched normal equations, and least-squares steps within the priors' support.
 
-Least-squares equations of many parameter vectors at once.
+Normal equations are formed for many parameter vectors at once. The estimate of one data set spends
+most of its time in the interpreter, not in arithmetic. Where one model is fitted to thousands of
+data sets, everything is therefore computed for all of them together, and only ``J'J``, ``J'e`` and
+``e'e`` are kept for each output.
 
-An estimate of one data set spends most of its time in the interpreter, not in the numbers. Where
-thousands of data sets are fitted by one model, everything is computed for all of them together, and
-each keeps only what a step needs: per output ``J'J``, ``J'e`` and ``e'e``.
-
-The coordinates in which an iteration steps: a scale for each unknown, a slope and the room left.
-
+Each unknown is scaled, with the slope of its prior and its distance to the bounds of the support.
 An unknown with a log-normal prior is stepped in its logarithm, all others as they are. Such an
-unknown is a positive scale or shape whose prior says that halving it is as likely as doubling it:
-in the logarithm that prior is normal, no step leaves the support, and a linear step that would cut
-the unknown to a tenth is one of moderate length.
+unknown is a positive scale or shape for which the prior makes halving as likely as doubling: in the
+logarithm that prior is normal, no step leaves the support, and a linear step that would cut the
+unknown to a tenth has moderate length.
 
-Only the steps are in these coordinates. The objectives stay functions of the unknown itself, with
+Only the steps use these coordinates. The objectives remain functions of the unknown itself, with
 ``Prior.log_density`` the density per unit of the unknown, so the maximum-likelihood point and the
-mode of ``Phi_B`` do not depend on them. (The mode of the density per unit of the logarithm, which
-is where a sampler's coordinates have theirs, is another point.)
-
-The least-squares step that stays inside the priors' support.
-
-The linear equations of one iteration, with the variances held.
+mode of ``Phi_B`` do not depend on them. The mode of the density per unit of the logarithm, which is
+the mode in a sampler's coordinates, is a different point.
 """
 
 from __future__ import annotations
@@ -30,7 +24,6 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
@@ -158,7 +151,7 @@ class PriorScale:
         root = scaled_root(priors, sd)
         return cls(tuple(priors), mean, sd, low, high, logarithmic, spread, root)
 
-    def inside(self, theta: Array) -> NDArray[np.bool_]:
+    def inside(self, theta: Array) -> Flags:
         """Which unknowns lie in their prior's support; zero has no logarithm. Shape (..., l)."""
         return (theta >= self.low) & (theta <= self.high) & ~(self.logarithmic & (theta <= 0))
 
@@ -259,7 +252,7 @@ def is_cut(step: Array, room: tuple[Array, Array]) -> bool:
     return bool(np.any((reach > 0) & np.isfinite(reach) & (np.abs(step) >= reach)))
 
 
-def on_limit(room: tuple[Array, Array]) -> NDArray[np.bool_]:
+def on_limit(room: tuple[Array, Array]) -> Flags:
     """Which unknowns, shape (l,), lie on a limit of their support."""
     return np.minimum(*room) <= _ON_LIMIT
 
@@ -303,7 +296,7 @@ class WhitenedEquations:
         return self.jacobian.T @ self.residual + self.slope
 
     @property
-    def held(self) -> NDArray[np.bool_]:
+    def held(self) -> Flags:
         """Which unknowns lie on a limit and would leave, shape (l,)."""
         down, up = self.room
         return on_limit(

@@ -1,13 +1,11 @@
 """Parameter estimates from chaotic and other transient records by multiple shooting.
 
-Parameters of chaotic and other transient motions by multiple shooting.
-
-A chaotic motion forgets its start: over a record of some Lyapunov times the motion at the end is no
-longer a usable function of the initial state and the parameters, and a fit of these alone ("single
-shooting") gets lost in a landscape of countless minima. Multiple shooting gives each short piece of
-the record an initial state of its own, starts these from what was measured, and asks for continuity
-only of the solution. The linearised problem is solved for all of them by one banded elimination, so
-that the parameters' step and their covariance come from a small matrix.
+A chaotic motion is sensitive to its initial state: after some Lyapunov times it is no longer a
+usable function of the initial state and the parameters. A fit of these alone (single shooting)
+has countless local minima. Multiple shooting gives each short segment of the record an initial
+state of its own, takes first guesses of these states from the measurement, and imposes continuity
+only on the solution. The linearised problem is solved for all states by one banded elimination, so
+that the step of the parameters and their covariance come from a small matrix.
 
 References
 ----------

@@ -1,15 +1,13 @@
-"""Generalised Gauss-Newton iteration of multiple shooting.
+"""Generalised Gauss-Newton iteration of multiple shooting, for parameters and all states together.
 
-Generalised Gauss-Newton iteration of multiple shooting: parameters and all states together.
+Steps are damped by the natural monotonicity test. It measures the distance of a trial point from
+the solution by the linearisation at the present point, in units of the unknowns, so that residuals,
+gaps and equations need no relative weights.
 
-Steps are damped by the natural monotonicity test: what counts is how far the linearisation at the
-present point says a trial point still is from the solution. It is measured in units of the
-unknowns, so that there is nothing to weigh between residuals, gaps and equations.
-
-Continuity is not asked for at once. At the start a gap between steps is a residual like others,
-with the variance that the gaps of the start have; every full step takes that down tenfold, until
-gaps must close. At first, then, states stay near the samples and parameters fit the rates of
-change, which is nearly linear and works from far; in the end the motion is one of the model.
+Continuity is imposed gradually. At the start a gap between steps is a residual with the variance of
+the initial gaps. Every full step divides that variance by ten, until gaps must close. Early
+iterations thus keep the states near the samples and fit parameters to the rates of change, which is
+nearly linear and converges from far. The final motion solves the model.
 
 References
 ----------

@@ -1,10 +1,8 @@
-"""One step of a multiple-shooting estimate: problem and linearisation.
+"""One step of a multiple-shooting estimate: its problem and the linearisation.
 
-A model over transient records as multiple shooting sees it: runs, unknowns, variances.
-
-What the linearisation at one point says about parameters and states: the way to the solution.
-
-The normal equations of every record, its states eliminated, add up to those of the parameters.
+The problem holds a model over transient records: runs, unknowns and variances. At each point the
+states of every record are eliminated from its normal equations; the sum over records gives the
+equations of the parameters.
 """
 
 from __future__ import annotations
@@ -14,9 +12,8 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.estimation._least_squares import PriorScale, bounded_step
 from bayesoleo.estimation._problem import measured_of
 from bayesoleo.model._kernels import kernels
@@ -92,7 +89,7 @@ class ShootingProblem:
         return frozenset(name for name, owner in owners if parameters[owner].measured)
 
     @property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Integers:
         """Number of samples of each output, shape (s,)."""
         return np.array(
             [
@@ -118,10 +115,10 @@ class ShootingProblem:
         """Which outputs a run has."""
         return [self.outputs.index(name) for name in run.outputs]
 
-    def between_intervals(self, r: int) -> NDArray[np.bool_]:
+    def between_intervals(self, r: int) -> Flags:
         """Which of a run's inner nodes are shooting nodes, shape (n - 1,)."""
         return cast(
-            NDArray[np.bool_],
+            Flags,
             np.arange(1, self.runs[r].segments.steps) % self.steps_per_interval[r] == 0,
         )
 
@@ -244,7 +241,7 @@ class Local:
         return self.scale.root[measured_of(self.problem)]
 
     @property
-    def pulled(self) -> NDArray[np.bool_]:
+    def pulled(self) -> Flags:
         """Unknowns that the prior pulls: all for the Bayesian estimator, for the others those whose
         prior is a measurement, shape (l,)."""
         return measured_of(self.problem) | (self.prior == "be")

@@ -1,4 +1,4 @@
-"""Several starts, and the distinct modes that they lead to."""
+"""Estimates from several starts, and the distinct modes to which they lead."""
 
 from __future__ import annotations
 

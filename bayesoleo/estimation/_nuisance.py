@@ -1,24 +1,18 @@
-r"""Nuisance parameters: quantities that are known to a tolerance.
+r"""Nuisance parameters: quantities measured beside the records, known to a tolerance.
 
-Estimators that forget priors hold what was measured beside the data, and carry its uncertainty.
+The conditions of a run are measured with a standard deviation; the offset and gain of a sensor lie
+within its declared accuracy. Intervals are too narrow if these are held at their declared values,
+and the quantities absorb physics if they are left free. They are therefore unknowns with a prior:
+with sensitivities ``B`` of the outputs to the nuisances, in units of their standard deviations, the
+physical parameters are estimated as if the noise covariance were :math:`V + B B^T`.
 
-The maximum of the likelihood knows nothing of a tolerance: it would move a constant known to 1 % by
-half of it to fit the noise. Such unknowns keep their value, and the others are estimated given it.
-With sensitivities :math:`J` and :math:`B` of the outputs to both, an error :math:`\delta` of the
-held values moves the estimate by :math:`S\delta = -(J'WJ)^{-1} J'WB\,\delta`, so that its
-covariance is :math:`(J'WJ)^{-1} + S \Sigma S'` with the tolerances' covariance :math:`\Sigma`.
-
-Nuisance parameters: what was measured beside the records, and is known to a tolerance only.
-
-A run's conditions are measured with a standard deviation; a sensor's offset and gain lie within its
-declared accuracy. Held at their declared values they make intervals too narrow; left free they
-would absorb physics. As unknowns with a prior they do neither: with sensitivities ``B`` of the
-outputs to the nuisances, in units of their standard deviations, the physical parameters are
-estimated as if the noise covariance were :math:`V + B B^T`.
-
-Their prior is itself a measurement. An estimator that re-centres priors (MBE) would forget it, so
-that MBE runs with nuisances at their null and carries their uncertainty into its covariance
-(:mod:`bayesoleo.estimation.estimators.known`); the Bayesian estimator frees them from there.
+Maximum likelihood and MBE disregard that prior: the first would move a constant that is known to
+1 % to fit the noise, the second re-centres priors. They hold the nuisances at their nominal values
+and estimate the other unknowns. With sensitivities :math:`J` and :math:`B` of the outputs to both,
+an error :math:`\delta` of the held values moves the estimate by
+:math:`S\delta = -(J'WJ)^{-1} J'WB\,\delta`, so that its covariance is
+:math:`(J'WJ)^{-1} + S \Sigma S'` with the covariance :math:`\Sigma` of the tolerances. The Bayesian
+estimator starts from there with the nuisances free.
 """
 
 from __future__ import annotations
@@ -29,9 +23,8 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.effects._catalogue import find_effect
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
@@ -48,7 +41,7 @@ from bayesoleo.prediction._records import Record
 
 
 def without_measured(
-    problem: EstimationProblem, theta: Array, measured: NDArray[np.bool_]
+    problem: EstimationProblem, theta: Array, measured: Flags
 ) -> EstimationProblem:
     """The same problem in the other unknowns.
 
@@ -71,7 +64,7 @@ def without_measured(
 
 
 def with_measured(
-    point: PointEstimate, problem: EstimationProblem, theta: Array, measured: NDArray[np.bool_]
+    point: PointEstimate, problem: EstimationProblem, theta: Array, measured: Flags
 ) -> PointEstimate:
     """An estimate of some unknowns as one of all.
 
@@ -115,7 +108,7 @@ def with_measured(
 
 
 def _carried(
-    point: PointEstimate, problem: EstimationProblem, theta: Array, measured: NDArray[np.bool_]
+    point: PointEstimate, problem: EstimationProblem, theta: Array, measured: Flags
 ) -> Array:
     """Covariance of all unknowns, (l, l): the held ones have that of their priors."""
     own, held = np.flatnonzero(~measured), np.flatnonzero(measured)
@@ -138,8 +131,8 @@ def _shift(
     problem: EstimationProblem,
     theta: Array,
     variance: Array,
-    own: NDArray[np.int64],
-    held: NDArray[np.int64],
+    own: Integers,
+    held: Integers,
 ) -> Array | None:
     """Change of the estimate by that of a held value, (own, held); None where there is none."""
     evaluation = problem.evaluate(theta)

@@ -1,27 +1,18 @@
 """Objective functions by name, their second derivatives, and Newton's method.
 
-The objective functions by name: an error model, and whether the prior counts.
+An objective is an error model, with or without the prior. Its derivatives are with respect to
+``phi = (theta, v)``: parameters first, then the error variances.
+
+Newton's method is written as least-squares equations. With ``v`` eliminated at every step, the
+step of the parameters is that of the joint problem in ``(theta, v)``: the Hessian loses the Schur
+complement ``H_tv H_vv^-1 H_vt``. The part of the Hessian that Gauss-Newton omits,
+``sum e_tt v^-1 e``, comes from central differences of the sensitivities along each unknown,
+contracted with the residual. That takes ``2 l`` evaluations and no second derivative of a model; a
+periodic orbit would need ``l (l + 1) / 2`` more linear solves for each run, with new kernels.
 
 References
 ----------
-Verbeek (1993), eqs. 2.25-2.35.
-
-Second derivatives of the objective at an estimate, and what noise of the data does through them.
-
-Everything is about ``phi = (theta, v)``: parameters first, then the error variances.
-
-Second derivatives of the objective: Newton's method as least-squares equations.
-
-With ``v`` eliminated at every step, Newton's step for the parameters is that of the joint problem
-in ``(theta, v)``: the Hessian loses the Schur complement ``H_tv H_vv^-1 H_vt``. The part of the
-Hessian that Gauss and Newton leave out, ``sum e_tt v^-1 e``, comes from central differences of the
-sensitivities along each unknown, contracted with the residual. That takes ``2 l`` evaluations and
-no second derivative of any model, of which a periodic orbit would need ``l (l + 1) / 2`` more
-linear solves for each run, with new kernels.
-
-References
-----------
-Verbeek (1993), Appendix A, which minimises ``-Phi_B``.
+Verbeek (1993), eqs. 2.25-2.35, and Appendix A, which minimises ``-Phi_B``.
 """
 
 from __future__ import annotations
@@ -31,9 +22,8 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import ProfiledErrorModel
 from bayesoleo.error_models._full import GivenErrors
 from bayesoleo.error_models._independent import log_likelihood, output_counts, sums_of_squares
@@ -136,7 +126,7 @@ def log_prior(priors: Sequence[Prior], theta: Array) -> float:
 def log_posterior(
     sums: Array,
     variance: Array,
-    counts: NDArray[np.int64],
+    counts: Integers,
     priors: Sequence[Prior],
     theta: Array,
 ) -> float:

@@ -1,9 +1,7 @@
-"""Parametric bootstrap: new data that a problem predicts, with new noise.
+"""Parametric bootstrap: new data from a problem's prediction at given parameters, with new noise.
 
-New data for a problem: what it predicts at given parameters, with new noise.
-
-Where inputs are measured too, their noise is drawn anew as well: the data come from the true inputs
-and the estimator sees noisy ones.
+Noise of measured inputs is drawn anew as well: the data come from the true inputs, and the
+estimator sees noisy ones.
 """
 
 from __future__ import annotations
@@ -13,13 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._least_squares import BatchProblem
-from bayesoleo.estimation._problem import EstimationProblem, Evaluation, Misfit
+from bayesoleo.estimation._problem import EstimationProblem, Evaluation, Misfit, SameData
 from bayesoleo.model._priors import Prior
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics, Record
@@ -45,7 +42,7 @@ class NoiseBlock:
     """
 
     sensitivity: Array
-    output: NDArray[np.int64]
+    output: Integers
     sd: Array
     columns: Array
 
@@ -143,7 +140,7 @@ class ResidualSource:
         ]
 
 
-class Shifted:
+class Shifted(SameData):
     """A problem whose measured outputs are moved by a known amount.
 
     Parameters
@@ -154,7 +151,8 @@ class Shifted:
     """
 
     def __init__(self, problem: EstimationProblem, shift: tuple[Array, ...]) -> None:
-        self.problem, self.shift = problem, shift
+        super().__init__(problem)
+        self.shift = shift
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -175,21 +173,6 @@ class Shifted:
     def start(self) -> Array:
         """Where an estimate starts, shape (l,)."""
         return self.problem.start
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.problem.outputs
-
-    @property
-    def runs(self) -> tuple[str, ...]:
-        """Labels of the runs."""
-        return self.problem.runs
-
-    @property
-    def counts(self) -> NDArray[np.int64]:
-        """Number of samples, shape (N, s)."""
-        return self.problem.counts
 
     def evaluate(self, theta: Array) -> Evaluation:
         """Residuals and sensitivities at one vector, shape (l,)."""

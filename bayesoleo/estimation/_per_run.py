@@ -1,12 +1,9 @@
-"""Estimates from each run alone, and which of them can be compared.
+"""Estimates from each run alone, and the runs and parameters among which they can be compared.
 
-Each run estimated on its own: what a model's parameters would be if that run were all there is.
-
-Parameters that describe the specimen should come out alike from every run; what scatters beyond its
-uncertainty, or follows frequency or position, is the trace of physics that the model lacks (Verbeek
-1993, sections 2.3 and 6.2). :func:`~bayesoleo.estimation.between_runs` says how much.
-
-Which runs and parameters can be compared: those that are determined by enough of each other.
+Parameters of the specimen should be the same in every run. Scatter beyond their uncertainty, or a
+trend with frequency or position, is evidence of physics that the model lacks (Verbeek 1993,
+sections 2.3 and 6.2). :func:`~bayesoleo.estimation.between_runs` measures it. Only runs and
+parameters that are determined by enough of each other are compared.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._estimate import estimate
 from bayesoleo.estimation._point_estimate import PointEstimate
@@ -211,8 +208,8 @@ class Comparable:
         The others, each with the reason.
     """
 
-    runs: NDArray[np.bool_]
-    parameters: NDArray[np.bool_]
+    runs: Flags
+    parameters: Flags
     left_out: tuple[str, ...]
 
 
@@ -239,7 +236,7 @@ def comparable(each: xr.Dataset) -> Comparable:
     return Comparable(usable, kept, left_out)
 
 
-def _determined(each: xr.Dataset) -> NDArray[np.bool_]:
+def _determined(each: xr.Dataset) -> Flags:
     """Which parameters a run's data determine beside the prior, shape (N, l)."""
     alone, with_prior = (
         np.diagonal(each[name].values, axis1=1, axis2=2)
@@ -277,11 +274,11 @@ def _is_definite(covariance: Array) -> bool:
 def _left_out(
     names: NDArray[np.str_],
     runs: NDArray[np.str_],
-    good: NDArray[np.bool_],
-    regular: NDArray[np.bool_],
-    determined: NDArray[np.bool_],
-    kept: NDArray[np.bool_],
-    usable: NDArray[np.bool_],
+    good: Flags,
+    regular: Flags,
+    determined: Flags,
+    kept: Flags,
+    usable: Flags,
     held: Sequence[str],
 ) -> tuple[str, ...]:
     """What is not compared, and why, a clause each."""

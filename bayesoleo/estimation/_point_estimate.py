@@ -1,9 +1,4 @@
-"""Point estimates: values, covariance, history, as labelled arrays and text.
-
-A point estimate: where, how sure, and how it was reached.
-
-A point estimate as labelled arrays and as text.
-"""
+"""Point estimate: values, covariance and history, as labelled arrays and as text."""
 
 from __future__ import annotations
 
@@ -22,7 +17,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.prediction._stability import Stability
 from bayesoleo.solvers._orbit import Status, added, counted
 
-#: Notes on estimates whose standard deviations are not what they seem.
+#: Notes on estimates whose standard deviations are not reliable.
 EXACT = (
     "{} is fitted to the rounding of its samples: there is no noise to estimate, and standard "
     "deviations mean nothing"
@@ -56,15 +51,15 @@ class PointEstimate:
     status : Status
         ``NO_CONVERGENCE`` also where the steps became small away from the fixed point.
     iterations : int
-        Steps taken, with the last, small one.
+        Steps taken, including the last, small one.
     halvings : int
-        Over all iterations.
+        Number of halvings over all iterations.
     evaluations : int
         Calls of ``problem.evaluate``.
     objective : float
         The method's own objective at the estimate: eq. 2.29 for BE, 2.31 for the others.
     distance : float
-        To the method's fixed point by linearisation, in standard deviations; NaN if the steps
+        Linearised distance to the method's fixed point, in standard deviations; NaN if the steps
         never became small.
     start : ndarray, shape (l,)
     history : ndarray, shape (iterations + 1, l)
@@ -74,20 +69,20 @@ class PointEstimate:
     on_limit : tuple of str
         Unknowns that lie on a limit of their prior's support.
     objective_name : str
-        What was maximised, one of :data:`bayesoleo.estimation.OBJECTIVES`.
+        Objective that was maximised, one of :data:`bayesoleo.estimation.OBJECTIVES`.
     error_covariance : ndarray, shape (s, s), optional
-        Of the outputs' errors; diagonal unless the objective is of correlated ones.
+        Covariance of the outputs' errors; diagonal unless the objective has correlated errors.
     failures : mapping of str to int
-        Trials on the way that could not be evaluated, by the lower-case name of their
+        Trial points that could not be evaluated, by the lower-case name of their
         :class:`~bayesoleo.solvers._orbit.Status`: steps towards them were halved.
     stability : Stability, optional
         Floquet multipliers of each run's periodic solution at the estimate, and how often one
-        jumped to another branch on the way; None where there are no periodic solutions.
+        jumped to another branch during the iteration; None without periodic solutions.
     exact : tuple of str
         Outputs that are fitted to the rounding of their samples.
     known : tuple of str
-        Unknowns that were held, because the method forgets what was measured of them; their
-        uncertainty is carried into the covariance.
+        Unknowns that were held because the method disregards their prior; their uncertainty is
+        carried into the covariance.
     """
 
     names: tuple[str, ...]
@@ -135,7 +130,7 @@ class PointEstimate:
 
     @property
     def doubts(self) -> list[str]:
-        """Where standard deviations are not what they seem."""
+        """Notes on standard deviations that are not reliable."""
         found = [EXACT.format(", ".join(self.exact))] if self.exact else []
         if self.undetermined:
             text = SILENT if len(self.undetermined) == 1 else UNDETERMINED
@@ -145,8 +140,8 @@ class PointEstimate:
 
     @property
     def notes(self) -> list[str]:
-        """What to know of an estimate: of its solutions, such as that one is unstable, and of its
-        standard deviations."""
+        """Notes on the estimate's solutions, such as an unstable one, and on its standard
+        deviations."""
         held = [KNOWN.format(_listed(self.known))] if self.known else []
         return [*([] if self.stability is None else self.stability.notes()), *self.doubts, *held]
 
@@ -154,7 +149,7 @@ class PointEstimate:
         return float(self.theta[self.names.index(name)])
 
     def following(self, first: PointEstimate | None) -> PointEstimate:
-        """The same, with the jumps on the way of the estimate that it was polished from."""
+        """Copy that includes the branch jumps of the estimate from which it was polished."""
         if first is None or first.stability is None or self.stability is None:
             return self
         jumps = self.stability.jumps + first.stability.jumps
@@ -177,7 +172,7 @@ class PointEstimate:
 
 
 def _listed(names: tuple[str, ...]) -> str:
-    """Names in a sentence; of many the first ones."""
+    """Names in a sentence; only the first ones of many."""
     rest = len(names) - _MOST_NAMES
     return ", ".join(names[:_MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
 
@@ -319,7 +314,7 @@ def _methods(stages: Sequence[PointEstimate]) -> np.ndarray:
 
 
 def as_text(point: PointEstimate) -> str:
-    """One line a parameter and a last one for how it ended."""
+    """One line for each parameter, and a last one for the outcome."""
     width = max([9, *(len(name) for name in point.names)])
     lines = [f"{'parameter':<{width}}  {'start':>12}  {'estimate':>12}  {'sd':>9}"]
     rows = zip(point.names, point.start, point.theta, point.sd, strict=True)

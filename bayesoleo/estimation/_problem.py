@@ -1,14 +1,10 @@
-"""The problem protocol: the contract between what is fitted and what fits it.
+"""The problem protocol: the interface between the data with their model and the estimators.
 
-The contract between whatever can be fitted and whatever fits it.
-
-Estimators and samplers see a :class:`Problem`: names, priors, and the residuals ``e = y -
-yhat(theta)`` of ``s`` output channels in ``N`` runs. They never see a model, so that a closed
-formula and a campaign of measured runs are estimated by the same code.
-
-Problems that give residuals sample by sample, for error models that look at their order.
-
-A problem with some of its unknowns held: the sections that profiles and regions are made of.
+Estimators and samplers see an :class:`EstimationProblem`: names, priors, and the residuals
+``e = y - yhat(theta)`` of ``s`` output channels in ``N`` runs. They never see a model, so that a
+closed formula and a campaign of measured runs are estimated by the same code. Error models that use
+the order of samples need problems that also return residuals sample by sample. Profiles and regions
+use sections of a problem, in which some unknowns are held.
 """
 
 from __future__ import annotations
@@ -18,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.error_models._base import RunSamples
@@ -41,7 +36,7 @@ class Evaluation:
     status : Status
         Unless it is ``CONVERGED`` the arrays hold NaN.
     monodromy : tuple of ndarray or None
-        Of each run's periodic solution, where there are such; its eigenvalues are the Floquet
+        Monodromy matrix of each run's periodic solution, if any; its eigenvalues are the Floquet
         multipliers.
     """
 
@@ -68,34 +63,34 @@ class Misfit:
 
 
 def jumps_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
-    """Solutions so far that left their branch, by run, shape (N,); zeros where none are counted."""
+    """Number of solutions that left their branch, by run, shape (N,); zeros where not counted."""
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
 
 
 class Named(Protocol):
-    """Something with unknowns that have names."""
+    """A problem with named unknowns."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the unknowns."""
+        """Names of the unknowns."""
 
 
 def measured_of(problem: Named) -> Bool[Flags, " unknowns"]:
     """Which unknowns have a prior that is a measurement, shape (l,).
 
-    These are nuisance parameters and constants known to a tolerance: what is known of them counts
-    in every estimator. A problem names them in ``nuisances``.
+    These are nuisance parameters and constants known to a tolerance, whose prior counts in every
+    estimator. A problem names them in ``nuisances``.
     """
     nuisances = getattr(problem, "nuisances", frozenset[str]())
     return np.array([name in nuisances for name in problem.names], dtype=bool)
 
 
 class EstimationProblem(Protocol):
-    """Something with ``l`` unknowns, ``N`` runs and ``s`` outputs that can be fitted."""
+    """A problem with ``l`` unknowns, ``N`` runs and ``s`` outputs that can be fitted."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the unknowns; one that varies by run reads ``name[run]``."""
+        """Names of the unknowns; one that varies by run is ``name[run]``."""
 
     @property
     def priors(self) -> tuple[Prior, ...]:
@@ -144,20 +139,43 @@ class ResidualProblem(EstimationProblem, Protocol):
         """
 
 
-class Held:
-    """The same problem in fewer unknowns.
+class SameData:
+    """A problem made of another one with the same outputs, runs and numbers of samples."""
+
+    def __init__(self, problem: EstimationProblem) -> None:
+        self.problem = problem
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.problem.outputs
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Labels of the runs."""
+        return self.problem.runs
+
+    @property
+    def counts(self) -> Integers:
+        """Number of samples, shape (N, s)."""
+        return self.problem.counts
+
+
+class Held(SameData):
+    """A problem with some of its unknowns held.
 
     Parameters
     ----------
     problem : EstimationProblem
     theta : ndarray, shape (l,)
-        All unknowns; those that stay free start from here.
+        All unknowns; the free ones start from here.
     held : sequence of int
-        Which keep their value.
+        Positions of the unknowns that keep their value.
     """
 
     def __init__(self, problem: EstimationProblem, theta: Array, held: Sequence[int]) -> None:
-        self.problem, self.full_start = problem, np.array(theta, dtype=float)
+        super().__init__(problem)
+        self.full_start = np.array(theta, dtype=float)
         self.free = np.setdiff1d(np.arange(len(problem.names)), np.asarray(held, dtype=int))
         self.priors: tuple[Prior, ...] = tuple(self._given(held)[k] for k in self.free)
 
@@ -177,23 +195,8 @@ class Held:
         """Where an estimate starts, in the free unknowns."""
         return cast(Array, self.full_start[self.free])
 
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.problem.outputs
-
-    @property
-    def runs(self) -> tuple[str, ...]:
-        """Labels of the runs."""
-        return self.problem.runs
-
-    @property
-    def counts(self) -> NDArray[np.int64]:
-        """Number of samples, shape (N, s)."""
-        return self.problem.counts
-
     def _given(self, held: Sequence[int]) -> list[Prior]:
-        """Priors of all unknowns; a joint one of free unknowns is that given the held ones."""
+        """Priors of all unknowns; a joint prior is conditional on its held parameters."""
         priors = list(self.problem.priors)
         for joint, positions, members in joint_groups(priors):
             free = [k for k, position in enumerate(positions) if position not in held]
@@ -214,7 +217,7 @@ class Held:
         return whole
 
     def freeze(self, theta: Array) -> None:
-        """Fix where a campaign's solver starts from; nothing to do for other problems."""
+        """Fix the anchors of a campaign's solver; other problems have none."""
         freeze = getattr(self.problem, "freeze", None)
         if freeze is not None:
             freeze(self.full(np.asarray(theta, dtype=float)))
@@ -225,7 +228,7 @@ class Held:
         return replace(found, sensitivity=tuple(s[:, self.free] for s in found.sensitivity))
 
     @property
-    def branch_jumps(self) -> NDArray[np.int64]:
+    def branch_jumps(self) -> Integers:
         """Solutions so far that left their branch, by run, shape (N,)."""
         return jumps_of(self.problem)
 
@@ -237,7 +240,7 @@ class Held:
 def _conditional(
     joint: JointNormal, free: Sequence[int], known: Sequence[int], values: Array
 ) -> JointNormal:
-    """Some parameters of a joint prior, given others."""
+    """Joint prior of some parameters, conditional on others."""
     mean, covariance = np.array(joint.mean), np.array(joint.covariance)
     gain = np.linalg.solve(covariance[np.ix_(known, known)], covariance[np.ix_(known, free)]).T
     return JointNormal.of(

@@ -1,14 +1,12 @@
 """Log-likelihood ratio and profile likelihood.
 
-How far the objective falls from an estimate: the function that regions and profiles cut.
+The log-likelihood ratio is the loss of the objective relative to the estimate. The error variances
+follow the parameters, ``v_b = M_bb / n_b``, so that it is a ratio of the likelihood profiled over
+``v`` (Verbeek 1993, eq. 3.17 in 2.29).
 
-The error variances follow the parameters, ``v_b = M_bb / n_b``, so that a fall of the objective is
-one of the profile over ``v`` (Verbeek 1993, eq. 3.17 in 2.29).
-
-Profile likelihood: how far the objective falls when one unknown is held away from its estimate.
-
-Where the model is linear in the unknowns the profile is a parabola and its limits are those of
-linearisation; a flat side says that the data do not bound the unknown there.
+The profile likelihood maximises over all unknowns but one, which is held at given values. Where the
+model is linear in the unknowns, the profile is a parabola and its limits are those of
+linearisation. A flat side shows that the data do not bound the unknown there.
 """
 
 from __future__ import annotations

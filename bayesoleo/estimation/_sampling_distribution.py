@@ -1,8 +1,4 @@
-"""Sampling distribution of an estimator over simulated experiments.
-
-Bias and scatter of replications beside theory, as labelled arrays and as text.
-
-How an estimator scatters over repeated experiments, by simulation.
+"""Sampling distribution of an estimator over simulated experiments, compared with theory.
 
 References
 ----------

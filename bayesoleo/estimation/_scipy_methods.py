@@ -1,11 +1,10 @@
 """SciPy's optimisers behind the interface of the estimators, for comparison.
 
-They work in the same scaled unknowns and on the same objective, with ``v`` eliminated:
-least-squares methods restage it between solves, the others see the objective in which it is staged
-everywhere.
-Where the objective has a prior they maximise with it, as BE does.
+They use the same scaled unknowns and the same objective, with ``v`` eliminated. Least-squares
+methods update ``v`` between solves, the others at every evaluation. Where the objective has a
+prior, they maximise with it, as BE does.
 
-An optimiser's own word for success is checked. A line search that meets vectors which cannot be
+The success that an optimiser reports is checked. A line search that meets vectors which cannot be
 evaluated may stop on a slope and report that the objective no longer changes; such a point is no
 optimum, and its status is ``NO_CONVERGENCE``.
 """

@@ -1,8 +1,7 @@
 """Sensitivity analysis: local derivatives and Sobol indices of predicted features.
 
-Numbers that a prediction is judged by: the peak of a pressure, the rms of a force, by run.
-
-Which parameters matter for a feature of the prediction: near an estimate, and over the prior.
+A feature is one number of a predicted run, such as the peak of a pressure or the rms of a force.
+Local derivatives hold near an estimate, Sobol indices over the prior.
 """
 
 from __future__ import annotations

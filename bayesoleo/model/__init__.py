@@ -1,4 +1,4 @@
-"""Declare a model as named terms, derive its partials, and generate kernels that evaluate them."""
+"""Models declared as named terms, their derivatives, and the kernels that evaluate them."""
 
 import lazy_loader
 

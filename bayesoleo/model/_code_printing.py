@@ -1,4 +1,4 @@
-"""Print code with shared subexpressions for NumPy arrays and, in a loop, for Numba scalars."""
+"""Print code with shared subexpressions, for NumPy arrays and for Numba scalars in a loop."""
 
 from __future__ import annotations
 

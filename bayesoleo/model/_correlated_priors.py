@@ -1,18 +1,14 @@
 """Joint normal priors over several parameters, and priors from an earlier result.
 
-Priors that belong together: a normal density over several parameters at once.
-
-What an earlier campaign leaves behind is not one interval for each parameter. Its posterior may
-know a product of two parameters far better than either, and a prior that forgets this hands the
-next campaign less than was measured. Here the earlier posterior, condensed to mean and covariance,
-is the prior of several parameters: each carries a :class:`Correlated` prior, which by itself is its
-marginal, and whoever asks for all of them together gets the joint density.
+The result of an earlier campaign is not one interval for each parameter. Its posterior may
+determine a product of two parameters far better than either, and a prior without their correlation
+loses that information. Here the earlier posterior, condensed to mean and covariance, is the joint
+prior of several parameters. Each carries a :class:`Correlated` prior, which alone is its marginal;
+the priors of all of them together give the joint density.
 
 References
 ----------
 Verbeek (1993), section 2.2.4: the condensed posterior of an earlier experiment as prior.
-
-What an earlier campaign has found, as the prior of a model.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo._types import Array
 from bayesoleo.errors import ModelError
@@ -191,10 +187,10 @@ class Correlated:
     def support(self) -> tuple[float, float]:
         return self.joint.low[self.index], self.joint.high[self.index]
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         return self.marginal.log_density(value)
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         return self.marginal.sample(rng, size)
 
 

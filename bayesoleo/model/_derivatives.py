@@ -1,14 +1,12 @@
 """Symbolic residuals, partial derivatives and switching functions of a model.
 
-Residuals and partial derivatives of a model, by computer algebra (Verbeek 1993, section 4.3).
-
-Analytic pieces of a model whose equations have kinks or jumps.
+Partial derivatives come from computer algebra (Verbeek 1993, section 4.3).
 
 ``abs``, ``sign``, ``step``, ``min`` and ``max`` change their formula where an argument - a
-*switching function* - changes sign. Replacing each by the formula of one side, chosen by a constant
-called its *mode* (one where the switching function is positive, zero where it is negative), leaves
-equations that are analytic while modes are held: what an integrator needs to keep its order, and to
-find the switch on a smooth continuation of the motion.
+*switching function* - changes sign. Each is replaced by the formula of one side, chosen by a
+constant called its *mode* (one where the switching function is positive, zero where it is
+negative). With modes held, the equations are analytic, so that an integrator keeps its order and
+finds the switch on a smooth continuation of the motion.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Dimensions of a model's terms: summands that cannot be added, and units that equations fix.
+"""Check of dimensions: summands that cannot be added, and units that equations determine.
 
-Only what is declared is judged. A unit that is left out is not known, a bare number that may carry
-one (``9.81*mass``, ``temperature - 293.15``) is not either, and what is not known agrees with
-everything.
+Only declared units are checked. The unit of an undeclared name is unknown, and so is that of a bare
+number that may carry one (``9.81*mass``, ``temperature - 293.15``); unknown units agree with all
+others.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A model as plain dicts of text and numbers, and back: what a stored result keeps of it.
+"""A model as plain dicts of text and numbers, and back, for stored results.
 
 Nothing is pickled: a document holds declarations only, and is parsed like any other declaration.
 """

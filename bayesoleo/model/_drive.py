@@ -1,12 +1,12 @@
 """Drive a model by any of its channels.
 
-A rig may control the displacement although the equation of motion is written for a force: then the
-displacement is the clean input, and the force is what the system answers. If the controlled
-channel's output map is a dof itself, the dof is replaced by the input with its exact derivatives;
-otherwise - an effect sits on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
+A rig may control the displacement although the equation of motion is written for a force. The
+displacement is then the clean input, and the force is the response. If the controlled channel's
+output map is a dof itself, the dof is replaced by the input with its exact derivatives. Otherwise -
+an effect acts on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
 
-Where the given-up input enters with its rate as well (a lagging sensor shows ``F + tau dot(F)``),
-what is solved for is a state: the answer ``F`` becomes a dof of first order.
+Where the rate of the former input also appears (a lagging sensor shows ``F + tau dot(F)``), the
+response ``F`` becomes a dof of first order.
 """
 
 from __future__ import annotations

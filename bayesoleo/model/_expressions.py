@@ -1,12 +1,8 @@
 """Parser of the equation language: text to symbolic expressions, and back to text.
 
-Text to symbolic expressions: the small language in which equations are declared.
-
-Names are those that a model declares; ``dot(q)`` is a time derivative (``ddot(q)`` the second), of
-an expression as well. Text is parsed against a closed list of names, so a misspelt one is an error
+The names are those that a model declares; ``dot(q)`` is a time derivative (``ddot(q)`` the second),
+also of an expression. Text is parsed against a closed list of names, so a misspelt one is an error
 rather than a new symbol.
-
-Expressions as the text that declares them.
 """
 
 from __future__ import annotations

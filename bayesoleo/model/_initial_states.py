@@ -1,13 +1,14 @@
-"""How a transient starts: the state of a model at a run's first sample.
+"""Initial states of transients: the state of a model at a run's first sample.
 
 A dof declares its start with ``Dof(initial=...)``: an expression over parameters (so that a start
-may be estimated, or depend on what is), conditions, channels as measured at the first sample, and
-the word ``equilibrium``, the value at which nothing moves under the inputs of the first sample.
+may be estimated, or depend on estimated ones), conditions, channels as measured at the first
+sample, and the word ``equilibrium``, the value at which nothing moves under the inputs of the first
+sample.
 
-A start that is not declared is estimated: it is what is measured there, or equilibrium where no
-channel measures it, plus an unknown of each transient run (``start_<dof>``), with a prior so weak
-that the data decide. The thesis (Verbeek 1993, section 4.2) warns that "poor initial conditions
-ruin" a transient; an unknown a run costs less than that.
+An undeclared start is estimated: it is the measured value, or equilibrium where no channel measures
+it, plus an unknown of each transient run (``start_<dof>``), with a prior so weak that the data
+decide. The thesis (Verbeek 1993, section 4.2) warns that "poor initial conditions ruin" a
+transient; one unknown for each run costs less than that.
 """
 
 from __future__ import annotations

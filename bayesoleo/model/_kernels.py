@@ -1,17 +1,14 @@
 """Numerical kernels of a model: evaluation at a block of points for many parameter vectors.
 
-A model as a key: equal to all models of the same expressions, whatever their parameters' values.
-
-Computer algebra is the slowest part of a search that tries a hundred models on each campaign, and
-its results hold for every campaign.
-
-Functions that evaluate a model at a block of points for many parameter vectors.
-
 All arrays have the points last, so that a loop over points runs through memory: states ``z (L, nz,
 N)``, inputs ``u (nu, N)`` shared by the lanes of a call, constants ``p (L, np)``. ``lanes`` lists
-which of the ``L`` parameter vectors to evaluate. The same generated source serves two back ends:
-NumPy (ready at once; for models evaluated a few times) and Numba (compiled, cached on disk by the
-source's hash).
+the parameter vectors, of the ``L``, that are evaluated. The same generated source serves two back
+ends: NumPy (ready at once; for models evaluated a few times) and Numba (compiled, cached on disk by
+the source's hash).
+
+Kernels are kept by a key that is equal for all models of the same expressions, whatever the values
+of their parameters. Computer algebra is the slowest part of a search that tries a hundred models on
+each campaign, and its results hold for every campaign.
 """
 
 from __future__ import annotations

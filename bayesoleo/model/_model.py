@@ -1,10 +1,7 @@
 """Declaration of a model: named terms and definitions in one immutable value.
 
-A model is declared, not programmed: named terms and definitions in one frozen value.
-
-Declared units: all are read, and all are of SI, because nothing in a model is converted.
-
-Names that a model declares and nothing in it uses: most are slips of the pen.
+Declared units are all read and must be SI, because nothing in a model is converted. A declared name
+that is not used is reported, because most are typing errors.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Parameters, dofs, conditions and outputs: the parts a model is declared from."""
+"""Parameters, dofs, conditions and outputs: the parts from which a model is declared."""
 
 from __future__ import annotations
 

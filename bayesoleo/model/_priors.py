@@ -1,16 +1,12 @@
 """Prior densities of single parameters, and their transforms to unbounded coordinates.
 
-Prior densities of single parameters.
-
 The kinds are those of Verbeek (1993), section 2.2.4 - uniform within absolute bounds, normal, and
-normal read as a 99 % band - and the log-normal and truncated normal that positive quantities ask
-for. All are written out, since an estimator and a sampler ask for them thousands of times and
-building a SciPy distribution costs a hundred times more than the density itself.
+normal read as a 99 % band - and, for positive quantities, the log-normal and the truncated normal.
+All are written out, since an estimator and a sampler evaluate them thousands of times and building
+a SciPy distribution costs a hundred times more than the density itself.
 
-Maps between parameters in natural units and coordinates without bounds.
-
-A sampler that never meets a bound needs no rejection at it. What the map stretches is paid back by
-the logarithm of its Jacobian.
+In unbounded coordinates a sampler never meets a bound and needs no rejection there. The logarithm
+of the Jacobian corrects the density for the transform.
 """
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ from functools import cached_property
 from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri, expit, log_ndtr, ndtri_exp
 
 from bayesoleo._types import Array
@@ -56,10 +52,10 @@ class Prior(Protocol):
     def support(self) -> tuple[float, float]:
         """Lowest and highest value with positive density; infinite where unbounded."""
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         """Natural logarithm of the normalised density; minus infinity outside the support."""
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Independent draws, shape (size,)."""
 
 
@@ -95,12 +91,12 @@ class Normal:
     def support(self) -> tuple[float, float]:
         return -np.inf, np.inf
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         with np.errstate(over="ignore"):
             scaled = (np.asarray(value, dtype=float) - self.centre) / self.spread
             return np.asarray(-0.5 * scaled * scaled - (_LOG_SQRT_2_PI + np.log(self.spread)))
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         return self.centre + self.spread * rng.standard_normal(size)
 
 
@@ -127,12 +123,12 @@ class Uniform:
     def support(self) -> tuple[float, float]:
         return float(self.low), float(self.high)
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         value = np.asarray(value, dtype=float)
         inside = np.where(np.isnan(value), np.nan, -np.log(self.high - self.low))
         return np.where((value < self.low) | (value > self.high), -np.inf, inside)
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         return rng.uniform(self.low, self.high, size)
 
 
@@ -159,7 +155,7 @@ class LogNormal:
     def support(self) -> tuple[float, float]:
         return 0.0, np.inf
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         # A copy without strides: NumPy may round the logarithm of a strided array differently.
         value = np.array(value, dtype=float)
         outside = value <= 0
@@ -169,7 +165,7 @@ class LogNormal:
             inside = -0.5 * scaled * scaled - (_LOG_SQRT_2_PI + np.log(self.log_spread)) - logarithm
         return np.where(outside, -np.inf, inside)
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         return self.median * np.exp(self.log_spread * rng.standard_normal(size))
 
 
@@ -229,14 +225,14 @@ class TruncatedNormal:
     def support(self) -> tuple[float, float]:
         return float(self.low), float(self.high)
 
-    def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
+    def log_density(self, value: ArrayLike) -> Array:
         value = np.asarray(value, dtype=float)
         with np.errstate(over="ignore"):
             u = (value - self._peak) / self.spread
             inside = -u * (0.5 * u + self._steepness) - np.log(self._moments[0] * self.spread)
         return np.where((value < self.low) | (value > self.high), -np.inf, inside)
 
-    def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         # In the left tail the distribution function is a small number known to full precision.
         sign = -1.0 if self._steepness > 0 else 1.0
         bounds = (self.low - self.centre) / self.spread, (self.high - self.centre) / self.spread

@@ -1,4 +1,4 @@
-"""Which parameter values fit, as a density: the sampled posterior of parameters and variances."""
+"""Posterior density of parameters and variances: its sampler, approximations and diagnostics."""
 
 import lazy_loader
 

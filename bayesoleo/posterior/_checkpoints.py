@@ -1,11 +1,8 @@
-"""Segments of the chains, kept on disk so that sampling resumes.
+"""Segments of the chains, stored so that sampling can resume.
 
-A stretch of the chains together with everything that continuing after it needs.
-
-Where segments go: numbered pieces on disk, or memory.
-
-The generator's state lies in the same file as the draws, so that a killed run continues to the same
-draws.
+A segment holds draws together with everything that is needed to continue. Segments are numbered
+files on disk, or stay in memory. The state of the random generator is in the same file as the
+draws, so that an interrupted run continues to the same draws.
 """
 
 from __future__ import annotations

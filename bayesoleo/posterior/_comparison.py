@@ -1,14 +1,12 @@
 """Posterior against point estimate, sensitivity to the prior, calibration of posteriors.
 
-What the posterior says that the point estimate, its covariances and its regions did not.
+The comparison shows where the posterior differs from the point estimate with its covariances and
+regions. Sensitivity to the prior is computed without sampling again.
 
-How much the posterior leans on the prior, without sampling it again.
-
-Are posteriors what they say? Ranks of the truth among draws, and whether they are uniform.
-
-Where parameters are drawn from their prior and data from the model, the rank of each parameter
-among independent draws of its posterior is uniform. A sampler or a density with a mistake shows as
-a slope (bias), a hollow (too narrow) or a hill (too wide) of the ranks.
+Calibration is simulation-based. Where parameters are drawn from their prior and data from the
+model, the rank of each parameter among independent draws of its posterior is uniform. An error in
+the sampler or the density shows as a slope (bias), a U shape (too narrow) or a hump (too wide) of
+the ranks.
 
 References
 ----------
@@ -26,12 +24,12 @@ from functools import lru_cache
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
 from bayesoleo import _schema as schema
 from bayesoleo._display import columns
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import ResultsError
 from bayesoleo.posterior._diagnostics import Samples
 
@@ -261,7 +259,7 @@ DRAWS = 99
 _SETS = 4000
 
 
-def rank_of(samples: Samples, truth: ArrayLike, rng: np.random.Generator) -> NDArray[np.int64]:
+def rank_of(samples: Samples, truth: ArrayLike, rng: np.random.Generator) -> Integers:
     """Rank of each true value, shape (k,), among :data:`DRAWS` draws of its posterior.
 
     Parameters
@@ -355,13 +353,13 @@ def _reference(count: int, draws: int, seed: int) -> Array:
     return np.sort(_least_p(_counts(sets, draws), _two_sided(count, draws)))
 
 
-def _counts(ranks: NDArray[np.int64], draws: int) -> NDArray[np.int64]:
+def _counts(ranks: Integers, draws: int) -> Integers:
     """Ranks below 1, 2 ... draws, shape (S, draws), of sets of ranks, shape (S, R)."""
     table = np.zeros((len(ranks), draws + 1), dtype=np.int64)
     np.add.at(table, (np.arange(len(ranks))[:, None], ranks), 1)
     return np.cumsum(table, axis=1)[:, :-1]
 
 
-def _least_p(counts: NDArray[np.int64], table: Array) -> Array:
+def _least_p(counts: Integers, table: Array) -> Array:
     """Smallest probability over the places, shape (S,), of counts (S, draws)."""
     return np.asarray(table[counts, np.arange(counts.shape[1])].min(axis=1))

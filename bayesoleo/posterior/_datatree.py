@@ -1,10 +1,8 @@
 """Samples as groups of a DataTree that ArviZ reads, with blocks of a period as data points.
 
-Blocks of samples: the data points by which ArviZ checks and compares models.
-
-A sample is no data point of its own, because neighbouring errors may be alike, and a run is too
-much for one where there are few. A block is one period of one run; where a run has many, a few
-consecutive ones. A transient is cut into equal stretches. Each block gives, by output,
+One sample is no suitable data point, because neighbouring errors may be correlated; one run is too
+much where there are few. A block is one period of one run, or a few consecutive periods where a run
+has many. A transient is cut into equal stretches. Each block gives, by output,
 
 * one measured sample (``observed_data``), at another phase in each block, so that all blocks
   together show every part of the motion,
@@ -17,12 +15,8 @@ All three have the one dim ``block``, so no value is missing.
 References
 ----------
 Bürkner, Gabry and Vehtari (2021), "Efficient leave-one-out cross-validation for Bayesian
-non-factorized normal and Student-t models", *Computational Statistics* 36, section 2.1 (what
-remains of leaving one out where data depend on each other).
-
-Draws for a posterior predictive, and the errors that come with them.
-
-Samples as the labelled groups of the result's tree.
+non-factorized normal and Student-t models", *Computational Statistics* 36, section 2.1
+(leave-one-out where data depend on each other).
 """
 
 from __future__ import annotations
@@ -34,11 +28,10 @@ from typing import Any, cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._correlated_priors import sample_of
@@ -70,9 +63,9 @@ class Blocks:
         Number of the block's first period, or of a transient's stretch, from 1.
     """
 
-    starts: NDArray[np.int64]
-    shown: NDArray[np.int64]
-    period: NDArray[np.int64]
+    starts: Integers
+    shown: Integers
+    period: Integers
 
     @classmethod
     def of(cls, samples: RunSamples, most: int, first: int = 0) -> Blocks:
@@ -117,7 +110,7 @@ def cut(density: LogDensity) -> list[Blocks]:
 def block_groups(
     samples: Samples,
     density: LogDensity,
-    inputs: Callable[[int, NDArray[np.int64]], Mapping[str, Array]] | None = None,
+    inputs: Callable[[int, Integers], Mapping[str, Array]] | None = None,
     *,
     units: Mapping[str, str] | None = None,
     seed: int = 0,
@@ -194,7 +187,7 @@ def _block_coordinates(runs: Sequence[str], blocks: Sequence[Blocks]) -> dict[st
 def _constant(
     samples: Sequence[RunSamples],
     blocks: Sequence[Blocks],
-    inputs: Callable[[int, NDArray[np.int64]], Mapping[str, Array]] | None,
+    inputs: Callable[[int, Integers], Mapping[str, Array]] | None,
     units: Mapping[str, str],
 ) -> xr.Dataset:
     """What was known at the samples that are shown: when they were taken, and the inputs."""
@@ -300,7 +293,7 @@ def choose_all(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]
     return _flat(samples.theta)[picks], _flat(samples.of_errors)[picks]
 
 
-def _picks(samples: Samples, size: int, seed: int) -> NDArray[np.int64]:
+def _picks(samples: Samples, size: int, seed: int) -> Integers:
     count = samples.log_density.size
     return np.random.default_rng(seed).choice(count, size=min(size, count), replace=False)
 

@@ -1,16 +1,10 @@
-"""Samples and their diagnostics: effective size, convergence, agreement of ensembles.
-
-What draws are worth, whether ensembles agree, and what a point estimate did not say.
-
-What sampling returns.
-"""
+"""Samples and their diagnostics: effective sample size, convergence, agreement of ensembles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo import _schema as schema
@@ -101,7 +95,7 @@ def effective_size(draws: Array) -> Array:
     return out
 
 
-def nested_rhat(draws: Array, ensemble: NDArray[np.int64]) -> Array:
+def nested_rhat(draws: Array, ensemble: Integers) -> Array:
     """Agreement between ensembles of every quantity; one means that they agree.
 
     Parameters

@@ -1,12 +1,9 @@
 """Moves of emcee's ensembles: differential evolution, snooker, independence proposals.
 
-Differential evolution: a step along the difference of two other walkers.
-
-Snooker update: a step along the line to another walker.
-
-Independence move: proposals from a fixed mixture, wherever the walker is.
-
-Several independent ensembles advanced in one call, and the acceptance of each kind of move.
+Differential evolution steps along the difference of two other walkers. A snooker update steps along
+the line to another walker. The independence move proposes from a fixed mixture, wherever the walker
+is. Several independent ensembles are advanced in one call, and the acceptance of each kind of move
+is recorded.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""Independent ensembles of walkers, on this machine or on the workers of a cluster.
+"""Independent ensembles of walkers, advanced together by emcee, here or on a cluster's workers.
 
-A log density whose rows are evaluated by the workers of a cluster.
-
-Every row depends on itself alone, so the draws are the same on one machine and on many, whatever
-the number of ensembles or workers and whichever of them are lost.
-
-Several independent ensembles of walkers, advanced together by emcee.
+Workers evaluate rows of the log density. Each row depends on itself alone, so the draws are the
+same on one machine and on many, whatever the number of ensembles or workers, and even if workers
+are lost.
 """
 
 from __future__ import annotations

@@ -1,31 +1,31 @@
-r"""Parameters that scatter between runs: a population with mean and spread, sampled with the runs'.
+r"""Parameters that scatter between runs: their population mean and spread, sampled with the runs.
 
-In coordinates without bounds a parameter of run :math:`\kappa` is
+In unbounded coordinates a parameter of run :math:`\kappa` is
 
 .. math:: u_\kappa \sim N(\mu, s^2),
 
-with the parameter's own prior for the mean :math:`\mu`, and a half-normal one for the spread
-:math:`s` whose scale is that prior's standard deviation. Of a parameter without bounds :math:`s` is
-in its unit; of one with a bound it is the spread of the logarithm of the distance to that bound, of
-one with two bounds that of the logit.
+with the parameter's own prior for the mean :math:`\mu`, and a half-normal prior for the spread
+:math:`s` whose scale is the standard deviation of that prior. For a parameter without bounds
+:math:`s` is in its unit; with one bound it is the spread of the logarithm of the distance to that
+bound, with two bounds that of the logit.
 
-Sampled as they stand, the runs' values and the mean would have to move together whenever :math:`s`
-shrinks; their deviations from it would, whenever :math:`s` grows. So the coordinates follow what
-the runs say for themselves: where run :math:`\kappa` alone, given the parameters that all runs have
-in common, puts its value at :math:`\hat u_\kappa \pm \sigma_\kappa`,
+The centred form correlates the runs' values with the mean when :math:`s` is small, the non-centred
+form correlates their deviations when :math:`s` is large. The coordinates therefore depend on the
+estimate of each run. Where run :math:`\kappa` alone, given the parameters that all runs share,
+gives :math:`\hat u_\kappa \pm \sigma_\kappa`,
 
 .. math::
 
     u_\kappa = \frac{s^2 \hat u_\kappa + \sigma_\kappa^2 \mu}{s^2 + \sigma_\kappa^2}
                + \frac{s \sigma_\kappa}{\sqrt{s^2 + \sigma_\kappa^2}}\, z_\kappa ,
 
-and likewise :math:`\mu` is its own mean given :math:`s` plus so many of its own spreads. For a
-linear model with normal errors all :math:`z` are then independent and standard normal whatever
-:math:`s` is: centred where the data are strong, not centred where they are weak, and anything
-between. The spread itself may be anything from nothing to far more than was seen; its coordinate
-is the normal quantile of a half-Cauchy distribution function, in which both of its tails, flat at
-nothing and a power far out, are like a normal's. The posterior does not depend on the numbers
-:math:`\hat u` and :math:`\sigma`, only the work does.
+and likewise :math:`\mu` is its conditional mean given :math:`s` plus a multiple of its conditional
+standard deviation. For a linear model with normal errors all :math:`z` are then independent and
+standard normal for every :math:`s`: centred where the data are strong, non-centred where they are
+weak, and in between otherwise. The coordinate of the spread is the normal quantile of a half-Cauchy
+distribution function. In it both tails of the spread, flat at zero and a power law at infinity,
+are like those of a normal. The posterior does not depend on the numbers :math:`\hat u` and
+:math:`\sigma`; only the efficiency of sampling does.
 
 References
 ----------
@@ -44,11 +44,10 @@ from functools import cached_property
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import ErrorModel
 from bayesoleo.error_models._registry import error_model
 from bayesoleo.errors import InputError
@@ -86,7 +85,7 @@ class Population:
     """
 
     name: str
-    members: NDArray[np.int64]
+    members: Integers
     prior: Prior
     centres: Array
     sds: Array
@@ -218,7 +217,7 @@ class HierarchicalUnknowns(Unknowns):
     populations: tuple[Population, ...] = ()
 
     @cached_property
-    def _shared(self) -> NDArray[np.int64]:
+    def _shared(self) -> Integers:
         """Places of the unknowns that belong to no population."""
         taken = np.concatenate([population.members for population in self.populations])
         return np.setdiff1d(np.arange(len(self.plain.labels)), taken)
@@ -425,7 +424,7 @@ def hierarchical(
     )
 
 
-def _members(problem: EstimationProblem, name: str) -> NDArray[np.int64]:
+def _members(problem: EstimationProblem, name: str) -> Integers:
     """Places of a parameter's values in the runs."""
     wanted = {schema.by_run(name, run) for run in problem.runs}
     members = np.array([k for k, own in enumerate(problem.names) if own in wanted], dtype=np.int64)

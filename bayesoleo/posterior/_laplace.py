@@ -1,14 +1,11 @@
-"""Laplace approximations at the modes, and importance sampling from their mixture.
+"""Laplace approximations at the modes, their mixture, and importance sampling from it.
 
-Laplace approximations at the modes of a log density, and the mixture that they make.
-
-Weighted draws from a mixture: the posterior at a hundredth of the cost, where it is near one.
-
-Where Laplace's approximation is good, independent draws from it that are weighted by target over
-proposal are worth a third of what draws of the target itself would be, and no walker has to warm
-up. Whether the approximation *is* good is told by the weights: the largest of them follow a
-generalised Pareto distribution whose shape says how many of their moments exist. Below 0.7 sums of
-them converge at a practicable rate; above, :func:`~bayesoleo.posterior.sample` is the way.
+Where the approximation is good, independent draws from it, weighted by target over proposal, are
+worth about a third as many draws of the target itself, and no walker has to warm up. The cost is a
+hundredth of sampling. The weights show whether the approximation is good: the largest of them
+follow a generalised Pareto distribution whose shape determines how many of their moments exist.
+Below 0.7 sums of weights converge at a practicable rate; above, use
+:func:`~bayesoleo.posterior.sample`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""The log posterior density of many parameter vectors at once.
-
-Residuals of a problem at one vector, and what they tell of its unknowns under an error model.
-
-The log posterior density of many vectors at once, over coordinates without bounds.
-"""
+"""Log posterior density of many parameter vectors at once, over unbounded coordinates."""
 
 from __future__ import annotations
 
@@ -11,11 +6,10 @@ from collections import Counter
 from typing import Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import Array, Float
+from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._base import ErrorModel
 from bayesoleo.error_models._registry import error_model
 from bayesoleo.errors import InputError
@@ -26,7 +20,7 @@ from bayesoleo.solvers._orbit import Status
 
 
 def residuals_at(problem: EstimationProblem, errors: ErrorModel, theta: Array) -> list[Array]:
-    """Residuals (s, n) of every run; where sums are enough, columns of equal squares.
+    """Residuals (s, n) of every run; equivalent columns where sums of squares suffice.
 
     Raises
     ------
@@ -84,14 +78,14 @@ def information_at(
     return total
 
 
-#: Prefix of the names of the error variances' coordinates.
+#: Prefix of the coordinate names of error variances.
 LOG_VARIANCE = schema.log_variance("")
-#: Parameter vectors whose residuals are held at once: what they take stays in the cache.
+#: Parameter vectors whose residuals are held at once, so that they stay in the cache.
 LANES = 8
 
 
 class Density(Protocol):
-    """What the sampler needs to know of a log density over ``d`` coordinates."""
+    """Interface of a log density over ``d`` coordinates, as the sampler uses it."""
 
     evaluations: int
     failures: Counter[str]
@@ -121,16 +115,17 @@ class LogDensity:
     Parameters
     ----------
     problem : EstimationProblem
-        What is fitted: ``l`` unknowns, ``N`` runs, ``s`` outputs.
+        Problem with ``l`` unknowns, ``N`` runs and ``s`` outputs.
     jobs : int, optional
-        Threads over which the rows are spread. By default the problem's ``misfit`` is called once
-        for all rows and spreads its own work. The result does not depend on it.
+        Threads over which the rows are distributed. By default the problem's ``misfit`` is called
+        once for all rows and distributes its own work. The result does not depend on it.
     errors : ErrorModel or str, optional
-        What the errors have in common, ``m`` quantities; see
+        Error model with ``m`` quantities; see
         :mod:`bayesoleo.error_models`. By default one variance for each output.
     unknowns : Unknowns, optional
-        How the problem's unknowns follow from ``p`` coordinates, and their prior; by default each
-        is one, with the problem's prior. See :mod:`bayesoleo.posterior._hierarchy`.
+        Map from ``p`` coordinates to the problem's unknowns, and their prior; by default one
+        coordinate for each unknown, with the problem's prior. See
+        :mod:`bayesoleo.posterior._hierarchy`.
 
     Attributes
     ----------
@@ -201,7 +196,7 @@ class LogDensity:
 
     @property
     def branch_jumps(self) -> int:
-        """Solutions of runs so far that left the branch of the one they started from."""
+        """Number of solutions, by run, that left the branch from which they started."""
         return int(jumps_of(self.problem).sum())
 
     def natural(
@@ -249,7 +244,7 @@ class LogDensity:
         inside = np.flatnonzero(status == Status.CONVERGED)
         if inside.size:
             theta = self.unknowns.theta(block[inside])
-            # Infinite or overflowing terms are told apart below by their status.
+            # Infinite or overflowing terms are identified below by their status.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 likelihood = self._of_sums if self.errors.by_sums else self._of_residuals
                 by_run[inside], status[inside] = likelihood(theta, eta[inside])
@@ -269,7 +264,7 @@ class LogDensity:
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             return self.unknowns.log_prior(block) + self.errors.log_prior(eta)
 
-    def _of_sums(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+    def _of_sums(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
         misfit = self._misfit(theta)
         return self.errors.of_sums(misfit.sum_of_squares, eta), misfit.status
 
@@ -283,7 +278,7 @@ class LogDensity:
             np.concatenate([part.status for part in parts]),
         )
 
-    def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
+    def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
         """Log-likelihood by run (W, N) and statuses (W,), in blocks of runs and rows."""
         if self.errors.over_runs:
             return self._of_all_residuals(theta, eta)
@@ -305,8 +300,8 @@ class LogDensity:
         thread_map(work, blocks, self.jobs)
         return by_run, status.max(axis=1)
 
-    def _of_all_residuals(self, theta: Array, eta: Array) -> tuple[Array, NDArray[np.int64]]:
-        """The same where runs have errors in common, in blocks of rows."""
+    def _of_all_residuals(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
+        """The same for errors that runs share, in blocks of rows."""
         problem, count = cast(ResidualProblem, self.problem), len(theta)
         by_run = np.full((count, len(self.runs)), np.nan)
         status = np.zeros(by_run.shape, dtype=np.int64)
@@ -324,9 +319,7 @@ class LogDensity:
         )
         return by_run, status.max(axis=1)
 
-    def _mark_failures(
-        self, total: Array, by_run: Array, status: NDArray[np.int64]
-    ) -> tuple[Array, Array]:
+    def _mark_failures(self, total: Array, by_run: Array, status: Integers) -> tuple[Array, Array]:
         status[(status == Status.CONVERGED) & ~np.isfinite(total)] = Status.NOT_FINITE
         failed = status != Status.CONVERGED
         total[failed], by_run[failed] = -np.inf, -np.inf

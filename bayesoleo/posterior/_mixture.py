@@ -1,4 +1,4 @@
-"""Mixtures of Student-t densities: where walkers start and what the independence move proposes."""
+"""Mixtures of Student-t densities, for starts of walkers and proposals of the independence move."""
 
 from __future__ import annotations
 

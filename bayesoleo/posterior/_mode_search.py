@@ -1,19 +1,18 @@
-"""Other modes of a density than those that its sampler would start from.
+"""Search for modes of a density beyond those from which its sampler would start.
 
-Walkers that all start in one mode say nothing of another: their ensembles agree, and every quantity
-has its effective size. So points scattered far about the start climb first, by differences of the
-density alone, a batch of them at once. A mode that they reach and that holds a share of the density
-becomes a component of the mixture from which walkers start and that proposes jumps.
+If all walkers start in one mode, they do not find another: ensembles agree, and every quantity has
+its effective sample size. Points scattered widely about the start are therefore moved uphill first,
+with differences of the density alone and as one batch. A mode found in this way that holds a share
+of the density becomes a component of the mixture from which walkers start and which proposes jumps.
 
-No finite number of climbs proves that there is no other mode: one whose basin none of them started
-in stays unknown.
+No finite number of searches proves that there is no other mode. A mode is missed if no search
+starts in its basin.
 
 References
 ----------
-Nocedal and Wright (2006), *Numerical Optimization*, 2nd ed., section 6.1 (BFGS).
-
-Gelman and Rubin (1992), "Inference from iterative simulation using multiple sequences",
-*Statistical Science* 7, section 2.1 (modes are looked for before chains start).
+Nocedal and Wright (2006), *Numerical Optimization*, 2nd ed., section 6.1 (BFGS). Gelman and Rubin
+(1992), "Inference from iterative simulation using multiple sequences", *Statistical Science* 7,
+section 2.1 (modes are searched for before chains start).
 """
 
 from __future__ import annotations
@@ -22,9 +21,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.posterior._laplace import Mode
 from bayesoleo.posterior._log_density import Density
@@ -182,9 +180,7 @@ def _from_prior(height: _Counted, block: Array) -> tuple[Array, Array]:
     return y[best, lanes], values[best, lanes]
 
 
-def _spread(
-    distance: Array, values: Array, climbs: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _spread(distance: Array, values: Array, climbs: int, rng: np.random.Generator) -> Integers:
     """Indices of points to climb from: by distance in bands, of each the highest and another.
 
     The highest of all would be those next to the start.
@@ -265,7 +261,7 @@ def _updated(inverse: Array, step: Array, change: Array) -> Array:
     return np.asarray(left @ inverse @ left.T + np.outer(step, step) / product)
 
 
-def _apart(y: Array, going: NDArray[np.int64], known: list[Array]) -> NDArray[np.int64]:
+def _apart(y: Array, going: Integers, known: list[Array]) -> Integers:
     """Climbs that are neither at a known mode nor beside an earlier one."""
     kept: list[int] = []
     for lane in going:

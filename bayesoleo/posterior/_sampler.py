@@ -1,9 +1,4 @@
-"""The sampler: adaptation, stopping rule and result.
-
-When to adapt, how long to keep, and whether that was enough.
-
-Sample a posterior until it is known well enough.
-"""
+"""Sampler of the posterior: adaptation, stopping rule and result."""
 
 from __future__ import annotations
 
@@ -40,24 +35,24 @@ from bayesoleo.posterior._mode_search import with_other_modes
 
 @dataclass(frozen=True)
 class Schedule:
-    """When to adapt, how long to keep, when to stop.
+    """Schedule of sampling: adaptation, length of segments, stopping rule.
 
     Parameters
     ----------
     effective_size : float
-        Effective draws asked for, of every quantity.
+        Requested effective sample size of every quantity.
     max_evaluations : int
-        No segment begins that would take more rows of the log density than this.
+        Budget of rows of the log density; no segment begins that would exceed it.
     warm_up : int
         Draws of the first warm-up round; each later one has twice as many.
     most_rounds : int
         Warm-up rounds at most.
     least : int
-        Kept draws of each walker before anything is decided.
+        Kept draws of each walker before the stopping rule is applied.
     times : float
-        Kept draws in autocorrelation times before the estimates are believed.
+        Kept draws, in autocorrelation times, from which the estimates are reliable.
     segment : int
-        Draws of the longest segment: what a kill can cost.
+        Draws of the longest segment, the most that an interruption can lose.
     """
 
     effective_size: float
@@ -87,7 +82,7 @@ class Quality:
     draws: int
 
     def shortfalls(self, schedule: Schedule, ensembles: int) -> list[str]:
-        """What is not yet good enough, in words; empty if everything is."""
+        """Criteria that are not met yet, in words; empty if all are."""
         if not np.all(np.isfinite(self.times)):
             return ["a quantity never moved"]
         short = []
@@ -109,12 +104,12 @@ class Quality:
         return short
 
 
-#: Points from which other modes are looked for, and for a first look.
+#: Starting points of the mode search, in full and in quick runs.
 CLIMBS, QUICK_CLIMBS = 32, 16
-#: Part of the evaluations allowed that this may take.
+#: Fraction of the evaluations that the mode search may take.
 SEARCHING = 0.25
-#: Evaluations of the log density at which a first look ends, good or not, but not before so many
-#: steps of each walker: minutes, where a motion takes milliseconds.
+#: Evaluations of the log density at which a quick run ends, converged or not, but not before this
+#: number of steps of each walker: minutes, where a motion takes milliseconds.
 QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
 
 
@@ -147,37 +142,37 @@ def sample(
         Laplace approximations at the modes; walkers start there and the independence move proposes
         from it.
     effective_size : float
-        Effective draws of every quantity to stop at, by the smaller of two estimates.
+        Effective sample size of every quantity at which sampling stops, by the smaller of two
+        estimates.
     ensembles : int
         Independent ensembles; nested R-hat compares them.
     walkers : int, optional
         Walkers of each; by default chosen from ``d``.
     seed : int
-        Everything random follows from it; the draws do not depend on threads.
+        Seed of the random generator; the draws do not depend on threads.
     out : path-like, optional
-        Folder of checkpoints. A run that was killed continues there to the same draws; one that is
-        complete is read.
+        Folder of checkpoints. An interrupted run continues there to the same draws; a complete
+        one is read.
     fingerprint : str
-        Hash of what the density depends on (data, model, priors); a folder with another one is
-        refused.
+        Hash of data, model and priors; a folder with another hash is refused.
     progress : bool or float
         Whether to show a bar of the effective size, at once or after so many seconds.
     max_evaluations : int
-        Rows of the log density to stop at.
+        Rows of the log density at which sampling stops.
     weights : MoveWeights, optional
         How often each kind of move is chosen; by default the warm-up's acceptance decides.
     segment : int
         Draws of the longest checkpointed segment.
     quick : bool
         Shorter warm-up, an effective size of at most 200 and not more than
-        :data:`QUICK_EVALUATIONS`, for a first look.
+        :data:`QUICK_EVALUATIONS`.
     climbs : int, optional
-        Points from which modes are looked for that the start does not have
+        Starting points of the search for modes that the start does not have
         (:mod:`~bayesoleo.posterior._mode_search`), by default :data:`CLIMBS`, or
-        :data:`QUICK_CLIMBS`; none where zero. Without them, walkers that all start in one mode
-        reach their effective size there, whatever else there is.
+        :data:`QUICK_CLIMBS`; zero disables it. Without the search, walkers that all start in one
+        mode reach their effective sample size there and miss others.
     scheduler : str, optional
-        Other processes or machines that evaluate the density: ``local:4``, or the address of a Dask
+        Processes or machines that evaluate the density: ``local:4``, or the address of a Dask
         scheduler; see :func:`bayesoleo._dask.connected`. The draws are the same.
 
     Returns
@@ -241,7 +236,7 @@ def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool
 def _fingerprint(
     given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule, climbs: int
 ) -> str:
-    """Hash of all that the draws follow from; a larger effective size only continues them."""
+    """Hash of all that determines the draws; a larger effective size only continues them."""
     digest = hashlib.sha256()
     settings = [
         given,
@@ -258,8 +253,8 @@ def _fingerprint(
     ]
     digest.update(json.dumps(settings).encode())
     for array in (start.centres, start.covariances, start.log_weights):
-        # Rounded: the mode found again on another machine differs in the last bits, and segments
-        # hold what was used.
+        # Rounded: the mode found on another machine differs in the last bits, and segments hold the
+        # mode that was used.
         digest.update(np.array2string(array, precision=6, threshold=array.size + 1).encode())
     return digest.hexdigest()
 
@@ -267,10 +262,10 @@ def _fingerprint(
 def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: Schedule) -> Segment:
     """Walkers drawn from the start and from modes found beside it."""
     spent = 0
-    # A climb takes some twenty rows and as many as there are coordinates, a dozen times.
+    # A climb takes about a dozen times twenty rows plus one for each coordinate.
     climbs = min(climbs, int(SEARCHING * schedule.max_evaluations / (12 * (20 + start.dimension))))
     if climbs > 0:
-        # A generator of its own: where nothing is found the draws are what they are without.
+        # A separate generator: if no mode is found, the draws are the same as without the search.
         rng = np.random.default_rng([seed, climbs])
         start, spent = with_other_modes(group.log_density, start, climbs, rng)
     first = group.start(start, seed)
@@ -296,8 +291,8 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
         return True
     if len(rounds) < 2:
         return False
-    # Nearly all proposals that forget where a walker was are taken: so it did, and none is left in
-    # a tail that the mixture misses.
+    # Nearly all independence proposals are accepted: walkers have forgotten their start, and none
+    # is left in a tail that the mixture misses.
     if _independence(rounds[-1]) > 0.8:
         return True
     times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
@@ -305,7 +300,7 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
 
 
 def _tuned(segments: list[Segment]) -> MoveWeights:
-    """From the last round of the warm-up: fixed before draws are kept, the same after a restart."""
+    """Move weights from the last warm-up, fixed before draws are kept, also after a restart."""
     rounds = [s for s in segments if s.phase == "warm-up"]
     return MoveWeights.tuned(_independence(rounds[-1])) if rounds else MoveWeights()
 
@@ -318,7 +313,7 @@ def _independence(segment: Segment) -> float:
 def _keep(
     store: Store, group: Ensembles, schedule: Schedule, bar: _Bar
 ) -> tuple[Quality, list[str]]:
-    """Add segments until the draws are good enough or the evaluations are spent."""
+    """Add segments until the criteria are met or the evaluations are used up."""
     while True:
         kept = [s for s in store.segments if s.phase == "kept"]
         done = sum(s.draws for s in kept)
@@ -336,10 +331,10 @@ def _keep(
 
 
 def _decisions(least: int, done: int) -> list[int]:
-    """Numbers of draws at which it is decided whether to stop, up to the first after those done.
+    """Numbers of draws at which the stopping rule is applied, up to the first after those done.
 
-    They grow by a fifth and depend on nothing else, so that a run that was interrupted stops at
-    the same draw; and the diagnostics, whose cost grows with the draws, are computed rarely.
+    They grow by a fifth and depend on nothing else, so that an interrupted run stops at the same
+    draw. The diagnostics, whose cost grows with the draws, are thus computed rarely.
     """
     numbers = [least]
     while numbers[-1] <= done:
@@ -350,7 +345,7 @@ def _decisions(least: int, done: int) -> list[int]:
 def _stopped(
     kept: list[Segment], group: Ensembles, schedule: Schedule
 ) -> tuple[Quality, list[str]]:
-    if sum(s.draws for s in kept) < 4:  # what splitting chains in halves needs
+    if sum(s.draws for s in kept) < 4:  # splitting chains in halves needs this many
         raise InputError(
             "no draw could be kept within so many evaluations",
             key="max_evaluations",

@@ -1,7 +1,4 @@
-"""Unknowns of a problem as unbounded coordinates, and their prior.
-
-The unknowns of a problem as coordinates without bounds, and their prior there.
-"""
+"""Unknowns of a problem as unbounded coordinates, and their prior in these coordinates."""
 
 from __future__ import annotations
 

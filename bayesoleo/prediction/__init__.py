@@ -1,4 +1,4 @@
-"""prediction"""
+"""Prediction of measured runs by a model: periodic and transient motions, with sensitivities."""
 
 import lazy_loader
 

@@ -1,16 +1,12 @@
-"""Known solutions from which solutions at other parameters start.
+"""Anchors: known solutions with derivatives, from which solutions at other parameters start.
 
-A solution with its derivatives, from which solutions at other parameters start.
+An anchor that is fixed before sampling makes a solution a function of its own parameters alone. It
+also detects a change of branch: the linear prediction from which a solve starts then errs by more
+than the distance moved.
 
-Frozen before sampling, it makes a solution a function of its own parameters alone. It also knows
-when a solution is none of its own branch: the linear prediction that a solve starts from is wrong
-by more than it moved.
-
-Where the equations of a whole period are not solved from a guess: start from a motion that an
-integrator found.
-
-Steep friction leaves Newton's method on a mesh little to go by until it knows where the motion
-sticks; an integrator sees that as it goes.
+Where Newton's method does not converge from a guess, the anchor comes from a motion that an
+integrator found. Steep friction gives Newton's method on a mesh little information until it knows
+where the motion sticks; an integrator finds this as it proceeds.
 """
 
 from __future__ import annotations
@@ -19,9 +15,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Float
+from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.model._model import Model
@@ -83,7 +78,7 @@ class Anchor:
             return -1
         return int(count_unstable(floquet_multipliers(self.monodromy)))
 
-    def left_by(self, change: Array, x: Array) -> NDArray[np.bool_]:
+    def left_by(self, change: Array, x: Array) -> Flags:
         """Whether solutions ``x (L, n, w)`` at changes ``(L, na)`` of the active parameters lie
         farther from their prediction than that moved, and than a tenth of the swing.
         """
@@ -93,12 +88,12 @@ class Anchor:
         return found
 
     @cached_property
-    def scale(self) -> tuple[Array, NDArray[np.int64]]:
+    def scale(self) -> tuple[Array, Integers]:
         """Swing of each state, shape (D,), and the nodes at which motions are compared."""
         states = self.x.shape[1] if self.monodromy is None else len(self.monodromy)
         return swings(self.x, min(states, self.x.shape[1])), compared(len(self.x))
 
-    def after(self, old: Anchor | None, boundary: Boundary, active: NDArray[np.int64]) -> Anchor:
+    def after(self, old: Anchor | None, boundary: Boundary, active: Integers) -> Anchor:
         """The same, knowing whether it is on the branch of the anchor before it."""
         if old is None:
             return self
@@ -106,7 +101,7 @@ class Anchor:
         left = far and not old.leads_to(self.p, self.x, boundary, active)
         return replace(self, jumped=bool(left or old.unstable != self.unstable))
 
-    def leads_to(self, p: Array, x: Array, boundary: Boundary, active: NDArray[np.int64]) -> bool:
+    def leads_to(self, p: Array, x: Array, boundary: Boundary, active: Integers) -> bool:
         """Whether small steps from here to constants ``p (np,)`` arrive at a solution ``x (n, w)``.
 
         A linear prediction fails over a long way too; another branch is where no path leads.
@@ -117,7 +112,7 @@ class Anchor:
         swing = self.scale[0]
         return bool(np.all(np.abs(end - x)[:, : swing.size] <= SAME * swing))
 
-    def _walked(self, p: Array, boundary: Boundary, active: NDArray[np.int64]) -> Array | None:
+    def _walked(self, p: Array, boundary: Boundary, active: Integers) -> Array | None:
         """Where a path of steps, each predicted by the last, ends; None where it has an end of its
         own.
         """

@@ -1,12 +1,15 @@
 """Inputs that do not repeat: smooth curves through noisy samples, with derivatives.
 
-Signals that do not repeat: a smooth curve through noisy samples, with its derivatives.
+A signal is modelled as a process whose third derivative is white noise, sampled with white noise.
+Its smoothed mean is a quintic smoothing spline (Wahba 1978), found by a Kalman filter and a
+backward pass in O(N); its smoothness follows from the filter's innovations, by maximum likelihood.
+Value, velocity and acceleration at the samples define the spline between them, and the same model
+gives draws of the remaining uncertainty.
 
-A signal is taken as a process whose third derivative is white noise, sampled with white noise. Its
-smoothed mean is a quintic smoothing spline (Wahba 1978), found by a Kalman filter and a backward
-pass in O(N); how smooth it is follows from the filter's innovations, by maximum likelihood. Value,
-velocity and acceleration at the samples define the spline between them, and the same model gives
-draws of what the smoothing leaves uncertain.
+The band-limited curve holds all frequencies up to half the sampling rate, unless the spectrum has
+fallen to a noise floor below that. It is then cut off at that frequency if a derivative of the
+channel is taken, or if no other channel responds to the higher frequencies. Curves are kept on a
+grid so fine that quintic pieces between its points are exact to 5e-6.
 
 References
 ----------
@@ -15,13 +18,6 @@ in regression. J. Royal Statistical Society B 40(3), 364-372.
 
 Durbin, J. and Koopman, S. J. (2002). A simple and efficient simulation smoother for state space
 time series analysis. Biometrika 89(3), 603-616.
-
-A channel that does not repeat as an input: the band-limited curve through its samples.
-
-A curve holds all frequencies up to half the sampling rate, unless the spectrum has fallen to a
-floor of noise below that. There it is cut off if a derivative is taken of it, or if no other
-channel answers to what is cut off. Curves are kept on a grid so fine that quintic pieces between
-its points are exact to 5e-6.
 """
 
 from __future__ import annotations

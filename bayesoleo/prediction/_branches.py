@@ -1,11 +1,7 @@
-"""Branches of periodic answers of a model, and its limit cycles.
+"""Branches of periodic responses of a model, and limit cycles of a model without input.
 
-Branches of a model's periodic answers.
-
-What a single solve does not show: that there are other answers to the same motion, where two of
-them meet and vanish, and which of them a rig can be on.
-
-The limit cycle of a model without input, with its period.
+A single solve does not show other responses to the same input, the folds where two of them meet and
+vanish, and which of them are stable. Branches do.
 """
 
 from __future__ import annotations
@@ -15,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
@@ -66,7 +61,7 @@ class AnswerBranch:
         return self.branch.values
 
     @property
-    def unstable(self) -> NDArray[np.int64]:
+    def unstable(self) -> Integers:
         """Number of multipliers outside the unit circle at each value, shape (K,)."""
         return np.array([point.unstable for point in self.branch.points], dtype=np.int64)
 

@@ -1,29 +1,23 @@
-"""Band-limited interpolation of samples, with the Kalman smoother it is based on.
+"""Band-limited interpolation of samples, with the Kalman smoother on which it is based.
 
-Kalman filter and smoother of a process whose third derivative is white noise.
+The smoother models a process whose third derivative is white noise. Time is in sampling intervals
+and noise in standard deviations of a sample, so that one number remains: the roughness, the
+variance of the process noise in an interval. The smoothed mean is a quintic smoothing spline (Wahba
+1978) whose gain at the angular frequency w per sample is ``1 / (1 + w**6 / roughness)`` inside a
+long record. Between its points it consists of quintic pieces, given by value, first and second
+derivative.
 
-Time is in sampling intervals and noise in standard deviations of a sample's, so that one number is
-left: the roughness, variance of the process's noise in an interval. The smoothed mean is a quintic
-smoothing spline (Wahba 1978) whose gain at the angular frequency w per sample is
-``1 / (1 + w**6 / roughness)`` inside a long record.
+A signal that was sampled fast enough is the sum of its frequencies up to half the sampling rate
+(Shannon 1949), which the discrete Fourier transform gives with all derivatives. A record is not
+one period of that transform. Near its ends the curve is therefore a smoothing spline of twice the
+band, and beyond them the record is continued by reflection, so that value, slope and curvature are
+continuous, until it may fade out.
 
 References
 ----------
 Wahba, G. (1978). Improper priors, spline smoothing and the problem of guarding against model errors
 in regression. J. Royal Statistical Society B 40(3), 364-372.
 
-Quintic pieces between equidistant points with value, first and second derivative.
-
-Band-limited interpolation of samples that do not repeat.
-
-Between its samples a signal that was sampled fast enough is the sum of its frequencies up to half
-the sampling rate (Shannon 1949), which the discrete Fourier transform gives with all derivatives.
-A record does not end where a period of that transform would. Near its ends the curve is a smoothing
-spline of twice the band, and beyond them the record is continued by reflection, so that value,
-slope and curvature go on, until it may fade out.
-
-References
-----------
 Shannon, C. E. (1949). Communication in the presence of noise. Proceedings of the IRE 37(1), 10-21.
 """
 

@@ -1,17 +1,14 @@
-"""Bandwidth of inputs: what a model amplifies wrongly, and what it does not receive.
-
-Inputs from which a model makes an output that was not measured.
+"""Bandwidth of inputs: harmonics that are noise, and content that does not reach the model.
 
 A model that takes derivatives of an input multiplies its harmonics by powers of their frequency. An
-encoder shows vibrations of a nanometre at hundreds of hertz; a rigid mass makes newtons of them,
-where the measured force has none. So predicted and measured power are compared by band, and from
-the top down an input counts only as far as its outputs answer to it.
+encoder shows vibrations of a nanometre at hundreds of hertz; a rigid mass turns them into newtons
+that the measured force does not contain. Predicted and measured power are therefore compared by
+frequency band, from the highest down, and an input is used up to the frequency where its outputs
+respond to it.
 
-What of its inputs a model does not get, beyond noise.
-
-An input is cut off where its spectrum has fallen to a floor. In a periodic run it counts by its
-harmonics. In a transient it is a straight line over stretches that are masked. Each of these leaves
-something out, which is noise only if it is flat, if no output answers to it, or if it is small
+An input loses content in three ways: it is cut off where its spectrum has fallen to a floor; in a
+periodic run only its harmonics count; in a transient it is a straight line over masked stretches.
+The lost part is noise only if its spectrum is flat, if no output responds to it, or if it is small
 beside noise.
 """
 

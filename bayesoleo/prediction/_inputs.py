@@ -1,9 +1,4 @@
-"""Inputs of a run and their exact derivatives, as solvers and integrators take them.
-
-Rows of inputs and their exact derivatives, at any phase of a record.
-
-A model under the inputs of one run, as integrators take it.
-"""
+"""Inputs of a run with their exact derivatives at any phase, for solvers and integrators."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Periodic orbits of a model under a planned motion, by any of the package's solvers.
 
-One question, five ways to answer it: on a mesh of equal steps, on a mesh of its own, by shooting,
-by shooting with derivatives from a mesh, and by shooting with a library's integrator. Answers can
-be held against each other.
+There are five solvers: a mesh of equal steps, an adaptive mesh, shooting, shooting with derivatives
+from a mesh, and shooting with a library's integrator. Their results can be compared.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
@@ -69,7 +68,7 @@ class PeriodicOrbits:
         return tuple(motion.orbit for motion in self.motions)
 
     @property
-    def status(self) -> NDArray[np.int64]:
+    def status(self) -> Integers:
         """Values of :class:`~bayesoleo.solvers._orbit.Status`, shape (L,): look here first."""
         return np.array([int(orbit.status) for orbit in self.orbits], dtype=np.int64)
 

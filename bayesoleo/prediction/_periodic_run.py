@@ -1,7 +1,4 @@
-"""Prediction of one periodic run, with sensitivities.
-
-Predict one run: solve the model under its inputs, evaluate outputs at its raw samples.
-"""
+"""Prediction of one periodic run, with sensitivities: model outputs at raw samples."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.errors import CampaignError, ModelError
@@ -291,9 +287,7 @@ class RunPredictor:
         jumped = self._left(p, solution.x, samples.status, monodromy)
         return replace(samples, jumped=jumped, monodromy=monodromy)
 
-    def _left(
-        self, p: Array, x: Array, status: NDArray[np.int64], monodromy: Array | None = None
-    ) -> NDArray[np.bool_]:
+    def _left(self, p: Array, x: Array, status: Integers, monodromy: Array | None = None) -> Flags:
         """Whether solutions that converged left the anchor's branch, which is counted."""
         anchor = self.anchor
         if not self.watched or anchor is None or anchor.monodromy is None:  # of a transient
@@ -307,7 +301,7 @@ class RunPredictor:
         if left.any():
             with _COUNTING:
                 self.jumps += int(left.sum())
-        return cast(NDArray[np.bool_], left)
+        return cast(Flags, left)
 
     def evaluate(self, p: Array) -> PredictedSamples:
         """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it.
@@ -332,7 +326,7 @@ class RunPredictor:
         p: Array,
         x: Array | None,
         x_p: Array | None,
-        status: NDArray[np.int64],
+        status: Integers,
         derivatives: bool,
     ) -> PredictedSamples:
         """Outputs of solutions ``x (L, n, w)`` with their derivatives ``x_p (L, n, w, na)``."""
@@ -345,7 +339,7 @@ class RunPredictor:
         p: Array,
         z: Array,
         z_p: Array | None,
-        status: NDArray[np.int64],
+        status: Integers,
         derivatives: bool,
     ) -> PredictedSamples:
         """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives of ``z_p``."""
@@ -365,7 +359,7 @@ class RunPredictor:
             yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
         return PredictedSamples(y, yp, status)
 
-    def squares(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+    def squares(self, p: Array) -> tuple[Array, Integers]:
         """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums
         of failed lanes mean nothing.
 
@@ -393,7 +387,7 @@ class RunPredictor:
             self._fused = (self.plan, made)
         return self._fused[1]
 
-    def _squares_of_predictions(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+    def _squares_of_predictions(self, p: Array) -> tuple[Array, Integers]:
         """Through predictions of a few vectors at a time."""
         parts = [self.predict(p[first : first + CHUNK]) for first in range(0, len(p), CHUNK)]
         squares = [squared_distances(self.measured, part.y) for part in parts]
@@ -405,9 +399,7 @@ class RunPredictor:
             return np.empty((p.shape[0], 0, 1, self.record.time.size))
         return self.scheme.sample(x, self.plan, self.boundary.step(self.steps))
 
-    def _judge(
-        self, status: NDArray[np.int64], z: Array, p: Array, y: Array, lanes: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
+    def _judge(self, status: Integers, z: Array, p: Array, y: Array, lanes: Integers) -> Integers:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
         status = status.copy()
         finite = np.isfinite(y[lanes]).all(axis=(1, 2))

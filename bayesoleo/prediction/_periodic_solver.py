@@ -1,16 +1,12 @@
-"""The solver of periodic runs by name, and a run solved by it.
+"""Solvers of periodic runs by name, and a run solved by one of them.
 
-Solvers of periodic motions by name, for one model under the inputs of one run.
+Equal steps (``collocation``) are solved by ``RunPredictor``, for many parameter vectors at once.
+The solvers of this file take one parameter vector and a motion to start from, and return a motion
+with its derivatives and an estimate of its error.
 
-Equal steps (``collocation``) are solved by :class:`~bayesoleo.prediction.run.RunPredictor`, for
-many parameter vectors at once. The other solvers stand here: each takes one parameter vector and a
-motion to start from, and returns a motion with its derivatives and an estimate of its error.
-
-Predict one periodic run by any solver but collocation on equal steps.
-
-The motion is sampled at the raw samples as the solver has it. It is also put on the run's mesh of
-equal steps, with its derivatives: that is the anchor from which later solutions start, and what
-scores and the response to input noise are made of.
+The motion is evaluated at the raw samples directly from the solver's representation. It is also
+interpolated, with its derivatives, to the run's mesh of equal steps. That is the anchor from which
+later solutions start, and the basis of scores and of the response to input noise.
 """
 
 from __future__ import annotations
@@ -22,9 +18,8 @@ from functools import cached_property, partial
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import Kernels, kernels
@@ -521,7 +516,7 @@ class SolvedRun(RunPredictor):
         jumped = status.ok and self.anchor is not None and self.anchor.jumped
         return replace(samples, jumped=np.array([jumped]))
 
-    def squares(self, p: Array) -> tuple[Array, NDArray[np.int64]]:
+    def squares(self, p: Array) -> tuple[Array, Integers]:
         """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``."""
         return self._squares_of_predictions(p)
 

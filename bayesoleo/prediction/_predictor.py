@@ -1,8 +1,6 @@
-"""Prediction of all runs of a campaign, and where each unknown enters a model.
+"""Prediction of all runs of a campaign, for one or many vectors of unknowns.
 
-Where the unknowns of an estimate go in a model: shared ones once, by-run ones once a run.
-
-Predict all runs of a campaign for one or many vectors of unknowns.
+It assigns each unknown to its place in the model: shared ones once, by-run ones once for each run.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, Float, Int, Integers
@@ -49,7 +46,7 @@ class Layout:
     names: tuple[str, ...]
     parameters: tuple[str, ...]
     runs: tuple[str, ...]
-    columns: NDArray[np.int64]
+    columns: Integers
     active: tuple[str, ...]
 
     @classmethod

@@ -1,12 +1,8 @@
-"""Reduced records: the form in which a run reaches the models.
+"""Reduced records: the form in which a run reaches the models, made from a campaign or from arrays.
 
-Reduced records: what a campaign's run becomes before a model sees it.
-
-A channel is two things at once: its raw samples, which a likelihood compares with a prediction, and
-a signal, which a model takes as an input together with its time derivatives: the significant
-harmonics of a periodic channel, the band-limited curve through one of a transient.
-
-Records made from arrays, without a campaign folder.
+A channel has two parts. Its raw samples are compared with a prediction by the likelihood. Its
+signal is an input of a model, together with its time derivatives: the significant harmonics of a
+periodic channel, the band-limited curve through a transient one.
 """
 
 from __future__ import annotations

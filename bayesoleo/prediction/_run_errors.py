@@ -1,16 +1,12 @@
 """Errors of a predicted run: noise of its inputs, and discretisation of its motion.
 
-How the noise of a run's inputs reaches its predicted outputs.
+The harmonics of an input are known with a variance each. The resulting error of the prediction
+repeats in every period, so the scatter between periods does not contain it. It is computed by the
+same linear problem that gives parameter sensitivities. The smooth input of a transient has an error
+at every sample; a few draws of it represent its covariance.
 
-The input's harmonics are known with a variance each. What their errors do to the prediction repeats
-in every period, so the scatter between periods does not contain it: it has to be computed, by the
-same linear problem that gives parameter sensitivities. A transient's smooth input has an error at
-every sample; a few draws of it stand for its covariance.
-
-How far the motion of a run, as it is solved for, is from what its equations ask for.
-
-The mesh of a run is frozen, so that a log density is the same function everywhere; how good it is
-is asked for once, at the estimate.
+The mesh of a run is frozen, so that a log density is the same function everywhere. Its
+discretisation error is estimated once, at the point estimate.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """One record cut into shooting steps, with its least-squares equations.
 
-One record cut into shooting steps: what a model and a record contribute to a fit by multiple
-shooting.
-
-Least squares of one record under continuity, in the states of its nodes and the parameters.
+The equations are in the states of the nodes and the parameters, under continuity. They are the
+contribution of a model and a record to a fit by multiple shooting.
 """
 
 from __future__ import annotations

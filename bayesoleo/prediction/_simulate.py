@@ -1,4 +1,4 @@
-"""Simulate a run: what a model answers to a known periodic motion, sampled as a rig would."""
+"""Simulate a run: the response of a model to a known periodic motion, sampled as on a rig."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Where a channel's spectrum stands above its noise.
+"""Frequency range in which a channel's spectrum stands above its noise.
 
-Noise can be told from a signal only where the spectrum says so: where it falls to a floor that goes
-on to the highest frequencies. A signal that fills the band up to half the sampling rate shows no
-floor, and nothing can be taken from it.
+Noise can be told from a signal only where the spectrum falls to a floor that extends to the highest
+frequencies. A signal that fills the band up to half the sampling rate shows no floor, and its noise
+cannot be determined.
 
 References
 ----------

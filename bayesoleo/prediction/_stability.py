@@ -1,11 +1,9 @@
 """Stability of predicted motions, and jumps between branches.
 
-Which of a model's periodic answers were found: whether they can last, and whether they jumped.
-
-A nonlinear model may answer one input in several ways. Newton's method finds one of them and says
-nothing of the others: a small change of the parameters can take it to another branch, and a motion
-that no rig could stay on is found as readily as one that lasts. Both are seen from what a solve
-returns anyway.
+A nonlinear model may respond to one input in several ways. Newton's method finds one response and
+says nothing of the others. A small change of the parameters can move it to another branch, and it
+finds unstable motions, on which no rig could stay, as readily as stable ones. Both are detected
+from quantities that a solve returns anyway.
 """
 
 from __future__ import annotations
@@ -16,7 +14,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Complex, ComplexArray, Flags, Int, Integers
 from bayesoleo.solvers._orbit import floquet_multipliers
@@ -60,7 +57,7 @@ def jumps(
                 found[lane] = True
 
 
-def is_jump(here: Array, ahead: Array, x: Array, swing: Array, nodes: NDArray[np.int64]) -> bool:
+def is_jump(here: Array, ahead: Array, x: Array, swing: Array, nodes: Integers) -> bool:
     """The same for one solution ``x (n, w)``, predicted as ``ahead`` from ``here``."""
     columns = (nodes, slice(0, swing.size))
     moved = np.abs(ahead - here)[columns].max(axis=0)
@@ -75,12 +72,12 @@ def swings(x: Array, states: int) -> Array:
     return np.where(swing > STILL * np.abs(columns).max(axis=0), swing, np.inf)
 
 
-def compared(n: int) -> NDArray[np.int64]:
+def compared(n: int) -> Integers:
     """Nodes of a mesh of ``n`` steps that are looked at."""
     return np.unique(np.arange(COMPARED) * n // COMPARED)
 
 
-def count_unstable(multipliers: ComplexArray) -> NDArray[np.int64]:
+def count_unstable(multipliers: ComplexArray) -> Integers:
     """Number of multipliers ``(..., D)`` outside the unit circle, -1 where they are not known.
 
     Beside a huge one the others are known to its rounding only; what is not known to lie outside
@@ -92,7 +89,7 @@ def count_unstable(multipliers: ComplexArray) -> NDArray[np.int64]:
     return np.where(known, np.sum(sizes > 1.0 + margin, axis=-1), -1)
 
 
-def unstable_of(monodromy: Array) -> NDArray[np.int64]:
+def unstable_of(monodromy: Array) -> Integers:
     """The same from monodromy matrices ``(L, D, D)``."""
     known = np.isfinite(monodromy).all(axis=(1, 2))
     values = np.linalg.eigvals(np.where(known[:, None, None], monodromy, 0.0))
@@ -121,7 +118,7 @@ class Stability:
 
     @classmethod
     def of(
-        cls, runs: Sequence[str], monodromies: Sequence[Array | None], jumps: NDArray[np.int64]
+        cls, runs: Sequence[str], monodromies: Sequence[Array | None], jumps: Integers
     ) -> Stability:
         """From the monodromy matrix ``(D, D)`` of each run, where there is one."""
         size = max((m.shape[0] for m in monodromies if m is not None), default=0)
@@ -132,7 +129,7 @@ class Stability:
         return cls(tuple(runs), table, jumps)
 
     @property
-    def unstable(self) -> NDArray[np.int64]:
+    def unstable(self) -> Integers:
         """Number of multipliers outside the unit circle by run, -1 where they are not known."""
         return count_unstable(self.multipliers)
 
@@ -141,7 +138,7 @@ class Stability:
         """Jumps of all runs."""
         return int(self.jumps.sum())
 
-    def with_jumps(self, jumps: NDArray[np.int64]) -> Stability:
+    def with_jumps(self, jumps: Integers) -> Stability:
         """The same solutions after so many jumps."""
         return replace(self, jumps=jumps)
 

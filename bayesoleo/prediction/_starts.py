@@ -1,12 +1,11 @@
 """First guesses of periodic motions, and initial states of transients.
 
-A first guess of a periodic motion: measured where a dof is measured, declared otherwise.
+A first guess takes a dof from its measurement where it is measured, and from its declaration
+otherwise.
 
-The state with which a transient starts, and how it depends on the parameters.
-
-Three kinds of symbols occur in a start: constants of the run, channels as measured at the first
-sample, and the equilibrium. The equilibrium solves the equations of the dofs that ask for it with
-all rates zero; its derivatives follow by the implicit function theorem.
+The initial state of a transient depends on three kinds of symbols: constants of the run, channels
+as measured at the first sample, and the equilibrium. The equilibrium solves the equations of the
+dofs that use it with all rates zero; its derivatives follow by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from typing import cast
 
 import numpy as np
 import sympy as sp
-from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.model._derivatives import Derived
@@ -186,7 +184,7 @@ class InitialState:
         status[bad & (status == Status.CONVERGED.value)] = Status.NOT_FINITE.value
         return StartStates(state, state_p, status)
 
-    def _equilibrium(self, p: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    def _equilibrium(self, p: Array) -> tuple[Array, Array, Integers]:
         """Rest positions ``(L, d)`` of the dofs that ask for them, by damped Newton steps."""
         derived, lanes = self.kernels.derived, np.arange(p.shape[0])
         nz, d, moving = len(derived.states), len(derived.dofs), ~self.resting
@@ -225,13 +223,11 @@ class InitialState:
             z_p[lane, columns] = -np.linalg.solve(matrix, right)
         return z[:, self.first, 0], z_p[:, self.first], status
 
-    def _evaluate(self, z: Array, p: Array, lanes: NDArray[np.int64], g: Array, gz: Array) -> None:
+    def _evaluate(self, z: Array, p: Array, lanes: Integers, g: Array, gz: Array) -> None:
         with np.errstate(all="ignore"):
             self.kernels.jacobian(z, self.inputs, p, lanes, g, gz)
 
-    def _solve(
-        self, z: Array, p: Array, lane: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
-    ) -> int:
+    def _solve(self, z: Array, p: Array, lane: int, rows: Integers, columns: Integers) -> int:
         """Newton's method on one lane's static equations, in place."""
         one, where = z[lane : lane + 1], p[lane : lane + 1]
         d, nz = len(self.kernels.derived.dofs), z.shape[1]

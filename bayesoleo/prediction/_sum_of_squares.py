@@ -1,8 +1,7 @@
-"""Sums of squared residuals at raw samples, and nothing else: what a sampler asks for.
+"""Sums of squared residuals at raw samples, without the residuals themselves, for a sampler.
 
-Samples are taken in the order of their phase, a block at a time, and every block goes through
-interpolation, outputs and comparison while it is in the nearest cache. No array has the length of a
-record.
+Samples are taken in the order of their phase, in blocks. Each block goes through interpolation,
+outputs and comparison while it is in the nearest cache. No array has the length of a record.
 """
 
 from __future__ import annotations
@@ -13,12 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._compiled import BLOCK, BlockKernel, pointer
+from bayesoleo._compiled import BLOCK, BlockKernel, jit, pointer
 from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.model._derivatives import Derived
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.solvers._collocation import Collocation, SamplePlan, sample_block
-from bayesoleo.solvers._elimination import jit
 from bayesoleo.solvers._period_arrangement import total
 
 
@@ -54,11 +52,11 @@ class FusedSquares:
     """
 
     kernels: Kernels
-    order: NDArray[np.int64]
+    order: Integers
     inputs: Array
     places: Places
-    orders: NDArray[np.int64]
-    needed: NDArray[np.bool_]
+    orders: Integers
+    needed: Flags
 
     @classmethod
     def of(cls, kernels: Kernels, scheme: Any, plan: Any, inputs: Array) -> FusedSquares | None:
@@ -79,8 +77,8 @@ class FusedSquares:
         )
 
     def sums(
-        self, measured: Array, x: Array, p: Array, step: float, lanes: NDArray[np.int64]
-    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        self, measured: Array, x: Array, p: Array, step: float, lanes: Integers
+    ) -> tuple[Array, Flags, Flags]:
         """Compare the chosen lanes with measured samples.
 
         Parameters
@@ -132,7 +130,7 @@ def _distances(measured: Array, y: Array, sums: Array) -> None:
             sums[lane, k] = total(error * error)
 
 
-def _needed(derived: Derived) -> NDArray[np.bool_]:
+def _needed(derived: Derived) -> Flags:
     used = {s for item in (*derived.output, *derived.admissible) for s in item.free_symbols}
     return np.array([state in used for state in derived.states], dtype=np.bool_)
 
@@ -145,7 +143,7 @@ def _blocks(rows: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(whole.reshape(len(rows), count, BLOCK).swapaxes(0, 1))
 
 
-def _places(plan: SamplePlan, order: NDArray[np.int64]) -> Places:
+def _places(plan: SamplePlan, order: Integers) -> Places:
     index, position = (_blocks(row[None, order])[:, 0] for row in (plan.index, plan.position))
     w0, w1, w2 = (_blocks(weights[:, order]) for weights in (plan.w0, plan.w1, plan.w2))
     return Places(index, position, w0, w1, w2)

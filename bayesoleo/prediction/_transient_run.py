@@ -1,6 +1,6 @@
 """Prediction of one transient run, with sensitivities.
 
-Predict one transient run: a start, a mesh chosen once, solutions on it, outputs at samples.
+The mesh is chosen once; every solution starts from the initial state and is evaluated at samples.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Periodic solutions of implicit differential equations; this layer knows no model."""
+"""Periodic and transient solutions of implicit differential equations, independent of any model."""
 
 import lazy_loader
 

@@ -1,13 +1,11 @@
 """Adaptive mesh: steps are placed where the solution needs them.
 
-The next mesh: as many steps as a tolerance needs, each with the same share of the error.
-
-Periodic solutions on a mesh of their own: steps are placed where the solution needs them.
-
-A solution on a mesh and that on the mesh of half its steps differ by the coarse one's error, at the
-nodes and between them; the part that arises inside a step says how long the step may be. Edges are
-placed where the equations have kinks, so that every step sees smooth equations and the order of the
-method is kept across a contact.
+A solution on a mesh and that on the mesh of half its steps differ by the error of the coarse one,
+at the nodes and between them. The part that arises inside a step determines the length of that
+step: the next mesh has as many steps as a tolerance needs, each with the same share of the error.
+Edges are placed where the equations have kinks, so that every step sees smooth equations and the
+order of the method is kept across a contact. A solution at a stiff parameter is reached by
+continuation from a soft one.
 
 References
 ----------
@@ -15,8 +13,6 @@ Ascher, U., Christiansen, J. and Russell, R. D. (1979). A collocation solver for
 of boundary value problems. Mathematics of Computation 33, 659-679 (errors from halved meshes).
 
 Verbeek (1993), section 4.3.1, recommends error-controlled meshes.
-
-Reach a solution at a stiff parameter by walking there from a soft one.
 """
 
 from __future__ import annotations

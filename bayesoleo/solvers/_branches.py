@@ -1,18 +1,15 @@
 """Continuation of periodic solutions through folds, by pseudo-arclength.
 
-Periodic orbits with one more unknown and one more condition: a parameter, or the period.
-
-All unknowns of a period are reduced to the state at its start: linearised, the state at its end is
-``M`` times that at its start plus what the other unknown adds, with ``M`` the monodromy matrix. The
-closure, bordered by the condition, is regular where the closure alone is not: at a fold, and for an
-autonomous system, whose own multiplier is one.
-
-Branches of periodic orbits, followed through folds by pseudo-arclength continuation.
+A periodic orbit has one more unknown, a parameter or the period, and one more condition. All
+unknowns of a period are reduced to the state at its start. Linearised, the state at its end is
+``M`` times that at its start plus the contribution of the other unknown, with ``M`` the monodromy
+matrix. The closure, bordered by the condition, is regular where the closure alone is not: at a
+fold, and for an autonomous system, which has a multiplier of one.
 
 Along a branch the first state and one other value - a parameter, the frequency or the amplitude of
-the forcing - change together. A step goes along the tangent and back to the branch in the plane
-across it, so that the branch may turn round in the value. Every orbit comes with its multipliers:
-one passes through 1 at a fold and through -1 where the period doubles.
+the forcing - change together. A step goes along the tangent and returns to the branch in the plane
+perpendicular to it, so that the branch may turn round in the value. Every orbit comes with its
+multipliers: one passes through 1 at a fold and through -1 where the period doubles.
 
 References
 ----------

@@ -1,19 +1,13 @@
-"""One-step collocation, with its compiled loops.
-
-Compiled loops of one-step collocation: rows at stages, samples between nodes, elimination of a
-step's stages.
-
-Unknowns are ``x (L, n, w)``, with the highest derivatives at the stages behind the state of each
-step; steps have the lengths ``h (n,)``; ``a``, ``b`` and ``c`` are the method's weights, ``aa`` and
-``ba`` those of the second integral.
-
-One-step collocation, as linear maps between unknowns, stage values and samples.
+"""One-step collocation as linear maps between unknowns, stage values and samples, compiled.
 
 The unknowns of a step are the state at its left node (value, and velocity of a second-order dof)
-and the highest derivative of each dof at each stage: ``x (L, n, w)`` with ``w = D + s d``.
-Everything else - stage values, samples between nodes, sensitivities - is linear in them, so the
-same maps serve solutions and their derivatives. Steps are of one length unless a mesh says
-otherwise; ``step`` is the mean length throughout, period over number of steps.
+and the highest derivative of each dof at each stage: ``x (L, n, w)`` with ``w = D + s d``. Stage
+values, samples between nodes and sensitivities are linear in them, so the same maps serve solutions
+and their derivatives.
+
+Steps have the lengths ``h (n,)``, which are equal unless a mesh says otherwise; ``step`` is the
+mean length, period over number of steps. ``a``, ``b`` and ``c`` are the weights of the method,
+``aa`` and ``ba`` those of the second integral.
 """
 
 from __future__ import annotations
@@ -21,13 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._compiled import BLOCK as POINTS
+from bayesoleo._compiled import BLOCK as POINTS, jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
-from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together, jit
+from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together
 from bayesoleo.solvers._mesh import Mesh, Tableau
 
 
@@ -337,7 +330,7 @@ class SamplePlan:
     Positions and weights contain the length of their step over the mean length.
     """
 
-    index: NDArray[np.int64]
+    index: Integers
     position: Array
     w0: Array
     w1: Array
@@ -428,7 +421,7 @@ class Collocation:
             row, state = row + order + 1, state + order
         return x
 
-    def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
+    def rows(self, x: Array, lanes: Integers, step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and derivatives at the points."""
         method = self.method
         h = self.lengths(x.shape[1], step)
@@ -458,7 +451,7 @@ class Collocation:
             return self.plan_in(index, scaled - index)
         return self.plan_in(*self._mesh_of(n).locate(inside))
 
-    def plan_in(self, index: NDArray[np.int64], position: Array) -> SamplePlan:
+    def plan_in(self, index: Integers, position: Array) -> SamplePlan:
         """Given steps ``(N,)`` and positions in them, from 0 to 1: on one side of an edge."""
         w0, w1, w2 = (np.ascontiguousarray(weights.T) for weights in self.method.weights(position))
         if self.mesh is not None:
@@ -495,12 +488,12 @@ class Collocation:
         gz: Array,
         right: Array,
         x: Array | None,
-        lanes: NDArray[np.int64],
+        lanes: Integers,
         step: float,
         *,
         initial: bool = False,
         jumps: Array | None = None,
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Flags]:
         """Solve ``G dx = -right`` with the periodic closure.
 
         Parameters
@@ -557,5 +550,5 @@ class Collocation:
         return np.asarray((np.einsum("mdw,mw->md", end, x) - following).T)
 
     @property
-    def _orders(self) -> NDArray[np.int64]:
+    def _orders(self) -> Integers:
         return np.array(self.orders, dtype=np.int64)

@@ -1,40 +1,32 @@
 """Linear algebra of a step and of a whole period: elimination, periodic closure, sparse factors.
 
-Compiled elimination of small systems: one with exchange of rows, many at once without.
-
-Compiled once for every model: the sizes are run-time numbers.
-
-Closure of a period: the state from which the product of all steps leads back to itself.
+Small systems are eliminated in two ways: one at a time with row exchange, or many at once without.
+Both are compiled once for every model, since sizes are run-time numbers.
 
 Each step of the mesh maps the state at its left end to that at its right end. Eliminating a step's
 own unknowns leaves ``delta_{m+1} = M_m delta_m + r_m``; the product of all ``M_m`` closes the
 period with one small system (Verbeek 1993, section 4.3.1, with one state in place of three past
-blocks).
+blocks). Whether a closure is singular, or its recursion has grown too much to be trusted, must not
+depend on the units of the states: a matrix that appears ill-conditioned is balanced and tested
+again.
 
-Whether a closure is singular, or its recursion has grown too much to be trusted, must not depend on
-the units of the states: where a matrix looks bad as it is, it is balanced and looked at again.
-
-The linearised equations of a whole period at once, by a sparse factorisation with pivoting.
-
-Sweeping through a period multiplies the maps of its steps. Where a motion is so unstable that the
-product grows beyond the digits there are, or a step's own unknowns cannot be eliminated where they
-stand, the equations may be regular all the same: a factorisation that exchanges rows of different
-steps solves them, at many times the cost (20 times in Verbeek 1993, section 4.3.1).
+The product fails where a motion is so unstable that it grows beyond the available digits, or where
+a step's own unknowns cannot be eliminated locally. The equations may still be regular. A sparse
+factorisation of the whole period, which exchanges rows of different steps, solves them at many
+times the cost (20 times in Verbeek 1993, section 4.3.1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array
 from bayesoleo.solvers._mesh import Tableau
-
-jit = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 @jit

@@ -1,12 +1,12 @@
-"""How far a motion is from the solution, whichever solver found it.
+"""Discretisation error of a motion, whichever solver found it.
 
-The motion is put on a mesh of steps half as long, with an edge at every kink, and one step of
-Newton's method is taken there: what it changes is what the solver's own steps leave. A method sees
-the equations at its stages only, and an integrator's damped estimate passes over what is narrower
-than a step. So the equations are looked at densely between the stages as well; the part of the
+The motion is put on a mesh of steps half as long, with an edge at every kink, and one Newton step
+is taken there; its change estimates the error of the solver's own steps. A method sees the
+equations at its stages only, and an integrator's damped estimate misses features narrower than a
+step. The equations are therefore also evaluated densely between the stages. The part of the
 residual that no polynomial through the stages follows acts as a jump at the end of each step, and
-the linearised problem says what it does to the motion. Where that matters, steps are cut and the
-estimate is made again.
+the linearised problem gives its effect on the motion. Where that matters, steps are cut and the
+estimate is repeated.
 
 References
 ----------
@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._compiled import ImplicitEquations
+from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._mesh import Mesh, Tableau
 from bayesoleo.solvers._moving_edges import linearised_change, moved
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic import Boundary, Equations
+from bayesoleo.solvers._periodic import Boundary
 from bayesoleo.solvers._switched import (
     Crossings,
     Level,
@@ -223,7 +223,7 @@ def _look_into(
     problem: PeriodicProblem,
     level: Level,
     p: Array,
-    steps: NDArray[np.int64],
+    steps: Integers,
     count: int,
     at_stages: Array,
 ) -> tuple[Array, Array, Array] | None:
@@ -297,7 +297,9 @@ def _held(level: Level, p: Array) -> tuple[Array, Array]:
     )
 
 
-def _with_inputs(equations: Equations, d: int, z: Array, u: Array, p: Array) -> tuple[Array, Array]:
+def _with_inputs(
+    equations: ImplicitEquations, d: int, z: Array, u: Array, p: Array
+) -> tuple[Array, Array]:
     g, gz = np.empty((1, d, z.shape[1])), np.empty((1, d, *z.shape))
     with np.errstate(all="ignore"):
         equations.jacobian(z[None], u, p[None], np.array([0]), g, gz)

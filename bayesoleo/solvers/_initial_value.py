@@ -1,21 +1,18 @@
-"""Initial value problems of implicit equations, with derivatives.
+"""Initial value problems of implicit equations, with derivatives, in compiled steps.
 
-Initial value problems of implicit equations, with derivatives, in compiled steps.
-
-Radau IIA of order five or nine with error control; derivatives by the initial state and by
-parameters come from the same steps and the same linear systems (internal differentiation), so that
-they are those of the numbers computed. Kinks and jumps of the equations are located and stepped to.
+The method is Radau IIA of order five or nine with error control. Derivatives with respect to the
+initial state and to parameters come from the same steps and the same linear systems (internal
+differentiation), so that they are those of the computed numbers. Kinks and jumps of the equations
+are located and stepped to.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._compiled import Kernel
+from bayesoleo._compiled import PiecewiseEquations
 from bayesoleo._types import Array, Bool, Flags, Float
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _march as loop
@@ -37,28 +34,13 @@ STATUS = {
 }
 
 
-class PiecewiseKernels(Protocol):
-    """Kernels of equations whose outputs are their switching functions."""
-
-    @property
-    def jacobian(self) -> Kernel: ...
-    @property
-    def parameters(self) -> Kernel: ...
-    @property
-    def output(self) -> Kernel: ...
-    @property
-    def output_jacobian(self) -> Kernel: ...
-    @property
-    def admissible(self) -> Kernel: ...
-
-
 @dataclass(frozen=True)
 class Dynamics:
     """Equations of motion under given inputs, as analytic pieces.
 
     Parameters
     ----------
-    kernels : PiecewiseKernels
+    kernels : PiecewiseEquations
         Their last constants are the modes of the switching functions.
     orders : tuple of int
         Order (1 or 2) of each dof.
@@ -72,7 +54,7 @@ class Dynamics:
         Number of switching functions.
     """
 
-    kernels: PiecewiseKernels
+    kernels: PiecewiseEquations
     orders: tuple[int, ...]
     signal: InputSignal
     active: int
@@ -189,7 +171,7 @@ def solve_initial_value(
     *,
     tolerance: float = 1e-8,
     stages: int = 3,
-    cut: NDArray[np.bool_] | None = None,
+    cut: Flags | None = None,
     adaptive: bool = True,
     columns: Array | None = None,
     by_parameter: bool = False,

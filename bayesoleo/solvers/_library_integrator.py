@@ -1,17 +1,15 @@
-"""Integration by a library: time steps of transients, and shooting for comparison.
+"""Integration by SciPy: time steps of transients, and shooting for comparison.
 
-Steps for a transient, chosen by a library's integrator where the error asks for them.
+The steps of a transient are chosen by SciPy's integrator according to the error.
+
+Shooting integrates the variational equations with LSODA or Radau (Verbeek 1993, eqs. 4.10-4.11 and
+4.36-4.41), and Newton's method closes the period. It is slow and has no switches. It is an
+independent check of the package's own solvers, and a last resort where these fail.
 
 References
 ----------
 Hairer, E. and Wanner, G. (1996). Solving Ordinary Differential Equations II, 2nd ed., section IV.8:
 the method, as SciPy carries it out.
-
-Shooting by a library's integrator: slow, without switches, and written by others.
-
-The independent check of the package's own solvers, and what is left where these fail: SciPy's LSODA
-or Radau integrates the variational equations (Verbeek 1993, eqs. 4.10-4.11 and 4.36-4.41), Newton's
-method closes the period.
 """
 
 from __future__ import annotations
@@ -21,10 +19,9 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers._mesh import Mesh, Tableau
 from bayesoleo.solvers._orbit import Orbit, Status
@@ -177,7 +174,7 @@ def _solve(matrix: Array, right: Array) -> Array:
     return cast(Array, right / matrix[0])
 
 
-def _is_last(step: Array, z: Array, gz: Array, highest: NDArray[np.int64]) -> bool:
+def _is_last(step: Array, z: Array, gz: Array, highest: Integers) -> bool:
     """Whether a Newton step for the highest derivatives leaves round-off only."""
     # Terms that cancel to a derivative of zero leave the round-off of their own size.
     terms = np.abs(gz * z).sum(axis=1)

@@ -1,9 +1,7 @@
-"""Limit cycles of autonomous systems: the period is unknown.
+"""Limit cycles of autonomous systems, whose period and phase are unknown.
 
-Limit cycles of systems without input: the period is unknown, and so is where a cycle starts.
-
-The closure is bordered by the period on one side and on the other by a phase condition, that the
-first state stay in the plane through the guess across the motion.
+The closure is bordered by the period and by a phase condition: the first state stays in the plane
+through the guess, perpendicular to the motion.
 
 References
 ----------

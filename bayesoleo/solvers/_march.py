@@ -1,15 +1,9 @@
-"""Compiled integrator: steps, switches and derivatives from start to end.
+"""Compiled integrator: steps of chosen or given lengths, switches and derivatives.
 
-What a march needs to know where it starts, or starts again: rates, modes, admissibility.
-
-One step of a march: tried, judged by its error, differentiated and taken.
-
-A step of a march that meets a switch: shortened to end there, the mode exchanged.
-
-The integrator's loop: steps of chosen or of given lengths, switches, derivatives.
-
-Compiled once for all models: kernels come as addresses, so that the compiled loop is kept on disk
-and a new model costs its own kernels only.
+A start or restart computes rates, modes and admissibility. A step is tried, judged by its error,
+differentiated and taken; a step that meets a switch is shortened to end there, and the mode is
+exchanged. The integrator is compiled once for all models: kernels come as addresses, so that the
+compiled loop is kept on disk and a new model costs its own kernels only.
 """
 
 from __future__ import annotations
@@ -17,10 +11,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Integers
-from bayesoleo.solvers._elimination import eliminate, jit
+from bayesoleo._compiled import jit
+from bayesoleo._types import Array, Flags, Integers
+from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._radau_step import (
     SINGULAR,
     SOLVED,
@@ -361,7 +355,7 @@ class MarchTask(NamedTuple):
     """
 
     nodes: Array
-    cut: NDArray[np.bool_]
+    cut: Flags
     adaptive: bool
     tolerance: float
     enough: float
@@ -381,7 +375,7 @@ class Path(NamedTuple):
     states: Array
     tops: Array
     modes: Array
-    switched: NDArray[np.bool_]
+    switched: Flags
     aims: Array
     by: Array
     tops_by: Array
@@ -425,11 +419,11 @@ class System(NamedTuple):
     """
 
     kernels: Addresses
-    orders: NDArray[np.int64]
+    orders: Integers
     method: Method
     signal: InputSignal
     p: Array
-    modes: NDArray[np.int64]
+    modes: Integers
     active: int
     conditions: int
 

@@ -1,8 +1,6 @@
-"""Meshes of steps, and the collocation tableaus (nodes, weights, interpolation).
+"""Meshes of unequal steps over a period or a transient, and collocation methods.
 
-Collocation methods: nodes, weights and interpolation polynomials, computed, not tabulated.
-
-Meshes of steps of different lengths over a period, or over the time of a transient.
+Nodes, weights and interpolation polynomials of a method are computed, not tabulated.
 """
 
 from __future__ import annotations
@@ -13,9 +11,8 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import Polynomial, legendre
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Float
+from bayesoleo._types import Array, Float, Integers
 from bayesoleo.errors import InputError
 
 
@@ -167,7 +164,7 @@ class Mesh:
         """Phases at the positions ``c (s,)`` inside every step, shape (n s,)."""
         return (self.edges[:-1, None] + np.diff(self.edges)[:, None] * c).ravel()
 
-    def locate(self, phase: Array) -> tuple[NDArray[np.int64], Array]:
+    def locate(self, phase: Array) -> tuple[Integers, Array]:
         """Step and position in it, from 0 to 1, of phases between 0 and 1."""
         index = np.searchsorted(self.edges, phase, side="right") - 1
         index = np.clip(index, 0, self.steps - 1)

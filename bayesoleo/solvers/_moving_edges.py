@@ -1,11 +1,7 @@
 """Mesh edges that move to the phases at which the equations switch.
 
-Moving a period's phases along with the kinks in it.
-
-Periodic solutions whose edges move to where the equations switch.
-
-With the modes of all steps held, the equations are smooth whatever the trial motion. The unknowns
-are solved for together with the phases of the edges at which modes change, so that their switching
+With the modes of all steps held, the equations are smooth for any trial motion. The unknowns are
+solved for together with the phases of the edges at which modes change, so that their switching
 functions are zero there. That converges from much further away than an iteration in which every
 trial motion changes the equations, and every step keeps the order of the method.
 """

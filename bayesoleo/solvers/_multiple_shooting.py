@@ -1,13 +1,19 @@
 """Multiple shooting: a transient cut into short steps that are solved at once.
 
-Least squares over the states of a trajectory, under the constraint that it is continuous.
+Every node of an equidistant mesh is a shooting node, and one collocation step leads from it towards
+the next. The state at the node and the step's stage values are unknowns alike: an iterate need not
+solve the equations inside a step, nor be continuous from step to step. Linearised, the stages are
+eliminated locally, which leaves multiple shooting with exact derivatives (Albersmeyer and Diehl
+2010: such lifting never costs more per iteration, and contracts faster). Intervals of several
+steps - fewer shooting nodes, up to one interval for the whole record, which is single shooting -
+result from integrating through the inner nodes between iterations.
 
 The states ``s_m`` at the nodes and the parameters ``theta`` minimise a quadratic form under
 ``s_{m+1} = F_m s_m + C_m theta + d_m``. States and Lagrange multipliers in the order of time make
-the optimality conditions a band of half width ``2 D - 1`` with a border as wide as the parameters;
-one factorisation of the band, of a cost that grows with the number of nodes, leaves the small
-information matrix of the parameters alone. Nothing is multiplied along the trajectory, so that the
-exponential growth of disturbances in a chaotic system does no harm: the condensing recursion of
+the optimality conditions a band of half width ``2 D - 1`` with a border as wide as the parameters.
+One factorisation of the band, whose cost grows with the number of nodes, leaves the small
+information matrix of the parameters. Nothing is multiplied along the trajectory, so that the
+exponential growth of disturbances in a chaotic system does no harm. The condensing recursion of
 the literature, which forms the products ``F_m ... F_1``, has no digits left after some thirty
 Lyapunov times (``exp(36) = 1e16``).
 
@@ -16,35 +22,22 @@ References
 Bock, H. G. (1987). Randwertproblemmethoden zur Parameteridentifizierung in Systemen nichtlinearer
 Differentialgleichungen. Bonner Mathematische Schriften 183.
 
-A transient cut into many short steps that are solved at once: multiple shooting, lifted.
-
-Every node of an equidistant mesh is a shooting node, and one collocation step leads from it towards
-the next. The state at the node and the step's stage values are unknowns alike: an iterate need not
-solve the equations inside a step, nor be continuous from step to step. Linearised, the stages are
-eliminated where they stand, so that what remains is multiple shooting with exact derivatives
-(Albersmeyer and Diehl 2010: such lifting never costs more per iteration, and contracts faster).
-
-Intervals of several steps - fewer shooting nodes, up to one interval for the whole record, which is
-single shooting - are had by integrating through the inner nodes between iterations.
-
-References
-----------
 Albersmeyer, J. and Diehl, M. (2010). The lifted Newton method and its application in optimization.
 SIAM Journal on Optimization 20, 1655-1684.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
 
-from bayesoleo._types import Array
+from bayesoleo._compiled import ImplicitEquations
+from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._collocation import Collocation, SamplePlan
 
 _gbtrf, _gbtrs = get_lapack_funcs(("gbtrf", "gbtrs"), (np.zeros(1),))
@@ -161,7 +154,7 @@ def _widths(D: int) -> tuple[int, int]:
     return 2 * D - 1, 2 * D - 1
 
 
-def _places(n: int, D: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _places(n: int, D: int) -> tuple[Integers, Integers]:
     """Rows of the states (n, D) and of the multipliers (n - 1, D)."""
     first = 2 * D * np.arange(n)[:, None] + np.arange(D)
     return first, first[:-1] + D
@@ -174,7 +167,7 @@ def _band(hessian: Array, transition: Array, slack: Array) -> Array:
     band = np.zeros((3 * width + 1, D * (2 * n - 1)))
     states, multipliers = _places(n, D)
 
-    def put(rows: NDArray[np.int64], columns: NDArray[np.int64], values: Array | float) -> None:
+    def put(rows: Integers, columns: Integers, values: Array | float) -> None:
         band[2 * width + rows - columns, columns] = values
 
     put(states[:, :, None], states[:, None, :], hessian)
@@ -186,25 +179,12 @@ def _band(hessian: Array, transition: Array, slack: Array) -> Array:
     return band
 
 
-Indices = NDArray[np.int64]
-
 #: Newton iterations for one step of an integration, and the relative change of the stages at which
 #: they end: its square, which is what the last one leaves, is round-off.
 INTEGRATION_ITERATIONS = 12
 INTEGRATION_STEP = 1e-8
 
 _LANE = np.zeros(1, dtype=np.int64)
-
-
-class SegmentEquations(Protocol):
-    """What is needed of implicit equations (see ``bayesoleo.model._kernels.Kernels``)."""
-
-    @property
-    def jacobian(self) -> Callable[..., Any]: ...
-    @property
-    def parameters(self) -> Callable[..., Any]: ...
-    @property
-    def admissible(self) -> Callable[..., Any]: ...
 
 
 @dataclass(frozen=True)
@@ -235,7 +215,7 @@ class Segments:
 
     Parameters
     ----------
-    equations : SegmentEquations
+    equations : ImplicitEquations
         Residuals and partial derivatives.
     scheme : Collocation
         On an equidistant mesh.
@@ -251,7 +231,7 @@ class Segments:
         Number of parameters with derivatives.
     """
 
-    equations: SegmentEquations
+    equations: ImplicitEquations
     scheme: Collocation
     duration: float
     steps: int
@@ -355,11 +335,11 @@ class Segments:
         self.scheme.rows(x, np.arange(D), self.length, z)
         return z
 
-    def _points(self, chosen: Indices) -> Indices:
+    def _points(self, chosen: Integers) -> Integers:
         stages = self.scheme.method.stages
         return (chosen[:, None] * stages + np.arange(stages)).ravel()
 
-    def _evaluate(self, x: Array, p: Array, chosen: Indices) -> tuple[Array, Array, Array, bool]:
+    def _evaluate(self, x: Array, p: Array, chosen: Integers) -> tuple[Array, Array, Array, bool]:
         """Equations ``g (d, N)``, ``gz (d, nz, N)``, rows ``z (1, nz, N)``; whether admissible."""
         d, D = len(self.scheme.orders), self.scheme.state_size
         points = chosen.size * self.scheme.method.stages
@@ -390,7 +370,7 @@ class Segments:
         dx, _, ok = self.scheme.linear(matrix, target, None, lanes, self.length, initial=True)
         return dx[:, 0], bool(ok.all())
 
-    def _solve_steps(self, x: Array, p: Array, chosen: Indices) -> bool:
+    def _solve_steps(self, x: Array, p: Array, chosen: Integers) -> bool:
         """Newton's method on the stages of chosen steps, in place."""
         D = self.scheme.state_size
         for _ in range(INTEGRATION_ITERATIONS):

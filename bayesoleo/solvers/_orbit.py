@@ -1,9 +1,4 @@
-"""Result of a periodic solver, and the status with which any solver ends.
-
-How a numerical solution ended: the member's message says it, its value counts it.
-
-A periodic solution as every solver returns it, however it was found.
-"""
+"""Periodic solution as every solver returns it, and the status with which a solver ends."""
 
 from __future__ import annotations
 

@@ -1,17 +1,11 @@
-"""Memory layout of a period's steps, and compiled measures of residuals and steps.
+"""Memory layout of a period's steps, and compiled norms of residuals and steps.
 
-Compiled bookkeeping of a batched Newton iteration: sizes of residuals and steps, lane by lane in
-a fixed order.
+Steps are kept in the order in which they are swept: :data:`WIDTH` chunks side by side, with as many
+rows before and after them as a scheme looks at; chunks that are a step shorter are filled up with
+the first step of the next.
 
-Library reductions would change their order of summation with the shape of the batch, and with it
-the last bits of a solution.
-
-Where the steps of a period stand while they are swept, and the arrays that a lane needs.
-
-Steps are kept in the order in which they are swept:
-:data:`~bayesoleo.solvers.schemes.unrolled.emit.WIDTH` chunks side by side, with as many rows before
-and after them as a scheme looks at; chunks that are a step shorter are filled up with the first
-step of the next.
+Norms are computed lane by lane in a fixed order. Library reductions would change their order of
+summation with the shape of the batch, and with it the last bits of a solution.
 """
 
 from __future__ import annotations
@@ -24,11 +18,9 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._compiled import BLOCK
+from bayesoleo._compiled import BLOCK, jit
 from bayesoleo._types import Array, Flags, Float, Integers
-from bayesoleo.solvers._elimination import jit
 from bayesoleo.solvers._unrolled_collocation import COLUMNS, REACH, WIDTH
 from bayesoleo.solvers._unrolled_program import Program, chunks
 
@@ -180,9 +172,9 @@ class SweepLayout:
         Of the chunks.
     """
 
-    place: NDArray[np.int64]
-    source: NDArray[np.int64]
-    lengths: NDArray[np.int64]
+    place: Integers
+    source: Integers
+    lengths: Integers
 
     @staticmethod
     def of(n: int, front: int, block: int) -> SweepLayout:
@@ -268,7 +260,7 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
 _kept = threading.local()
 
 
-def _allocate(sizes: Sizes, positions: int, blocks: int, order: NDArray[np.int64]) -> Work:
+def _allocate(sizes: Sizes, positions: int, blocks: int, order: Integers) -> Work:
     """Zeros, each array from the beginning of a cache line on: vector instructions that straddle
     two lines take twice as long."""
     shapes = _shapes(sizes, positions, blocks)

@@ -1,14 +1,9 @@
-"""Periodic solutions on a given mesh, for many parameter vectors at once.
+"""Periodic solutions on a given mesh by Newton's method, for many parameter vectors at once.
 
-Equations at trial unknowns, many lanes at once: what Newton iterations over a mesh share.
-
-Periodic solutions by Newton's method on all unknowns of a period at once, for many parameter
-vectors.
-
-Lanes (parameter vectors) never see each other: each has its own step length, its own end and its
-own status, so that a solution depends on its own parameters and start alone, bit for bit.
-
-Reach a solution from a static guess by raising the forcing where Newton's method alone fails.
+Newton's method acts on all unknowns of a period at once. Lanes (parameter vectors) are independent:
+each has its own step length, its own end and its own status, so that a solution depends on its own
+parameters and start alone, bit for bit. Where Newton's method fails from a static guess, the
+solution is reached by raising the forcing in steps.
 """
 
 from __future__ import annotations
@@ -16,23 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._compiled import BlockKernel
-from bayesoleo._types import Array, Float, Int, Integers
+from bayesoleo._compiled import BlockKernel, ImplicitEquations
+from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.solvers import (
     _period_arrangement as arrangement,
-    _period_arrangement as measures,
     _periodic_newton as newton,
 )
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic_newton import NEEDS_EXCHANGE, Extrapolation
 from bayesoleo.solvers._schemes import Scheme
-
-Lanes = NDArray[np.int64]
 
 
 class Trial:
@@ -72,7 +62,7 @@ class Trial:
         self.squares, self.terms = np.empty((lanes, d)), np.empty((lanes, d))
         self.inside, self.defined = np.ones(lanes, dtype=np.bool_), np.ones(lanes, dtype=np.bool_)
 
-    def evaluate(self, lanes: Lanes) -> NDArray[np.bool_]:
+    def evaluate(self, lanes: Integers) -> Flags:
         """Equations at the present unknowns; true where they are finite and admissible, (L,)."""
         equations, u = self.problem.equations, self.problem.inputs
         self.problem.scheme.rows(self.x, lanes, self.step, self.z)
@@ -80,41 +70,26 @@ class Trial:
             equations.jacobian(self.z, u, self.p, lanes, self.g, self.gz)
             if self.problem.conditions:
                 equations.admissible(self.z, u, self.p, lanes, self.a)
-        measures.positive(self.a, lanes, self.inside, self.defined)
-        measures.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
+        arrangement.positive(self.a, lanes, self.inside, self.defined)
+        arrangement.measure(self.z, self.g, self.gz, lanes, self.squares, self.terms)
         finite = self.defined[lanes] & np.isfinite(self.terms[lanes]).all(axis=1)
         return self.inside[lanes] & finite
 
-    def newton_step(
-        self, lanes: Lanes, *, initial: bool = False
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    def newton_step(self, lanes: Integers, *, initial: bool = False) -> tuple[Array, Flags]:
         """Newton's step, shape (L, n, w), and where the linear problem has a solution, (L,)."""
         dx, _, ok = self.problem.scheme.linear(
             self.gz, self.g[:, :, None], self.x, lanes, self.step, initial=initial
         )
         return dx, ok
 
-    def take(self, lanes: Lanes, dx: Array, fraction: Array) -> None:
+    def take(self, lanes: Integers, dx: Array, fraction: Array) -> None:
         """Move the unknowns to a fraction, shape (lanes,), of a step from where it starts."""
-        measures.take(self.base, dx, lanes, fraction, self.x)
+        arrangement.take(self.base, dx, lanes, fraction, self.x)
 
-    def take_whole(self, lanes: Lanes, dx: Array) -> None:
+    def take_whole(self, lanes: Integers, dx: Array) -> None:
         """Move the unknowns by a whole step from where they are."""
-        measures.keep(self.x, lanes, self.base)
+        arrangement.keep(self.x, lanes, self.base)
         self.take(lanes, dx, np.ones(lanes.size))
-
-
-class Equations(Protocol):
-    """What a solver needs of implicit equations (see ``bayesoleo.model._kernels.Kernels``)."""
-
-    @property
-    def residual(self) -> Any: ...
-    @property
-    def jacobian(self) -> Any: ...
-    @property
-    def parameters(self) -> Callable[..., Any]: ...
-    @property
-    def admissible(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -123,7 +98,7 @@ class Boundary:
 
     Parameters
     ----------
-    equations : Equations
+    equations : ImplicitEquations
         Residuals and partial derivatives.
     scheme : Scheme
         Discretisation.
@@ -137,7 +112,7 @@ class Boundary:
         Number of parameters with derivatives.
     """
 
-    equations: Equations
+    equations: ImplicitEquations
     scheme: Scheme
     period: float
     inputs: Float[Array, "inputs points"]
@@ -254,7 +229,7 @@ def _with_exchange(
     problem: Boundary,
     p: Array,
     solution: Solution,
-    starts: Callable[[Lanes], Array],
+    starts: Callable[[Integers], Array],
     max_iterations: int,
     monotone: bool,
 ) -> Solution:
@@ -317,20 +292,18 @@ class _Newton:
                 break
             self.iterations[lanes] += 1
             dx, ok = trial.newton_step(lanes)
-            measures.step_size(trial.x, dx, lanes, trial.problem.scheme.state_size, size, least)
+            arrangement.step_size(trial.x, dx, lanes, trial.problem.scheme.state_size, size, least)
             lanes = self._drop(lanes, ok[lanes] & np.isfinite(size[lanes]), Status.SINGULAR.value)
             lanes = self._finish(lanes, dx, size, least)
             lanes = self._advance(lanes, dx, size)
         return Solution(trial.x, self.status, self.iterations)
 
-    def _drop(
-        self, lanes: Lanes, good: NDArray[np.bool_], reason: int | NDArray[np.int64]
-    ) -> Lanes:
+    def _drop(self, lanes: Integers, good: Flags, reason: int | Integers) -> Integers:
         bad = lanes[~good]
         self.status[bad] = reason if isinstance(reason, int) else reason[bad]
         return lanes[good]
 
-    def _reduces(self, lanes: Lanes, squares: Array, terms: Array) -> NDArray[np.bool_]:
+    def _reduces(self, lanes: Integers, squares: Array, terms: Array) -> Flags:
         """Whether the residual fell, in units of the equations' terms: the larger of those before
         and after.
 
@@ -346,7 +319,7 @@ class _Newton:
         self.merit[lanes] = np.sqrt(np.sum(own, axis=1))
         return after < before
 
-    def _finish(self, lanes: Lanes, dx: Array, size: Array, least: Array) -> Lanes:
+    def _finish(self, lanes: Integers, dx: Array, size: Array, least: Array) -> Integers:
         """Take the last step where it is small enough that what it leaves is round-off."""
         sizes = size[lanes]
         falling = (sizes < LAST_STEP) & (sizes < 0.1 * self.last[lanes])
@@ -357,10 +330,10 @@ class _Newton:
         self.last[lanes] = sizes
         return lanes[~done]
 
-    def _advance(self, lanes: Lanes, dx: Array, size: Array) -> Lanes:
+    def _advance(self, lanes: Integers, dx: Array, size: Array) -> Integers:
         """Take the steps, halved where they are inadmissible or do not reduce the residual."""
         trial = self.trial
-        measures.keep(trial.x, lanes, trial.base)
+        arrangement.keep(trial.x, lanes, trial.base)
         squares, terms, fraction = trial.squares[lanes], trial.terms[lanes], np.ones(lanes.size)
         pending = np.arange(lanes.size)
         for _ in range(MAXIMUM_HALVINGS):
@@ -380,7 +353,7 @@ class _Newton:
             trial.inside[stuck], Status.NO_CONVERGENCE.value, Status.INADMISSIBLE.value
         )
         self.status[stuck] = outside
-        measures.keep(trial.base, stuck, trial.x)
+        arrangement.keep(trial.base, stuck, trial.x)
         self.last[lanes[fraction < 1.0]] = np.inf
         kept = np.ones(lanes.size, dtype=bool)
         kept[pending] = False

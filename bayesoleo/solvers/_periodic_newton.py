@@ -1,17 +1,13 @@
 """Newton's method on all steps of a period at once, compiled.
 
-The equations of a period, linearised, and the recursion through its steps that solves them.
+It is the same iteration as in ``_periodic.py``, with all arrays of a lane in the processor's cache,
+and last steps with old derivatives. The linearised equations of a period are solved by a recursion
+through its steps. Models and schemes come as compiled pieces of fixed signature
+(``bayesoleo._compiled`` and ``_unrolled_program.py``), so this file is compiled once.
 
-Models and schemes come as compiled pieces of fixed signature (``bayesoleo.compiled`` and
-``solvers.schemes.unrolled``), so this is compiled once.
-
-Newton's method on one period, compiled: the same iteration as in ``solve``, with everything a
-lane needs in the processor's cache, and last steps with old derivatives.
-
-Starts that follow from one solution and its derivatives, made where they are needed.
-
-For a batch of parameter vectors all starts together are larger than a processor's cache; the
-solution and its derivatives are not.
+Starts that follow from one solution and its derivatives are made when they are needed. For a batch
+of parameter vectors all starts together exceed a processor's cache; the solution and its
+derivatives do not.
 """
 
 from __future__ import annotations
@@ -23,14 +19,9 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK, after, call_kernel, caller, pointer
+from bayesoleo._compiled import BLOCK, after, call_kernel, caller, jit, pointer
 from bayesoleo._types import Array, Integers
-from bayesoleo.solvers._elimination import (
-    LARGEST_GROWTH,
-    close as solve_closure,
-    close_balanced,
-    jit,
-)
+from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._period_arrangement import (
     LinearStart,

@@ -1,15 +1,12 @@
-"""One step of a Radau IIA method on implicit equations, with error and derivatives.
+"""One step of a Radau IIA method on implicit equations, with its error and its derivatives.
 
-How what is called from compiled code only is compiled, and how it calls a kernel.
-
-Without wrappers for Python and for C, and with one number in place of a function for each kernel,
-the integrator's functions compile in a fraction of the time: each of them takes many arrays.
-
-One step of a Radau IIA method on implicit equations, with its error and its derivatives.
-
-As in ``solvers.schemes.collocation`` a step's unknowns are the highest derivatives ``top (s, d)``
-at the stages, and everything else is linear in them; here steps follow one another, each with its
+As in ``_collocation.py`` a step's unknowns are the highest derivatives ``top (s, d)`` at the
+stages, and the other quantities are linear in them; here steps follow one another, each with its
 own length. The last stage is the end of the step, so that a step's end is among its unknowns.
+
+Functions that only compiled code calls are compiled without wrappers for Python and for C, and take
+the address of each kernel instead of a function. This cuts compilation to a fraction of the time,
+because each of them takes many arrays.
 """
 
 from __future__ import annotations

@@ -1,26 +1,19 @@
 """Discretisation schemes by name: collocation, backward and central differences.
 
-What every discretisation can do.
+Backward differences of second order on an equidistant mesh are the thesis's discretisation (Verbeek
+1993, eqs. 4.21-4.23). ``q'_m = (3 q_m - 4 q_{m-1} + q_{m-2}) / (2 h)`` and
+``q''_m = (2 q_m - 5 q_{m-1} + 4 q_{m-2} - q_{m-3}) / h**2``, indices modulo n. The unknowns are the
+dofs at the nodes, ``x (L, n, d)``; three past blocks are the state that the closure carries.
 
-The thesis's discretisation: second-order backward differences on an equidistant mesh (Verbeek
-1993, eqs. 4.21-4.23).
-
-``q'_m = (3 q_m - 4 q_{m-1} + q_{m-2}) / (2 h)`` and ``q''_m = (2 q_m - 5 q_{m-1} + 4 q_{m-2} -
-q_{m-3}) / h**2``, indices modulo n. The unknowns are the dofs at the nodes, ``x (L, n, d)``; three
-past blocks are the state that the closure carries.
-
-Central differences, and their combinations with backward ones, which Verbeek (1993), section
-4.3.1, tried before choosing backward differences for both derivatives.
-
-A motion that alternates from node to node has no central first difference. Against it an
-oscillator puts up ``-4 m/h**2 + k`` with both differences central, where backward ones put up
-``12 m/h**2 + 4 c/h + k``. So damping and friction do not hold it, odd and even nodes of a
-first-order equation are not tied together at all, and with a velocity that looks back the equations
-are singular where a friction's slope times the step comes to the mass. What depends on nodes before
-and behind cannot be solved in one sweep either, only by the slower sparse factorisation. For
-comparison, not for use.
-
-Discretisation schemes by name.
+Central differences, and their combinations with backward ones, were tried by Verbeek (1993),
+section 4.3.1, before choosing backward differences for both derivatives. They are here for
+comparison, not for use. A motion that alternates from node to node has no central first difference.
+An oscillator resists it with ``-4 m/h**2 + k`` if both differences are central, and with
+``12 m/h**2 + 4 c/h + k`` if they are backward. Central differences therefore leave it undamped by
+damping and friction, and decouple odd and even nodes of a first-order equation. With a backward
+velocity the equations are singular where a friction's slope times the step equals the mass.
+Equations that depend on nodes before and behind also need the slower sparse factorisation instead
+of one sweep.
 """
 
 from __future__ import annotations
@@ -29,8 +22,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
@@ -40,12 +33,9 @@ from bayesoleo.solvers._elimination import (
     close_and_sweep,
     eliminate_each,
     eliminate_together,
-    jit,
 )
 from bayesoleo.solvers._mesh import Mesh, tableau
 from bayesoleo.solvers._unrolled_program import Program
-
-Lanes = NDArray[np.int64]
 
 
 class Scheme(Protocol):
@@ -62,7 +52,7 @@ class Scheme(Protocol):
     def lengths(self, n: int, step: float) -> Array: ...
     def phases(self, n: int) -> Array: ...
     def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array: ...
-    def rows(self, x: Array, lanes: Lanes, step: float, z: Array) -> None: ...
+    def rows(self, x: Array, lanes: Integers, step: float, z: Array) -> None: ...
     def plan(self, phase: Array, n: int) -> Any: ...
     def sample(self, x: Array, plan: Any, step: float) -> Array: ...
     def linear(
@@ -70,11 +60,11 @@ class Scheme(Protocol):
         gz: Array,
         right: Array,
         x: Array | None,
-        lanes: Lanes,
+        lanes: Integers,
         step: float,
         *,
         initial: bool = False,
-    ) -> tuple[Array, Array, NDArray[np.bool_]]: ...
+    ) -> tuple[Array, Array, Flags]: ...
 
 
 FIRST = np.array([1.5, -2.0, 0.5, 0.0])
@@ -85,16 +75,15 @@ SECOND = np.array([2.0, -5.0, 4.0, -1.0])
 class CubicPlan:
     """Four nodes and their weights for each of N phases, shapes (4, N)."""
 
-    nodes: NDArray[np.int64]
+    nodes: Integers
     weights: Array
 
 
 @dataclass(frozen=True)
-class BackwardDifferences:
-    """Backward differences for dofs of given orders (1 or 2 each)."""
+class _EqualSteps:
+    """Differences on equal steps: the equations hold at the nodes, whose dofs are the unknowns."""
 
     orders: tuple[int, ...]
-    order = 2
 
     @property
     def state_size(self) -> int:
@@ -105,11 +94,6 @@ class BackwardDifferences:
     def width(self) -> int:
         """Unknowns at a node."""
         return len(self.orders)
-
-    @property
-    def program(self) -> unrolled.Program | None:
-        """Compiled pieces of a Newton step, where there is code for these orders."""
-        return unrolled.differences(self.orders, tuple(FIRST.tolist()), tuple(SECOND.tolist()))
 
     def lengths(self, n: int, step: float) -> Array:
         """Length of each step, s, shape (n,)."""
@@ -124,22 +108,9 @@ class BackwardDifferences:
         starts = np.cumsum([0, *(order + 1 for order in self.orders[:-1])])
         return np.ascontiguousarray(np.moveaxis(rows_at_nodes[:, starts], 1, 2))
 
-    def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
-        """Fill ``z (L, nz, N)`` with values and differences at the nodes."""
-        _rows(x, lanes, step, np.array(self.orders, dtype=np.int64), FIRST, SECOND, z)
-
     def _node_rows(self, x: Array, step: float) -> Array:
-        """Values and differences at the nodes, shape (L, nz, C, n)."""
-        rows = []
-        for j, order in enumerate(self.orders):
-            past = [np.moveaxis(np.roll(x[:, :, j], k, axis=1), 1, 2) for k in range(4)]
-            rows.append(past[0])
-            rows.append(sum(weight * q for weight, q in zip(FIRST, past, strict=True)) / step)
-            if order == 2:
-                rows.append(
-                    sum(weight * q for weight, q in zip(SECOND, past, strict=True)) / step**2
-                )
-        return np.stack(rows, axis=1)
+        """Values and differences at the nodes of columns ``x (L, n, d, C)``: (L, nz, C, n)."""
+        raise NotImplementedError
 
     def plan(self, phase: Array, n: int) -> CubicPlan:
         """Nodes around given phases (cycles) and the weights of the cubic through them."""
@@ -164,16 +135,45 @@ class BackwardDifferences:
             total += weights * rows[..., nodes]
         return total
 
+
+@dataclass(frozen=True)
+class BackwardDifferences(_EqualSteps):
+    """Backward differences for dofs of given orders (1 or 2 each)."""
+
+    order = 2
+
+    @property
+    def program(self) -> unrolled.Program | None:
+        """Compiled pieces of a Newton step, where there is code for these orders."""
+        return unrolled.differences(self.orders, tuple(FIRST.tolist()), tuple(SECOND.tolist()))
+
+    def rows(self, x: Array, lanes: Integers, step: float, z: Array) -> None:
+        """Fill ``z (L, nz, N)`` with values and differences at the nodes."""
+        _rows(x, lanes, step, np.array(self.orders, dtype=np.int64), FIRST, SECOND, z)
+
+    def _node_rows(self, x: Array, step: float) -> Array:
+        """Values and differences at the nodes, shape (L, nz, C, n)."""
+        rows = []
+        for j, order in enumerate(self.orders):
+            past = [np.moveaxis(np.roll(x[:, :, j], k, axis=1), 1, 2) for k in range(4)]
+            rows.append(past[0])
+            rows.append(sum(weight * q for weight, q in zip(FIRST, past, strict=True)) / step)
+            if order == 2:
+                rows.append(
+                    sum(weight * q for weight, q in zip(SECOND, past, strict=True)) / step**2
+                )
+        return np.stack(rows, axis=1)
+
     def linear(
         self,
         gz: Array,
         right: Array,
         x: Array | None,
-        lanes: NDArray[np.int64],
+        lanes: Integers,
         step: float,
         *,
         initial: bool = False,
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Flags]:
         """Solve ``G dx = -right`` as ``Collocation.linear``; the monodromy is the recursion's."""
         count, d, n = gz.shape[0], len(self.orders), gz.shape[3]
         dx = np.zeros((count, n, d, right.shape[2]))
@@ -301,7 +301,7 @@ COMBINATIONS: dict[str, tuple[Stencil, Stencil]] = {
 
 
 @dataclass(frozen=True)
-class Differences:
+class Differences(_EqualSteps):
     """Differences by any stencils on equal steps.
 
     Parameters
@@ -314,7 +314,6 @@ class Differences:
         first-order ones.
     """
 
-    orders: tuple[int, ...]
     name: str
 
     @property
@@ -323,33 +322,11 @@ class Differences:
         return 1 if self.name == "central-euler" else 2
 
     @property
-    def state_size(self) -> int:
-        """Value and velocity of each dof."""
-        return sum(self.orders)
-
-    @property
-    def width(self) -> int:
-        """Unknowns at a node."""
-        return len(self.orders)
-
-    @property
     def program(self) -> None:
         """No compiled Newton step."""
         return
 
-    def lengths(self, n: int, step: float) -> Array:
-        """Length of each step, s, shape (n,)."""
-        return np.full(n, step)
-
-    def phases(self, n: int) -> Array:
-        """Phases in cycles of the nodes, where the equations hold, shape (n,)."""
-        return np.arange(n) / n
-
-    def from_motion(self, rows_at_nodes: Array, rows_at_points: Array) -> Array:
-        """Unknowns that represent a given motion (see ``Collocation.from_motion``)."""
-        return BackwardDifferences(self.orders).from_motion(rows_at_nodes, rows_at_points)
-
-    def rows(self, x: Array, lanes: NDArray[np.int64], step: float, z: Array) -> None:
+    def rows(self, x: Array, lanes: Integers, step: float, z: Array) -> None:
         """Fill ``z (L, nz, N)`` with values and differences at the nodes."""
         z[lanes] = self._node_rows(x[lanes, :, :, None], step)[:, :, 0]
 
@@ -369,26 +346,16 @@ class Differences:
                 rows.append(np.moveaxis(sum(past, np.zeros(())), 1, 2))
         return np.stack(rows, axis=1)
 
-    def plan(self, phase: Array, n: int) -> CubicPlan:
-        """Nodes around given phases (cycles) and the weights of the cubic through them."""
-        return BackwardDifferences(self.orders).plan(phase, n)
-
-    def sample(self, x: Array, plan: CubicPlan, step: float) -> Array:
-        """Values and derivatives at planned phases by cubic interpolation, shape (L, nz, C, N)."""
-        rows = self._node_rows(x, step)
-        parts = zip(plan.nodes, plan.weights, strict=True)
-        return sum((weights * rows[..., nodes] for nodes, weights in parts), np.zeros(()))
-
     def linear(
         self,
         gz: Array,
         right: Array,
         x: Array | None,
-        lanes: NDArray[np.int64],
+        lanes: Integers,
         step: float,
         *,
         initial: bool = False,
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Flags]:
         """Solve ``G dx = -right`` as ``Collocation.linear``; there is no map from one period to the
         next, and the monodromy is not a number."""
         if initial:

@@ -1,21 +1,19 @@
 """Periodic solutions by shooting, and the hybrid of shooting with discretised derivatives.
 
-Periodic motions by shooting: Newton's method on the state that returns to itself.
+Shooting applies Newton's method to the state that returns to itself. The time map ``phi_T(s)`` and
+its derivative come from one integration (steps are differentiated as they are taken), first at a
+loose tolerance, which follows the residual, then at the requested one. The last passes use the same
+steps, so that the residual is a smooth function of the start and Newton's method ends in round-off
+instead of in the noise of step selection.
 
-The time map ``phi_T(s)`` and its derivative come from one integration (steps are differentiated as
-they are taken), first at a loose tolerance, which follows the residual, then at the one asked for.
-The last passes go by one and the same steps, so that the residual is a smooth function of the start
-and Newton's method ends in round-off instead of in the noise of choosing steps.
-
-The orbit by shooting, its derivatives by discretisation (the hybrid that Verbeek 1993, section
-4.3.2, suggests).
-
-Shooting finds motions from far away and steps to where the equations switch; a mesh has the
-derivatives by all parameters from one factorisation. The motion is put on the integrator's own
-steps, cut into equal parts, and linearised there as it is. Equal steps would not do: those across a
-contact leave derivatives in error by their length over the contact's duration. Nor would a Newton
-step on the mesh first: it moves a contact of a hundred-thousandth of the period off the edges (end
-stop of stiffness 1e11, 460 steps: derivatives err by 8e-2 after it, by 3e-6 without).
+The hybrid takes the orbit from shooting and its derivatives from a mesh (suggested by Verbeek 1993,
+section 4.3.2). Shooting finds motions from far away and steps to where the equations switch; a mesh
+has the derivatives by all parameters from one factorisation. The motion is put on the integrator's
+own steps, cut into equal parts, and linearised there without change. Equal steps would not do: a
+step across a contact leaves an error in the derivatives of its length over the contact's duration.
+Nor would a Newton step on the mesh first: it moves a contact of a hundred-thousandth of the period
+off the edges (end stop of stiffness 1e11, 460 steps: derivatives err by 8e-2 after it, by 3e-6
+without).
 """
 
 from __future__ import annotations
@@ -25,9 +23,8 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Float
+from bayesoleo._types import Array, Flags, Float
 from bayesoleo.solvers._initial_value import DenseTrajectory, Dynamics, solve_initial_value
 from bayesoleo.solvers._mesh import Mesh
 from bayesoleo.solvers._orbit import Orbit, Status
@@ -172,7 +169,7 @@ def shoot_on_steps(
     like: Shot,
     start: Array,
     steps: Array,
-    cut: NDArray[np.bool_],
+    cut: Flags,
     *,
     tolerance: float = 1e-8,
     sensitivities: bool = False,

@@ -2,21 +2,21 @@
 
 The state ``s`` holds for each dof its value, and its velocity where the dof is of second order. At
 given state and inputs the equations are solved for the highest derivatives by Newton's method: one
-step where they are linear in them. What ``h`` depends on follows by the implicit function theorem,
-so that derivatives are those of the generated kernels, not of differences.
+step where they are linear in them. The derivatives of ``h`` follow by the implicit function
+theorem, from those of the generated kernels rather than from differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Flags
-from bayesoleo.solvers._elimination import eliminate, jit
+from bayesoleo._compiled import ImplicitEquations, jit
+from bayesoleo._types import Array, Flags, Integers
+from bayesoleo.solvers._elimination import eliminate
 
 #: ``(times in s, shape (N,)) -> rows of inputs, shape (nu, N)``.
 Inputs = Callable[[Array], Array]
@@ -26,17 +26,6 @@ MAXIMUM_ITERATIONS = 30
 SMALL_STEP = 1e-12
 #: Below this a derivative is zero: where all terms cancel, relative steps never get small.
 SMALLEST = 1e-3
-
-
-class ImplicitEquations(Protocol):
-    """What is needed of implicit equations (see ``bayesoleo.model._kernels.Kernels``)."""
-
-    @property
-    def jacobian(self) -> Callable[..., Any]: ...
-    @property
-    def parameters(self) -> Callable[..., Any]: ...
-    @property
-    def admissible(self) -> Callable[..., Any]: ...
 
 
 class Rates(NamedTuple):
@@ -90,12 +79,12 @@ class StateSpace:
         """Number D of state components."""
         return sum(self.orders)
 
-    def state_rows(self) -> NDArray[np.int64]:
+    def state_rows(self) -> Integers:
         """Rows of ``z`` that are the state, shape (D,)."""
         first = np.cumsum([0, *(order + 1 for order in self.orders)])
         return np.array([first[j] + k for j, o in enumerate(self.orders) for k in range(o)], int)
 
-    def highest_rows(self) -> NDArray[np.int64]:
+    def highest_rows(self) -> Integers:
         """Rows of ``z`` that are highest derivatives, shape (d,)."""
         return np.cumsum([order + 1 for order in self.orders]).astype(int) - 1
 
@@ -242,14 +231,14 @@ class StateSpace:
         return np.concatenate([s[:, None], np.eye(self.size), by_parameter], axis=1).ravel()
 
 
-def _unit(z: Array, gz: Array, highest: NDArray[np.int64]) -> Array:
+def _unit(z: Array, gz: Array, highest: Integers) -> Array:
     """Size of the highest derivatives ``(L, d, N)`` that the equations' terms make, each alone."""
     terms = np.abs(gz * z[:, None]).sum(axis=2)
     slope = np.abs(gz[:, :, highest]).max(axis=2)
     return np.asarray(np.abs(z[:, highest]) + terms / np.where(slope > 0, slope, 1) + SMALLEST)
 
 
-def _solve_at_points(gz: Array, right: Array, highest: NDArray[np.int64]) -> tuple[Array, Flags]:
+def _solve_at_points(gz: Array, right: Array, highest: Integers) -> tuple[Array, Flags]:
     """Solve ``gz[:, :, highest] x = right`` at every point.
 
     ``right`` and ``x`` are ``(L, d, k, N)``; the flags ``(L, N)`` say where it is regular.

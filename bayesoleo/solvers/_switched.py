@@ -1,12 +1,9 @@
 """Periodic problems whose equations switch, and the phases at which they do.
 
-Where along a motion the equations have kinks: zeros of switching functions.
-
-A periodic problem that no mesh has been chosen for, and its solution on one.
-
-Equations with kinks or jumps are given in analytic pieces: the *mode* of each switching function,
-one where it is positive and zero where it is negative, is a row of the inputs. Modes either follow
-the trial motion, or are held between edges of the mesh.
+Such a problem has no mesh until one is chosen for it. Equations with kinks or jumps are given in
+analytic pieces: the *mode* of each switching function, one where it is positive and zero where it
+is negative, is a row of the inputs. Modes either follow the trial motion, or are held between edges
+of the mesh. Kinks of a motion are the zeros of its switching functions.
 """
 
 from __future__ import annotations
@@ -16,14 +13,14 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize.elementwise import find_root
 
-from bayesoleo._types import Array
+from bayesoleo._compiled import ImplicitEquations
+from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._mesh import Mesh, Tableau
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic import Boundary, Equations
+from bayesoleo.solvers._periodic import Boundary
 
 #: Positions in a step at which signs are compared.
 POSITIONS = np.arange(6) / 6.0
@@ -153,7 +150,7 @@ class PeriodicProblem:
 
     Parameters
     ----------
-    equations : Equations
+    equations : ImplicitEquations
         Residuals and partial derivatives.
     orders : tuple of int
         Order (1 or 2) of each dof.
@@ -169,7 +166,7 @@ class PeriodicProblem:
         Without them kinks are found by ever shorter steps.
     """
 
-    equations: Equations
+    equations: ImplicitEquations
     orders: tuple[int, ...]
     period: float
     inputs_at: Callable[[Array], Array]
@@ -202,20 +199,20 @@ class PeriodicProblem:
 class _Switching:
     """Equations whose modes are those of the motion at which they are evaluated."""
 
-    equations: Equations
+    equations: ImplicitEquations
     switches: Switches
 
-    def jacobian(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
+    def jacobian(self, z: Array, u: Array, p: Array, lanes: Integers, *out: Any) -> None:
         for lane in lanes:
             own = switched(self.switches, z[lane], u, p[lane])
             self.equations.jacobian(z, own, p, np.array([lane]), *out)
 
-    def residual(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
+    def residual(self, z: Array, u: Array, p: Array, lanes: Integers, *out: Any) -> None:
         for lane in lanes:
             own = switched(self.switches, z[lane], u, p[lane])
             self.equations.residual(z, own, p, np.array([lane]), *out)
 
-    def parameters(self, z: Array, u: Array, p: Array, lanes: NDArray[np.int64], *out: Any) -> None:
+    def parameters(self, z: Array, u: Array, p: Array, lanes: Integers, *out: Any) -> None:
         for lane in lanes:
             own = switched(self.switches, z[lane], u, p[lane])
             self.equations.parameters(z, own, p, np.array([lane]), *out)
@@ -284,7 +281,7 @@ class Level:
         plan = self.scheme.plan(phase, n)
         return self.scheme.sample(self.x[None, :, :, None], plan, self.boundary.step(n))[0, :, 0]
 
-    def inside(self, step: NDArray[np.int64], position: Array) -> Array:
+    def inside(self, step: Integers, position: Array) -> Array:
         """The same at positions, from 0 to 1, in given steps."""
         plan, mean = self.scheme.plan_in(step, position), self.boundary.step(self.x.shape[0])
         return self.scheme.sample(self.x[None, :, :, None], plan, mean)[0, :, 0]

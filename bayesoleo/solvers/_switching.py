@@ -1,14 +1,12 @@
-"""Location and crossing of switches during integration, and inputs as compiled code takes them.
-
-Inputs as compiled code takes them: a Fourier series, a piecewise cubic in time, or their sum.
-
-Where the vector field changes its formula: located inside a step, crossed with derivatives.
+"""Location and crossing of switches during integration, and inputs in compiled code.
 
 Equations with kinks or jumps are given as analytic pieces: a *mode* of each switching function
-``sigma_k(z, u, p)``, one where it is positive and zero where it is negative, stands among the
-constants ``p``. Inside a step modes are held, so that every step sees an analytic vector field,
-beyond the switch as well; a step in which ``sigma_k`` leaves the sign of its mode is shortened to
-end there, and the mode is exchanged.
+``sigma_k(z, u, p)``, one where it is positive and zero where it is negative, is among the constants
+``p``. Inside a step modes are held, so that every step sees an analytic vector field, beyond the
+switch as well. A step in which ``sigma_k`` leaves the sign of its mode is shortened to end there,
+the mode is exchanged, and the derivatives are carried across the switch.
+
+Inputs are a Fourier series, a piecewise cubic in time, or their sum.
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Integers
-from bayesoleo.solvers._elimination import jit
 from bayesoleo.solvers._radau_step import (
     SOLVED,
     Method,

@@ -1,16 +1,13 @@
 """Transient solutions from given states, for many parameter vectors at once.
 
-Transient solutions: from given states through a time, for many parameter vectors at once.
-
-A library's integrator chooses the steps, once, where the error asks for them
-(:mod:`~bayesoleo.solvers.transient.integrate`); collocation on those steps then gives every further
-solution.
-On a frozen mesh a solution is a smooth function of its own parameters, with sensitivities exact to
+A library's integrator chooses the steps, once, according to the error
+(``_library_integrator.py``); collocation on those steps then gives every further solution. On a
+frozen mesh a solution is a smooth function of its own parameters, with sensitivities exact to
 round-off and the same bits whatever the batch; an integrator that chose its steps anew for each
-vector would be none of that. The default scheme is the integrator's own method, so that the error
-it controlled is the error that is made.
+vector has none of these properties. The default scheme is the integrator's own method, so that the
+error it controlled is the error of the solution.
 
-Lanes (parameter vectors) never see each other, as in :mod:`bayesoleo.solvers.periodic.solve`.
+Lanes (parameter vectors) are independent, as in ``_periodic.py``.
 
 References
 ----------
@@ -22,16 +19,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as measures
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._mesh import Mesh
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import LAST_STEP, SMALL_STEP, Boundary, Solution, Trial
-
-Lanes = NDArray[np.int64]
 
 #: Newton iterations on the whole time at once, before it is walked through piece by piece.
 MAXIMUM_ITERATIONS = 12
@@ -110,7 +104,7 @@ class _State:
         self.status = np.full(x.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(x.shape[0], dtype=np.int64)
 
-    def keep(self, lanes: Lanes, good: NDArray[np.bool_], reason: Status | None = None) -> Lanes:
+    def keep(self, lanes: Integers, good: Flags, reason: Status | None = None) -> Integers:
         """Give up the lanes that are not good, for a reason or for what the evaluation found."""
         bad = lanes[~good]
         outside = np.where(
@@ -119,7 +113,7 @@ class _State:
         self.status[bad] = outside if reason is None else reason.value
         return lanes[good]
 
-    def direction(self, lanes: Lanes) -> tuple[Array, Array]:
+    def direction(self, lanes: Integers) -> tuple[Array, Array]:
         """Newton's step, and its size over the states' by lane, (L,); infinite where singular."""
         trial, size = self.trial, np.full(self.status.size, np.inf)
         dx, ok = trial.newton_step(lanes, initial=True)
@@ -136,14 +130,14 @@ class _State:
         size[~ok] = np.inf
         return dx, size
 
-    def finish(self, lanes: Lanes, small: NDArray[np.bool_], dx: Array) -> Lanes:
+    def finish(self, lanes: Integers, small: Flags, dx: Array) -> Integers:
         """Take the last step where it is so small that what it leaves is round-off."""
         finished = lanes[small[lanes]]
         self.trial.take_whole(finished, dx)
         self.status[finished] = Status.CONVERGED.value
         return lanes[~small[lanes]]
 
-    def advance(self, lanes: Lanes, dx: Array) -> Lanes:
+    def advance(self, lanes: Integers, dx: Array) -> Integers:
         """Take the steps, halved until they can be evaluated."""
         measures.keep(self.trial.x, lanes, self.trial.base)
         pending, fraction = lanes, np.ones(lanes.size)
@@ -244,7 +238,7 @@ def end_state(problem: Boundary, x: Array) -> Array:
     return rows[:, state_rows(scheme.orders), 0, 0]
 
 
-def state_rows(orders: tuple[int, ...]) -> NDArray[np.int64]:
+def state_rows(orders: tuple[int, ...]) -> Integers:
     """Rows of values and derivatives that are the state, shape (D,)."""
     first = np.cumsum([0, *(order + 1 for order in orders)])
     rows = [first[j] + k for j, order in enumerate(orders) for k in range(order)]

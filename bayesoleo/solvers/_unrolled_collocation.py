@@ -1,10 +1,7 @@
-"""Generated straight-line code for collocation.
+"""Generated straight-line code for collocation, and the lines that all schemes share.
 
-Lines of generated code that all schemes share: systems without inner loops, and the recursion of
-chunks side by side.
-
-Source for collocation: the unknowns of a step are its first state and the highest derivatives at
-its stages.
+The unknowns of a step are its first state and the highest derivatives at its stages. Shared are the
+solution of small systems without inner loops, and the recursion of chunks side by side.
 """
 
 from __future__ import annotations

@@ -1,16 +1,13 @@
 """Generated straight-line code for finite differences, and its compilation.
 
-Source for backward differences: the unknowns are the dofs at the nodes, the state those of past
-nodes.
+The code of a scheme for dofs of given orders has no inner loop but that over steps. For backward
+differences the unknowns are the dofs at the nodes, and the state those of past nodes.
 
-Straight-line code of one scheme for dofs of given orders: no inner loop is left but that over
-steps.
-
-A period is cut into :data:`WIDTH` chunks that are swept side by side: step ``t`` of all chunks is
-one vector instruction, and the recursion along the period, which has no parallelism of its own,
-costs no more than what is done node by node. Compiled once for a signature (scheme, orders), not
-once for a model. Rows of a block lie at constant distances, which lets the compiler prove that they
-do not overlap.
+A period is cut into :data:`WIDTH` chunks that are swept side by side. Step ``t`` of all chunks is
+one vector instruction, and the recursion along the period, which cannot run in parallel by itself,
+costs no more than the work at each node. Code is compiled once for a signature (scheme, orders),
+not once for a model. Rows of a block lie at constant distances, which lets the compiler prove that
+they do not overlap.
 """
 
 from __future__ import annotations
