@@ -1,4 +1,4 @@
-"""How good an estimate is, by what it leaves and by what it foresees."""
+"""Assessment of an estimate by its residuals and its predictive distribution."""
 
 import lazy_loader
 

@@ -1,11 +1,8 @@
 """Assessment of an estimate: every residual test by output and run.
 
-Do mean residuals differ from run to run, and from group to group?
-
-What a model leaves out differs between runs more than within one, and shows as means that noise
-cannot explain (Verbeek 1993, section 6.2).
-
-Assess an estimate by what it leaves: every test of section 2.4, as numbers by output and run.
+The tests are those of Verbeek (1993), section 2.4, as numbers by output and run. A further test
+compares the mean residuals between runs and between groups of runs: a model error differs more
+between runs than within one and shows as means that noise cannot explain (section 6.2).
 
 References
 ----------

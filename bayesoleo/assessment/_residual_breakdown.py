@@ -1,12 +1,9 @@
 """Breakdown of the repeating residual by harmonic and by coordinate.
 
-Residuals with what they may depend on: one series for each output of each run.
-
-Where in a result the error lives that repeats: at which harmonics, and along which coordinates.
-
-All runs count together, in units of the noise of their averages, so that a function of velocity,
-say, is one function for all of them: where it explains most of what repeats it is nearly the law
-that is missing.
+The residuals of each output of each run are held beside the quantities that they may depend on. All
+runs are pooled, in units of the noise of their averages, so that a function of velocity, for
+example, is one function for all of them. If it explains most of the repeating residual, it is close
+to the missing law.
 """
 
 from __future__ import annotations

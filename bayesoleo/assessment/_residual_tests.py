@@ -1,16 +1,13 @@
 """Residual tests and prediction scores, as pure functions.
 
-How well a prediction foresaw what was measured: log score and probability integral transform.
+Each test takes a residual and returns a statistic and the probability of such a value by chance.
+Samples are denser than the correlation of the model error or the noise, so that thousands of them
+may hold the information of dozens. Where the distribution of a test depends on this, it uses the
+autocorrelation time of the residual.
 
-Both need a prediction with its uncertainty: a mean and a standard deviation, or draws. They reward
-intervals that are as wide as the errors are, no wider.
-
-The tests, each a pure function of a residual: a statistic and the probability of as much by
-chance.
-
-Samples follow each other faster than the model's error or the noise changes, so that thousands of
-them may hold the information of dozens. Where a test's distribution depends on it, the
-autocorrelation time of the residual is measured and taken into account.
+The prediction scores are the log score and the probability integral transform. Both need a
+predictive distribution: a mean and a standard deviation, or draws. They reward intervals that are
+as wide as the errors, no wider.
 """
 
 from __future__ import annotations

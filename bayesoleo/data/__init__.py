@@ -1,4 +1,4 @@
-"""How files become records, and how noise is measured."""
+"""Data: campaigns of run files, their reduction to records, and the noise of records."""
 
 import lazy_loader
 

@@ -1,8 +1,6 @@
 """Campaigns: a folder with ``campaign.toml`` and one file a run, loaded in SI and checked.
 
-Sample times: equidistant or refused, with the rounding of written time stamps forgiven.
-
-Campaigns: a folder with ``campaign.toml`` and one file a run, loaded in SI and checked.
+Sample times must be equidistant; the rounding of written time stamps is tolerated.
 """
 
 from __future__ import annotations
@@ -51,7 +49,7 @@ def uniform_time(time: Array, column: str, before: int = 0) -> Array:
     Raises
     ------
     CampaignError
-        If times are missing, do not increase, leave a gap, or are too coarse to tell their spacing.
+        If times are missing, do not increase, leave a gap, or are too coarse for their spacing.
     """
     if time.size < 3:
         raise CampaignError("fewer than three samples", column=column, value=time.size)
@@ -60,8 +58,7 @@ def uniform_time(time: Array, column: str, before: int = 0) -> Array:
         raise CampaignError(f"no time in row {before + missing[0] + 1}", column=column)
     spacing = np.diff(time)
     back = np.flatnonzero(spacing <= 0)
-    # Stamps rounded more coarsely than the spacing repeat; say so rather than that time stands
-    # still.
+    # Time stamps that are rounded more coarsely than the spacing repeat: a message of its own.
     resolution = _written_resolution(time)
     if back.size and np.mean(spacing == 0) > 0.05:
         raise CampaignError(
@@ -81,7 +78,7 @@ def uniform_time(time: Array, column: str, before: int = 0) -> Array:
     _check_gaps(time, spacing, resolution, column)
     index = np.arange(time.size) - 0.5 * (time.size - 1)
     step = float(np.dot(index, time) / np.dot(index, index))
-    # A step that the stamps cannot tell from a rounder one is that one: 0.025, not 0.0250000003.
+    # The roundest step within the resolution of the stamps is taken: 0.025, not 0.0250000003.
     step = _roundest(step, 0.5 * resolution / time.size)
     first = _roundest(float(np.mean(time)) + step * float(index[0]), 0.5 * resolution)
     return first + step * np.arange(time.size, dtype=float)
@@ -108,7 +105,7 @@ def _check_gaps(time: Array, spacing: Array, resolution: float, column: str) -> 
 
 
 def _written_resolution(time: Array) -> float:
-    """Power of ten that all stamps are multiples of; zero if they are written in full."""
+    """Power of ten of which all stamps are multiples; zero if they are written in full."""
     probe = time[:: max(1, time.size // 500)]
     for decimals in range(12):
         scale = max(float(np.max(np.abs(probe))), 1e-300)
@@ -141,18 +138,18 @@ def window(time: Array, start: float | None, stop: float | None) -> slice:
     Raises
     ------
     CampaignError
-        If nothing is left, or there was nothing.
+        If fewer than three samples are given or left.
     """
     if time.size < 3:
         raise CampaignError("fewer than three samples", value=time.size)
-    # A thousandth of a sample keeps an end that was meant to be on a sample on it.
+    # The slack of a thousandth of a sample includes a sample that is exactly at an end.
     slack = 1e-3 * abs(float(np.nanmedian(np.diff(time))))
     low = -np.inf if start is None else start - slack
     high = np.inf if stop is None else stop + slack
     inside = np.flatnonzero((time >= low) & (time <= high))
     if inside.size < 3:
         raise CampaignError(
-            "nothing is left between start and stop",
+            "fewer than three samples between start and stop",
             key="start" if start is not None else "stop",
             value=(start, stop),
             hint=f"the file runs from {np.nanmin(time):.6g} to {np.nanmax(time):.6g} s",
@@ -187,7 +184,7 @@ class Run:
     condition_units : mapping of str to str
         SI unit of each condition.
     mask : tuple of (float, float)
-        Stretches that do not count, from and to, s on the file's own clock.
+        Masked stretches, from and to, s on the file's own clock.
     bandwidths : mapping of str to float
         Frequencies up to which channels count as inputs, Hz, where declared.
     """
@@ -231,7 +228,7 @@ class CampaignData:
     sha256 : str
         Of ``campaign.toml`` and all run files, in the order of the runs.
     rig : mapping of str to (float, float)
-        What may be asked of the rig in a further run, SI, infinite where there is no limit.
+        Limits of the rig in a further run, SI, infinite where there is none.
     """
 
     name: str
@@ -259,7 +256,7 @@ class CampaignData:
         Raises
         ------
         CampaignError
-            If there is none, with those there are.
+            If no run has this label; the message lists the labels.
         """
         for run in self.runs:
             if run.label == label:
@@ -285,7 +282,7 @@ def load_campaign(path: str | os.PathLike[str]) -> CampaignData:
     Raises
     ------
     CampaignError
-        If anything in it cannot be used; one line that says where, what, and what to write instead.
+        If the campaign is invalid; one line that says where and why, and how to correct it.
     """
     given = Path(path)
     toml = given if given.suffix == ".toml" else given / FILE
@@ -306,8 +303,8 @@ def load_campaign(path: str | os.PathLike[str]) -> CampaignData:
 
 
 def _check_shared(runs: tuple[Run, ...]) -> None:
-    """Raise where two runs are the same stretch of a file: it would count twice, or be held out
-    from itself."""
+    """Raise where two runs are the same stretch of a file: it would count twice, or be fitted and
+    held out at once."""
     for later, run in enumerate(runs):
         for other in runs[:later]:
             common = min(run.time[-1], other.time[-1]) - max(run.time[0], other.time[0])
@@ -337,14 +334,14 @@ def _checksum(toml: Path, files: list[Path]) -> str:
 
 
 def _load_run(declared: RunDeclaration, channels: Mapping[str, Channel], folder: Path) -> Run:
-    """Load one run; what goes wrong below is told with the run and its file."""
+    """Load one run; errors name the run and its file."""
     try:
         wanted = {channel.column for channel in channels.values()}
         wanted |= {declared.time} if declared.time else set(_TIME_COLUMNS)
         file = folder / declared.file
         columns = read_columns(file, declared.delimiter, declared.header_delimiter, wanted)
         whole, column = _time(declared, columns, channels)
-        # Cut first: what lies outside may have gaps.
+        # The cut comes first, because samples outside may have gaps.
         part = window(whole, declared.start, declared.stop)
         time = _frozen(uniform_time(whole[part], column, part.start) if column else whole[part])
         away = masked(time, declared.mask)
@@ -433,7 +430,7 @@ def _samples(
             value=float(values[missing[0]]),
             hint="cut the run there with start or stop, mask the gap, or fill it",
         )
-    if gap.any():  # what is masked does not count, so that any number will do
+    if gap.any():  # masked samples do not count, so that any number serves
         values = bridged(values[None], gap)[0]
     row, beyond = impossible_sample(values)
     if row is not None:
@@ -459,9 +456,8 @@ def _check_periods(declared: RunDeclaration, time: Array) -> None:
         return
     step = (time[-1] - time[0]) / (time.size - 1)
     periods = declared.frequency * step * time.size
-    # One sample short of two periods is what a record from 0 to 2 T without its end point holds;
-    # the declared frequency is approximate, so a few per cent short of two may still be two of the
-    # true ones.
+    # A record from 0 to 2 T without its end point is one sample short of two periods. The declared
+    # frequency is approximate, so that a few per cent short of two may still be two true periods.
     if periods < 1.9:
         raise CampaignError(
             f"fewer than two periods in {time[-1] - time[0]:.6g} s",

@@ -1,13 +1,7 @@
 """The file ``campaign.toml``: every table and key is checked.
 
-Values out of ``campaign.toml``: every key checked, so that a typing slip does not pass as a
-default.
-
-The table ``[rig]`` of a campaign: what may be asked of the rig in a run yet to be made.
-
-What ``campaign.toml`` says about a run.
-
-``campaign.toml`` as a whole: the campaign, its channels and its runs.
+An unknown key is an error, so that a misspelt key does not silently become a default. The tables
+describe the campaign, its channels, its runs and, in ``[rig]``, the limits of a future run.
 """
 
 from __future__ import annotations

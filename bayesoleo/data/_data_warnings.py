@@ -1,12 +1,11 @@
 """Warnings about reduced records: drift, doubtful frequencies, noise.
 
-Trends over a record: does the mean or the amplitude of a channel move from period to period.
+The warnings are sentences about drift, about a frequency that is a multiple or a fraction of the
+true one, and about a channel without a periodic signal.
 
-A record that drifts is no periodic equilibrium. Its average over periods is then of a motion that
-never was, and the drift counts as noise (Verbeek 1993 notes the slow drift of the gas pressure).
-
-What deserves a look in reduced records, as sentences: drift, a frequency that is a multiple or a
-part of the true one, a channel in which nothing repeats.
+A record that drifts is no periodic equilibrium: its average over periods belongs to no motion that
+occurred, and the drift counts as noise. (Verbeek 1993 notes the slow drift of the gas pressure.)
+The drift of the mean or the amplitude of a channel from period to period is therefore tested.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from bayesoleo.prediction._records import Record
 
 #: Probability of flagging any channel of a run without drift.
 FALSE_ALARM = 1e-3
-#: Least change over the record, in standard deviations of a single sample, that is worth a word.
+#: Smallest change over the record, in standard deviations of a single sample, that is reported.
 LEAST_CHANGE = 0.2
 _BINS = 24
 
@@ -94,10 +93,10 @@ def drift(values: Array, time_step: float, frequency: float, channel: str = "") 
     rms = float(np.sqrt(np.mean(swing**2)))
     time = (np.arange(signal.size) - 0.5 * (signal.size - 1)) / signal.size
     shapes = np.stack((time, time * swing))
-    # What the average can absorb of a trend is not left in the residual.
+    # The average absorbs a part of a trend, which is therefore projected out of the regressors.
     columns = np.stack([s - periodic_average(s, time_step, frequency).values for s in shapes])
     rest = signal - average.values
-    # In units of their own, or the amplitude's column vanishes beside that of the mean.
+    # Each column is scaled: that of the amplitude may be negligible beside that of the mean.
     length = np.sqrt(np.mean(columns**2, axis=1, keepdims=True))
     length[length == 0] = 1.0
     inverse = np.linalg.pinv(columns / length).T
@@ -127,7 +126,7 @@ def record_drifts(record: Record) -> tuple[Drift, ...]:
 
 
 def drifting(record: Record) -> tuple[Drift, ...]:
-    """Channels whose trend is larger than chance makes it, and large enough to matter."""
+    """Channels whose trend is significant and large enough to matter."""
     found = record_drifts(record)
     return tuple(
         item
@@ -143,7 +142,7 @@ def _coloured_sd(weights: Array, noise: Array) -> float:
     spectrum = np.abs(fft.rfft(noise)) ** 2 / samples
     width = np.ones(min(2 * _BINS + 1, spectrum.size))
     smooth = np.convolve(spectrum, width, "same")
-    # Bins on the harmonics are empty: the average over periods has taken them.
+    # Bins on the harmonics are empty: the average over periods contains them.
     used = np.convolve((spectrum > 1e-12 * spectrum.max(initial=0.0)).astype(float), width, "same")
     double = np.full(transfer.size, 2.0)
     double[0] = 1.0
@@ -152,21 +151,21 @@ def _coloured_sd(weights: Array, noise: Array) -> float:
     return float(np.sqrt(np.sum(double * transfer * smooth / np.maximum(used, 1.0)) / samples))
 
 
-#: Part of the power that harmonics off the multiples may hold, and their power over that of the
-#: noise (twice its variance), which noise exceeds twice in a thousand million: what is below either
-#: is no motion.
+#: A harmonic belongs to the motion if it exceeds both limits: a part of the total power, and a
+#: ratio to the power of the noise (twice its variance), which noise exceeds with probability 2e-9.
 STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
-#: A longer period is taken for the motion's own if no more than this part of what does not repeat
-#: in the declared period is left in it. Of noise all is left. And what does not repeat must be this
-#: part of the channel's deviation: twice the frequency leaves out half of a motion, a start that
-#: has not quite settled a per cent, the rounding of samples without noise nothing.
+#: A longer period is that of the motion if it leaves at most the part ``LEFT`` of the variance that
+#: does not repeat in the declared period; noise would leave all of it. The non-repeating part must
+#: also exceed the part ``LEAST`` of the channel's deviation: it is half of the motion where the
+#: declared frequency is double, but a per cent for an unsettled start and zero for the rounding of
+#: samples without noise.
 LEFT, LEAST = 0.25, 0.05
 #: Multiples of the declared period that are tried.
 LONGER = (2, 3)
 
 
 def motions_per_period(record: Record) -> int:
-    """How often the motion repeats within a declared period: two where the frequency is half.
+    """Number of periods of the motion in a declared period: two if the frequency is half.
 
     Parameters
     ----------
@@ -175,7 +174,7 @@ def motions_per_period(record: Record) -> int:
     Returns
     -------
     int
-        The greatest common divisor of the harmonics that stand above the noise of any channel; one
+        The greatest common divisor of the harmonics that exceed the noise of any channel; one
         for a transient.
     """
     strong: set[int] = set()
@@ -188,7 +187,7 @@ def motions_per_period(record: Record) -> int:
 
 
 def periods_per_motion(record: Record) -> tuple[int, str]:
-    """After how many declared periods the motion repeats: two where the frequency is double.
+    """Number of declared periods in a period of the motion: two if the frequency is double.
 
     Parameters
     ----------
@@ -197,15 +196,15 @@ def periods_per_motion(record: Record) -> tuple[int, str]:
     Returns
     -------
     periods : int
-        One for a transient, and where the record is too short to tell or has stretches left out.
+        One for a transient, and where the record is too short or has masked stretches.
     channel : str
-        Which shows it best; empty where it is one.
+        The channel with the clearest evidence; empty where the number is one.
     """
     if not record.periodic or record.kept is not None:
         return 1, ""
     step = record.frequency * (record.time[-1] - record.time[0]) / (record.time.size - 1)
     for count in LONGER:
-        # Two of the longer periods at least, or there is nothing to compare.
+        # A comparison needs two of the longer periods.
         if record.periods < 2 * count:
             continue
         basis = HarmonicBasis(record.time.size, step / count)
@@ -221,7 +220,7 @@ def periods_per_motion(record: Record) -> tuple[int, str]:
 
 
 def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = None) -> list[str]:
-    """Sentences about records that are usable but deserve a look.
+    """Warnings about records that are usable but should be checked.
 
     Parameters
     ----------
@@ -233,7 +232,7 @@ def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = N
     Returns
     -------
     list of str
-        Each names the run, what was found and what to write.
+        Each names the run, the finding and the remedy.
     """
     known = {} if units is None else units
     periods = [_about_period(record) for record in records]
@@ -250,18 +249,18 @@ def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = N
 
 
 def _unit(units: Mapping[str, str], channel: str) -> str:
-    """What follows a number; nothing where the channel is one."""
+    """The unit as it follows a number; empty for a dimensionless channel."""
     unit = units.get(channel, "(SI)")
     return f" {unit}" if unit else ""
 
 
 def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
-    """What channels show beside what is measured: foreign lines, cut-off ends, coarse steps."""
+    """Warnings about foreign lines, saturation and coarse steps of channels."""
     where = f"run {record.label}: "
     found = [
         f"{where}{line.channel} has a line at {line.frequency:.4g} Hz with the amplitude "
         f"{line.amplitude:.3g}{_unit(units, line.channel)}, which is no harmonic of "
-        f"{record.frequency:.4g} Hz: something periodic besides the drive; it counts as noise"
+        f"{record.frequency:.4g} Hz: a periodic source besides the drive; it counts as noise"
         for line in foreign_lines(record)
     ]
     found += [
@@ -274,10 +273,10 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
         stays = repeating_rounding(step, record.signal_noise[channel])
         unit = _unit(units, channel)
         what = (
-            f"where samples fall on the same phases in every period an error of "
-            f"{stays:.2g}{unit} of rounding repeats itself"
+            f"where samples fall on the same phases in every period, a rounding error of "
+            f"{stays:.2g}{unit} repeats"
             if record.periodic
-            else "rounding counts as noise, which is none where the channel rests"
+            else "rounding counts as noise, although it is no noise where the channel rests"
         )
         found.append(
             f"{where}{channel} goes in steps of {step:.3g}{unit}, "
@@ -288,7 +287,7 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
 
 
 def frequency_warnings(records: Sequence[Record]) -> list[str]:
-    """Those about what repeats and when, without which everything else that is found is doubtful.
+    """The warnings about the frequency; if there are any, all further results are doubtful.
 
     Parameters
     ----------
@@ -303,7 +302,7 @@ def frequency_warnings(records: Sequence[Record]) -> list[str]:
 
 
 def _about_period(record: Record) -> list[str]:
-    """What is doubtful about the period of one run."""
+    """Warnings about the period of one run."""
     found = []
     times = motions_per_period(record)
     if times > 1:
@@ -314,8 +313,8 @@ def _about_period(record: Record) -> list[str]:
     count, channel = periods_per_motion(record)
     if count > 1:
         found.append(
-            f"run {record.label}: {channel} repeats after {count} declared periods only, and "
-            f"what differs between them counts as noise; write frequency = "
+            f"run {record.label}: {channel} repeats only after {count} declared periods, and the "
+            f"difference between these counts as noise; write frequency = "
             f"{record.frequency / count:.4g}"
         )
         return found

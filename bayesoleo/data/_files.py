@@ -1,8 +1,6 @@
 """Readers of run files: delimited text, MATLAB v5, Parquet and netCDF.
 
-Delimited text with a header: what spreadsheets and test machines write.
-
-Columns out of run files: delimited text, MATLAB v5, Parquet and netCDF.
+Delimited text has a header, as spreadsheets and test machines write it.
 """
 
 from __future__ import annotations

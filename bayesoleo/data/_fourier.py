@@ -1,13 +1,11 @@
 """Sums over harmonics at an exact frequency, and autocovariance by FFT.
 
-Sums over harmonics at an exact frequency, for any number of samples per period.
+The period of a record is not a whole number of samples, so that a plain FFT has no bin at the
+harmonics. The chirp transform evaluates ``sum_n x_n exp(-2 pi i k step n)`` for any real step in a
+few FFTs. Least squares on all harmonics then needs only products with a nearly diagonal symmetric
+Toeplitz matrix, and a few conjugate-gradient iterations solve it.
 
-A record's period is no whole number of samples, so a plain FFT has no bin on the harmonics. The
-chirp transform has: it evaluates ``sum_n x_n exp(-2 pi i k step n)`` for any real step in a few
-FFTs. Least squares on all harmonics then needs only products with a symmetric Toeplitz matrix that
-is nearly diagonal, so that a few conjugate-gradient iterations solve it.
-
-Autocovariance by the fast Fourier transform (Wiener and Khinchin's theorem).
+The autocovariance follows from the FFT by the theorem of Wiener and Khinchin.
 """
 
 from __future__ import annotations

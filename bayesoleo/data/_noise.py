@@ -1,24 +1,17 @@
 """Noise of a record: averages over periods, local averages, spectrum between the harmonics.
 
-Noise of a signal that does not repeat: what a local polynomial cannot foresee.
+For a periodic run the average is a least-squares fit of all harmonics of the frequency that the
+samples of one period determine. Folding by linear interpolation smooths the noise and
+underestimates it by a fifth where the number of samples per period is not whole.
 
-Averages over periods, and the noise that does not repeat.
+A repeating signal has lines at the harmonics only. A record of P periods has P - 1 lines between
+two harmonics, which hold noise alone. Their average over neighbours is the noise *at* the
+harmonics, whether it is flat or not.
 
-The average is least squares on all harmonics of the frequency that the samples of one period
-determine. Folding by linear interpolation instead smooths the noise and understates it by a fifth
-where samples per period are not whole.
-
-What a transient's residual keeps over neighbouring samples, and its noise.
-
-A transient repeats nothing that could be averaged over periods. What the model lacks is smooth on
-the scale of the samples and noise is not, so that averages over a few neighbours say the same: they
-are the noise's standard error where nothing is missing, and larger where something is.
-
-The spectrum of a periodic run's noise, from the lines between its harmonics.
-
-What repeats has lines at the harmonics only. A record of P periods has P - 1 lines between two of
-them, and these hold noise alone. Averaged over neighbours they say what noise there is *at* the
-harmonics, flat or not.
+A transient has no periods to average over. Its noise is estimated as the error of a local
+polynomial prediction. The model error is smooth on the scale of the samples and noise is not, so
+that local averages of the residual equal their standard error where no effect is missing and are
+larger where one is.
 
 References
 ----------

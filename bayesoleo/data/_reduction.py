@@ -1,12 +1,9 @@
 """Reduction of a campaign to records: frequency, settled periods, harmonics, noise.
 
-Records on a regular grid of one period, as a solver or a reader of a figure wants them.
-
-The thesis maps one period by linear interpolation (Verbeek 1993, appendix B). A band-limited map
-uses all periods at once: least squares on the harmonics that the samples determine, evaluated on
-the grid, so that it adds no error of its own to a signal without higher ones.
-
-Campaigns to records: frequency, whole settled periods, significant harmonics, noise.
+A record is mapped to a regular grid of one period for solvers and figures. The thesis maps one
+period by linear interpolation (Verbeek 1993, appendix B). The band-limited map uses all periods at
+once: a least-squares fit of the harmonics that the samples determine, evaluated on the grid. It
+adds no error to a signal without higher harmonics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where registered data sets are: a folder of the user's, or a verified download."""
+"""Registered data sets: a folder of the user's, or a verified download."""
 
 from __future__ import annotations
 

@@ -1,13 +1,11 @@
 """Fundamental frequency of a periodic run, by the residual time shift function.
 
-Fundamental frequency of a periodic run.
+The estimate has two steps. The residual time shift function (Verbeek 1993, eq. B.2), refined around
+the nominal frequency, finds the period to a fraction of a sample. Gauss-Newton on all harmonics,
+jointly over the channels, then refines it to a fraction of its standard error: a wrong frequency
+shifts the late periods against the early ones, which would look like noise.
 
-Two steps. The residual time shift function (Verbeek 1993, eq. B.2), zoomed round the nominal
-frequency, finds the period to a fraction of a sample. Gauss-Newton on all harmonics, jointly over
-the channels, then brings it to a fraction of its own standard deviation: a wrong frequency moves
-the late periods against the early ones and would pass for noise that does not repeat.
-
-How the period of a record is found, in numbers that a figure can show.
+The intermediate numbers are kept so that a figure can show them.
 
 References
 ----------

@@ -1,21 +1,15 @@
 r"""Quality of samples: outliers, gaps, unsettled periods, converter resolution and saturation.
 
-Samples that no sensor measured: a number alone far beyond all others.
+An outlier is a single sample far beyond all others. A masked stretch is one in which a sensor
+dropped out or the rig was touched; its samples take no part in estimates. Where a periodic channel
+drives a model, or its noise is estimated, they are interpolated from the other periods. Leading
+periods that have not settled are left out.
 
-Stretches of a record that are not to count: a sensor that dropped out, a rig that was touched.
-
-Their samples take no part in estimates. Where a periodic channel drives a model, or is looked at
-for its noise, they are bridged by what the other periods show.
-
-Leading periods that have not settled yet.
-
-What a converter does to a record: values on a grid, and values cut off at its ends.
-
-Rounding to steps :math:`\Delta` adds an error of variance :math:`\Delta^2/12`. Where noise spreads
-over more than a step it is white, and is counted with the noise, which is measured from the same
-samples. Where a channel is quieter than that, and samples fall on the same phases in every period,
-the error repeats itself and looks like something missing; it is counted with the noise of the
-average. Its variance is then (Widrow and Kollar
+A converter rounds samples to a grid and clips them at its ends. Rounding to steps :math:`\Delta`
+adds an error of variance :math:`\Delta^2/12`. Where the noise exceeds a step, the rounding error is
+white and is contained in the noise measured from the samples. Where a channel has less noise and
+its samples fall on the same phases in every period, the rounding error repeats and looks like a
+missing effect; it is added to the noise of the average. Its variance is then (Widrow and Kollar
 2008, Quantization Noise)
 
 .. math:: \sum_k \frac{\Delta^2}{2 \pi^2 k^2} e^{-4 \pi^2 k^2 \sigma^2 / \Delta^2}.

@@ -1,4 +1,4 @@
-"""Writing a campaign in the raw format: simulated data take the same way as measured ones."""
+"""Writing of campaigns in the raw format, so that simulated data are read like measured data."""
 
 from __future__ import annotations
 

@@ -1,24 +1,17 @@
 """Alternative searches: other first effects, and backward elimination.
 
-Backward elimination: effects that are no longer worth their unknowns beside the others.
+The effect that explains most alone is not always part of the best model of several effects, and
+each of two missing effects may alone predict the hold-out runs worse than no effect. Other first
+effects are therefore followed to the end where the search added more than one effect, left more
+than noise, or found only parameters that vary from run to run. A full search takes minutes; a
+forecast of the best second effect, on the fitted runs alone, tells in seconds which first effects
+can compete. Backward elimination removes effects that do not pay for their unknowns beside the
+others.
 
 References
 ----------
 Schwarz (1978), Annals of Statistics 6(2), 461-464; Burnham and Anderson (2002), Model Selection
 and Multimodel Inference, section 2.5: dispersion.
-
-Whether another first effect may lead as far as the one that was taken: one effect ahead, on the
-fitted runs alone.
-
-A search carried to its end takes minutes; what the best second effect leaves beside the first tells
-in seconds whether it can come out better.
-
-Other first effects carried forward, and final models compared.
-
-The effect that explains most by itself is not always part of the best model of several; and of two
-that are missing each alone may predict other runs worse than none. Where the search ended with more
-than one effect, left more than noise, or added no cause but what varies from run to run, the first
-effects that were nearly as good as the one that was taken are followed to their ends too.
 """
 
 from __future__ import annotations
@@ -34,9 +27,9 @@ from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
+    contradicted,
     fall_on_hold_out,
     judged,
-    speak_against,
     with_error,
 )
 from bayesoleo.discovery._policy import SearchPolicy
@@ -59,21 +52,21 @@ from bayesoleo.effects._nonparametric import FAMILY
 
 @dataclass(frozen=True)
 class Loss:
-    """What is lost without one effect, everything else estimated anew.
+    """Rise of the sum of squares without one effect, after a new fit of all other unknowns.
 
     Parameters
     ----------
     step : AddedEffect
         The effect.
     rise : float
-        Of the weighted sum of squares on the fitted runs.
+        Rise of the weighted sum of squares on the fitted runs.
     size : int
-        Unknowns that leave with it.
+        Number of unknowns of the effect.
     scale : float
-        Variance of the samples' noise along what the effect changes, over that of white noise,
-        times the dispersion of what the model leaves.
+        Variance of the samples' noise along the change by the effect, over that of white noise,
+        times the dispersion of the residual.
     price : float
-        What one unknown must be worth, in units of the scale.
+        Price of one unknown, in units of the scale.
     """
 
     step: AddedEffect
@@ -102,19 +95,19 @@ def eliminated(
 ) -> State:
     """The state without effects that the last one made superfluous.
 
-    Each earlier effect is left out in turn and everything else estimated anew; the one that is
-    missed least goes first, as long as one is not worth its unknowns.
+    The model is refitted without each earlier effect in turn. As long as an effect is not worth its
+    unknowns, the one with the smallest loss is removed.
 
     Parameters
     ----------
     state : State
-        With an effect just added.
+        The state with an effect just added.
     roles : Roles
     numerics : Numerics
     notes : list of str
-        Told what was taken out, and why.
+        Receives the removed effects with the reasons.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
     """
     while len(state.assembly.steps) > 1:
         base = state.base()
@@ -122,22 +115,26 @@ def eliminated(
         doubted = [step for step in earlier if not plainly_needed(state, base, step)]
         if not doubted:
             return state
-        callback("look whether the earlier effects are still needed")
+        callback("test whether the earlier effects are still needed")
         losses = [loss_without(state, base, step, numerics) for step in doubted]
         least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
         if not least.worth < 0.0:
             return state
         effect = least.step.effect.id
         callback(f"remove {effect}: {least}")
-        notes.append(f"{effect} was removed again, a later effect made it superfluous: {least}")
+        notes.append(
+            f"{effect} was removed again because a later effect made it superfluous: {least}"
+        )
         state = fit_state(state.assembly.without(least.step), roles, numerics, progress=callback)
     return state
 
 
 def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
-    """Whether an effect's amplitudes are so far from their null that no fit without it is asked
-    for: by Wald's statistic, which is smaller than the fall of the sum of squares where they differ
-    by much (Hauck and Donner 1977, JASA 72, 851-853)."""
+    """Whether an effect's amplitudes are so far from their null that no fit without it is needed.
+
+    The criterion is Wald's statistic. Where it differs much from the fall of the sum of squares, it
+    is the smaller of the two (Hauck and Donner 1977, JASA 72, 851-853).
+    """
     point, names = state.fit.point, state.fit.problem.names
     index = [k for k, name in enumerate(names) if name.split("[")[0] in step.amplitudes]
     covariance = point.covariance[np.ix_(index, index)]
@@ -148,21 +145,21 @@ def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
 
 
 def loss_without(state: State, base: Base, step: AddedEffect, numerics: Numerics) -> Loss:
-    """What is lost without one effect of a model, everything else estimated anew."""
+    """The loss without one effect of a model, after a new fit of all other unknowns."""
     without = state.assembly.without(step).model()
     fit = quick_fit(base, without, base.fit.values, numerics)
     share, changes = compare(base, fit)
     names = [n for n in base.fit.problem.names if n not in fit.problem.names]
     measured = inflation_along(base, base.fit, names, changes)
-    # The logarithm is of as many samples as would say the same independently.
+    # The logarithm is that of the effective number of independent samples.
     scale = (measured or (1.0, 0))[0] * dispersion(base)
     price = max(schwarz_price(base) - float(np.log(scale)), 1.0)
     return Loss(step, -share * base.fall_back, len(names), scale, price)
 
 
 def dispersion(base: Base) -> float:
-    """Mean square of what a model leaves of periodic runs over that of the noise, at least one; of
-    transients the inflation is measured on all that is left."""
+    """Mean square of the residual of periodic runs over that of the noise, at least one. For
+    transients it is one, because their inflation is measured on the whole residual."""
     if not all(record.periodic for record in base.fit.records) or not base.excess > base.feigned:
         return 1.0
     return 1.0 + base.excess / max(base.noise, 1e-300)
@@ -176,25 +173,26 @@ def leads_as_far(
     effects: Sequence[Effect] | None,
     callback: ProgressCallback,
 ) -> bool:
-    """Whether a first effect with the best second one beside it leaves about as little as the first
-    two that were added, unknowns counted, or as the noise.
+    """Whether a first effect, with the best second one, competes with the first two added effects.
+
+    It competes if their penalised sums of squares are about equal, or if it leaves only noise.
 
     Parameters
     ----------
     progress : Progress
         A finished search.
     first : Ranked
-        Estimated in its first round.
+        An effect that was estimated in its first round.
     roles : Roles
     numerics : Numerics
     effects : sequence of Effect or None
         Instead of the catalogue.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
     """
     result = first.refit
     assert result is not None
-    callback(f"look how far {first.effect} leads as the first effect instead")
+    callback(f"try {first.effect} as the first effect")
     fitted = replace(roles, held_out=(), strategy="none")
     state = state_of(result.assembly, result.fit, fitted)
     if state.at_floor:
@@ -210,7 +208,8 @@ def leads_as_far(
     fall = fall_from(reference, present)
     left = replace(reference, excess=reference.excess - max(fall, *falls))
     best = int(np.argmax(worths))
-    # Of what is compared: a rival that moves the mean alone may lie in far more noise.
+    # The inflation is that of the compared models: a rival that moves the mean alone may have far
+    # more noise along its change.
     scale = dispersion(left) * max(result.inflation, tried[best].inflation)
     return (
         worths[best] > _worth(reference, fall, present) - numerics.policy.equal_likelihood * scale
@@ -247,7 +246,7 @@ def best_of_beam(
     max_effects: int,
     callback: ProgressCallback,
 ) -> Progress:
-    """The best final model that the best few first effects lead to.
+    """The best of the final models that start with the best few first effects.
 
     Parameters
     ----------
@@ -256,19 +255,19 @@ def best_of_beam(
     roles : Roles
     numerics : Numerics
     follow : callable (progress, most) -> Progress
-        Carries a search on to its end, with so many effects at most.
+        Continues a search to its end, with so many effects at most.
     effects : sequence of Effect or None
         Instead of the catalogue.
     max_effects : int
-        Effects added at most.
+        Largest number of effects to add.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
 
     Returns
     -------
     Progress
-        Finished. Effects of other final models that are about as likely stand in the classes of
-        those that are in their place here.
+        Finished. Effects of other final models that are about as likely are in the classes of the
+        effects that they would replace.
     """
     best = progress
     for first in followed(progress, numerics.policy):
@@ -276,7 +275,7 @@ def best_of_beam(
             continue
         if not leads_as_far(progress, first, roles, numerics, effects, callback):
             continue
-        callback(f"follow {first.effect} as the first effect instead")
+        callback(f"search again with {first.effect} as the first effect")
         other = _followed(progress, first, roles, numerics, follow, max_effects, callback)
         if other is not None and other.state.assembly.added:
             best = _better(best, other, numerics.policy, callback)
@@ -286,8 +285,8 @@ def best_of_beam(
 def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
     """First effects that were nearly as good as the one that was taken, the best first.
 
-    None where one effect alone led down to the noise. Those that the data could not tell from it
-    are looked at in its place by the review.
+    There is none where one effect alone left only noise. Effects that the data could not
+    distinguish from it are covered by the review.
     """
     opening, final = progress.rounds[0], progress.state
     taken = opening.accepted
@@ -336,14 +335,14 @@ def _followed(
         if result.share < numerics.policy.fair_share or not result.excludes_null():
             return None
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
-        reason += "; it is taken on trial, to be confirmed together with the next one"
+        reason += "; it is added provisionally, to be confirmed together with the next one"
     present = len(progress.state.assembly.added)
     few = progress.state.at_floor and not (opening.accepted and opening.accepted.absorbs)
     most = max(present, 2) if few else min(max(present + 1, 2), max_effects)
     begun = Round(
         opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
     )
-    # Of the notes only that on the roles holds for the other search too.
+    # Only the note on the roles applies to the other search too.
     notes = tuple(note for note in progress.notes if note == roles.description)
     found = follow(Progress(progress.first, after, (begun,), notes), most)
     if provisional and not _together_confirmed(found):
@@ -352,7 +351,7 @@ def _followed(
 
 
 def _together_confirmed(found: Progress) -> bool:
-    """Whether effects of which the first was refused by itself are confirmed together."""
+    """Whether effects are confirmed together of which the first alone was not confirmed."""
     if len(found.state.assembly.added) < 2:
         return False
     return fall_on_hold_out(*judged(found.first, found.state), _inflation(found)).confirms
@@ -361,12 +360,12 @@ def _together_confirmed(found: Progress) -> bool:
 def _better(
     best: Progress, other: Progress, policy: SearchPolicy, callback: ProgressCallback
 ) -> Progress:
-    """The better of two finished searches, with the other's effects in its classes if it is about
-    as likely."""
+    """The better of two finished searches; if both are about as likely, the other's effects join
+    its classes."""
     gap, scale = likelihood_gap(best, other)
     if set(best.state.assembly.added) == set(other.state.assembly.added):
         return best
-    if (best.state.at_floor and not other.state.at_floor) or speak_against(
+    if (best.state.at_floor and not other.state.at_floor) or contradicted(
         best.state, other.state, _inflation(best)
     ):
         return best
@@ -381,32 +380,32 @@ def _better(
 
 
 def _absorbs(found: Progress) -> bool:
-    """Whether a model has effects that take up a part of whatever is missing, and name no cause."""
+    """Whether a model has effects of absorbing families, which name no cause."""
     return any(step.effect.family in ABSORBING_FAMILIES for step in found.state.assembly.steps)
 
 
 def _with_notes(
     best: Progress, other: Progress, gap: float, callback: ProgressCallback
 ) -> Progress:
-    """The other search, which says what it stands instead of."""
+    """The other search, with a note on the effects that it replaces."""
     names, present = (
         " and ".join(effect for effect, _ in one.state.assembly.added) or "no effect"
         for one in (other, best)
     )
     callback(f"take {names} instead of {present}")
     way = f"falls by {gap:.3g}" if gap > 0 else f"rises by {-gap:.3g} only, and they name causes"
-    told = (
+    note = (
         f"instead of {present} the model has {names}: with unknowns counted (Schwarz 1978) the"
         f" weighted squared error on fitted runs {way}"
     )
-    return replace(other, notes=(*other.notes, told))
+    return replace(other, notes=(*other.notes, note))
 
 
 def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
-    """By how much less the other final model leaves, unknowns counted, and the scale of that.
+    """Advantage of the other final model in the penalised sum of squares, and its scale.
 
-    The scale is the dispersion of what the better one leaves times the inflation by the noise's
-    colour: one of them is a squared standard deviation.
+    The scale is the dispersion of the better model's residual times the inflation by coloured
+    noise. A gap of one scale is a squared standard deviation.
     """
     base = one.first.base()
     price, falls, worth = schwarz_price(base), [], []
@@ -425,9 +424,9 @@ def _inflation(found: Progress) -> float:
 
 
 def _with_classes(best: Progress, other: Progress) -> Progress:
-    """With the other model's effects in the classes of those that are in their place.
+    """The search with the other model's effects in the classes of those that they replace.
 
-    Effects that both models have stand in each other's place; the rest as they were added.
+    Effects that both models have correspond; the others correspond in the order of their addition.
     """
     ours, theirs = best.state.assembly.added, other.state.assembly.added
     left = [key for key in ours if key not in theirs]

@@ -1,12 +1,10 @@
 """A model with its drive and added effects, and the roles of the runs.
 
-Which runs are fitted and which are held out, and what is done where none is.
+An assembled model holds the declared equations, the channel that drives them and the effects added
+so far. Physical effects change the model in its own drive, sensor effects the channels of the
+driven model. The two are kept apart so that either can be added after the other.
 
-A model in the making: the declared equations, the channel that drives them, and the effects
-added so far.
-
-Effects of physics change the model in its own drive, sensor effects the channels of the driven one;
-both are kept apart so that either can be added after the other.
+The role of a run says whether it is fitted or held out.
 """
 
 from __future__ import annotations

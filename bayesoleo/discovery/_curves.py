@@ -1,12 +1,9 @@
 """Nonparametric curves: shapes, uncertainty, and parameters they absorb.
 
-What a curve without a name takes over from the model's parameters, and where it is not known.
-
-A smooth function of a quantity can do what a parameter of the same quantity does. Such directions
-are left to the parameter while the curve is estimated, by convention and not by the data: how much
-of the sum is the parameter's cannot be known, and its interval counts nothing of that.
-
-The shape of a nonparametric effect, with its uncertainty: what is shown instead of a name.
+A nonparametric effect is shown as a curve with its uncertainty. A smooth function of a quantity can
+produce the same change as a parameter of that quantity. While the curve is estimated, such
+directions are assigned to the parameter. This is a convention; the data do not determine the
+share of the parameter, and its interval does not include this uncertainty.
 """
 
 from __future__ import annotations

@@ -1,16 +1,12 @@
 r"""Errors of a prediction against the noise, by run and output.
 
-The error of a prediction, held against the noise: by run and output, and by role.
+All rounds of the search use the same noise: the smallest that any of its models supports.
 
-The same noise in all rounds: the least that any model of the search has borne out.
-
-Whether a residual has come down to what is expected of it.
-
-The squared ratio to the expected error is a sum of squares: of the noise's coefficients, which are
-many, and of what the unknowns' errors do, which may be one direction that rules all. Its mean is
-one; variance and skewness follow from the quadratic form, over runs that share their unknowns too,
-and a shifted :math:`\chi^2` variate with these three moments stands for it. Noise that is measured
-divides it, which makes it an F variate.
+A test decides whether a residual agrees with its expected error. The squared ratio of the two is a
+sum of squares of the noise's coefficients, which are many, and of the unknowns' errors, which may
+be dominated by one direction. Its mean is one. Its variance and skewness follow from the quadratic
+form, over all runs that share unknowns; the distribution is approximated by a shifted
+:math:`\chi^2` variate with these three moments. Division by a measured noise makes it an F variate.
 
 References
 ----------

@@ -1,21 +1,19 @@
 r"""Expected error of a run: its noise, and the uncertainty of the parameters.
 
-Whether what the unknowns' posterior does to a run is what its linearisation says.
-
-How large the error of a run is expected to be: by its noise, and by how well the unknowns are
-known.
-
-Let :math:`N` be the covariance of a run's noise, that of its inputs sent through the model
-included, :math:`J` its sensitivities, :math:`W` the weights of the estimator and :math:`C` the
-covariance that the estimator gives. Its estimates miss the truth by :math:`-C J' W e`, summed over
-the fitted runs, and by what the prior misses, so that their covariance is
+Let :math:`N` be the covariance of a run's noise, including that of its inputs propagated through
+the model, :math:`J` its sensitivities, :math:`W` the weights of the estimator and :math:`C` the
+covariance that the estimator states. The estimation error is :math:`-C J' W e`, summed over the
+fitted runs, plus the error of the prior, so that its covariance is
 
 .. math:: \Sigma = C + C \Big(\sum_r J_r' W N_r W J_r - \sum_r J_r' W J_r\Big) C,
 
-which is :math:`C` where the noise is white and of the size that the estimator found. A run that was
-not used is then off by :math:`N + J \Sigma J'`. A run that was fitted has lent some of its noise to
-the estimates and leaves :math:`N - J C J' W N - N W J C J' + J \Sigma J'`, in the simplest case
-:math:`N - J C J'`. So does a held-out run by the parameters of its own that are estimated on it.
+which equals :math:`C` where the noise is white and of the size that the estimator found. The error
+of a hold-out run has the covariance :math:`N + J \Sigma J'`. The estimates contain some of the
+noise of a fitted run, whose residual has the covariance
+:math:`N - J C J' W N - N W J C J' + J \Sigma J'`, in the simplest case :math:`N - J C J'`. The same
+holds for a hold-out run with respect to the by-run parameters that are estimated on it.
+
+Draws of the posterior check whether this linearisation holds.
 
 References
 ----------

@@ -1,15 +1,11 @@
 """Fits of an assembled model to runs, with masks and checks from other starts.
 
-Samples that do not count: they weigh nothing, and are bridged where whole periods are needed.
+A fit is the MBE, then the posterior mode, on a mesh fine enough not to influence them. Masked
+samples have no weight; they are interpolated where whole periods are needed.
 
-An estimate that ended where nobody expected it is looked for again from other starts.
-
-The equations of several resonances or contacts have several answers, and the nominal values may lie
-next to a wrong one. Such an answer gives itself away: it stands on a limit of a prior's support, or
-where the priors have next to no mass. Only then are other starts worth their time.
-
-Fit an assembled model to runs: MBE, then the posterior's mode, on a mesh fine enough not to
-matter.
+The equations of several resonances or contacts have several solutions, and the nominal values may
+lie next to a wrong one. A wrong solution usually lies at a limit of a prior's support, or where the
+priors have almost no mass. Only then is the time for other starts well spent.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Confirmation of an effect by runs that were not used.
+"""Confirmation of an effect by hold-out runs.
 
-By how much an effect lowers the squared error on runs that were not used, and how sure that is.
+An effect is confirmed if it lowers the squared error on runs that were not fitted. The uncertainty
+of this reduction decides whether it can be due to chance.
 
 References
 ----------
 McCullagh and Nelder (1989), Generalized Linear Models, section 4.5: dispersion. Theiler et al.
 (1992), Physica D 58, 77-94: a remainder with the same spectrum and random phases.
-
-Whether runs that were not used confirm an effect.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from bayesoleo.prediction._run_errors import input_columns
 
 @dataclass(frozen=True)
 class Fall:
-    """Fall of the weighted sum of squares on runs that were not used.
+    """Fall of the weighted sum of squares on hold-out runs.
 
     Parameters
     ----------
     value : float
         Sum over the runs, less the charge for parameters that were estimated on them.
     error : float
-        Standard error if the effect is not there: of the noise, what is left, and the parameters of
-        the model without it.
+        Standard error if the effect is absent: by the noise, the remaining model error and the
+        parameters of the model without it.
     expected : float
-        What it would be on average if the effect is exactly right.
+        Mean of the fall if the effect is exactly right.
     spread : float, optional
-        Standard error if the effect is there, its own parameters' included; by default the same.
+        Standard error if the effect is present, including its parameters; by default the same.
     policy : SearchPolicy
     """
 
@@ -54,25 +53,25 @@ class Fall:
 
     @property
     def scatter(self) -> float:
-        """Standard error if the effect is there."""
+        """Standard error if the effect is present."""
         return self.error if self.spread is None else self.spread
 
     @property
     def confirms(self) -> bool:
-        """Whether the fall exceeds its error as often as is asked for, and what one unknown that is
-        not there would explain as often."""
+        """Whether the fall is significant, and exceeds the fall that one superfluous unknown would
+        cause at the same significance."""
         enough = self.policy.confirming_errors
         return bool(self.value > max(enough * self.error, enough**2))
 
     @property
-    def speaks_against(self) -> bool:
-        """Whether the squared error rises by more than its error, as often as is asked for."""
+    def contradicts(self) -> bool:
+        """Whether the squared error rises significantly."""
         enough = self.policy.confirming_errors
         return bool(-self.value > enough * max(self.error, self.scatter))
 
     @property
     def undecided(self) -> bool:
-        """Whether these runs are unlikely to confirm even an effect that is real."""
+        """Whether these runs would probably not confirm even a real effect."""
         missed = stats.norm.isf(self.policy.missed_confirmation)
         least = self.policy.confirming_errors * self.error + missed * self.scatter
         return bool(self.expected < least)
@@ -82,9 +81,9 @@ class Fall:
         return self.expected / self.scatter**2 if self.scatter > 0 else 0.0
 
     def and_by(self, other: Fall) -> Fall:
-        """Both together, each weighted by what it would show of a real effect: by the expected fall
-        over the variance, which gives the test with most power. The larger weight is one. Runs
-        that the effect does not change, or that could not be solved, say nothing."""
+        """Both together, each weighted by the expected fall over its variance, which gives the
+        most powerful test. The larger weight is one. Runs that the effect does not change, or that
+        could not be solved, have no weight."""
         weights = np.array([one._weight for one in (self, other)])
         first, second = weights / max(weights.max(), 1e-300)
         return Fall(
@@ -100,7 +99,7 @@ class Fall:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value with its standard error, to as many digits as the error leaves."""
+    """A value with its standard error, to the significant digits that the error allows."""
     if not (np.isfinite(value) and np.isfinite(error) and error > 0):
         return f"{value:.3g} ± {error:.2g}"
     last = int(np.floor(np.log10(error))) - 1  # two digits of the error
@@ -112,27 +111,27 @@ def with_error(value: float, error: float) -> str:
 
 
 def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fall:
-    """Fall of the weighted sum of squares on held-out runs, and its standard error.
+    """Fall of the weighted sum of squares on hold-out runs, and its standard error.
 
     With predictions ``a`` and ``b`` the fall is ``sum w ((y - a)^2 - (y - b)^2)``. Noise with the
     covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
     ``4 d' w (1/w + B B') w d`` with ``d = b - a``; coloured noise multiplies the first part by the
-    inflation. What the model still leaves, beyond the noise, adds to it, and so do the errors of
-    the parameters: ``4 d' w J S J' w d`` with their sensitivities and covariance. Runs that could
-    not be solved in both states do not count.
+    inflation. The remaining model error adds to it, and so do the errors of the parameters:
+    ``4 d' w J S J' w d`` with their sensitivities and covariance. Runs that could not be solved in
+    both states do not count.
 
     Parameters
     ----------
     before, after : State
         Without and with the effect.
     inflation : float
-        Variance of the output's noise along what the effect changes, over that of white noise.
+        Variance of the output's noise along the change by the effect, over that of white noise.
 
     Returns
     -------
     Fall
-        Each parameter that only the model with the effect estimates on the runs themselves is
-        charged with what it takes of their noise on average.
+        The fall is reduced for each parameter that only the model with the effect estimates on
+        the runs themselves: by the noise that such a parameter absorbs on average.
     """
     fall = expected = variance = 0.0
     pulls = [np.zeros(len(state.fit.problem.names)) for state in (before, after)]
@@ -153,7 +152,7 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
 
 
 def _pull(state: State, prediction: Prediction, measured: State, change: Array) -> Array:
-    """By unknown of a fit, how its error moves the fall in one run: ``J' w d``, shape (l,)."""
+    """Derivative of the fall in one run by each unknown of a fit: ``J' w d``, shape (l,)."""
     predictor, names = prediction.predictor, state.fit.problem.names
     found, layout = np.zeros(len(names)), predictor.layout.names
     sensitivity = predictor.predict(prediction.vector)[0].sensitivity
@@ -164,14 +163,14 @@ def _pull(state: State, prediction: Prediction, measured: State, change: Array) 
         weight = measured.hold_errors.at(output, label).average.sigma ** -2
         along = sensitivity[b] @ (weight * change[b] * counts)
         for k, name in enumerate(names):
-            # What is estimated on the run itself follows what is wrong with the others.
+            # A parameter that is estimated on the run itself adapts to errors of the others.
             if name in layout and name in state.fit.model.parameters:
                 found[k] += along[layout.index(name)]
     return found
 
 
 def _known_to(state: State, pull: Array) -> float:
-    """Variance of what the errors of a fit's parameters do along a direction."""
+    """Variance along a direction by the errors of a fit's parameters."""
     covariance = state.fit.point.covariance
     if not np.isfinite(covariance).all():
         return 0.0
@@ -181,7 +180,7 @@ def _known_to(state: State, pull: Array) -> float:
 def _of_run(
     before: State, after: State, old: Prediction, new: Prediction, inflation: float
 ) -> tuple[float, float, float]:
-    """Fall in one run, what it is on average if the effect is right, and its variance."""
+    """Fall in one run, its mean if the effect is right, and its variance."""
     predictor, record = old.predictor, old.record
     columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
     fall = expected = noise = remainder = 0.0
@@ -210,9 +209,9 @@ def surrogate_variance(change: Array, left: Array) -> float:
     """Variance of ``change @ s`` over remainders ``s`` with the spectrum of ``left`` and random
     phases.
 
-    What still repeats scatters a fall: a curve that happens to run along it proves nothing. It is
-    taken to be spread as the noise is, but never to have more power than it shows where the effect
-    has any.
+    A repeating residual scatters the fall: an effect may follow it by chance. Its power is assumed
+    to be distributed like that of the noise, but limited to the observed power at the frequencies
+    of the effect.
 
     Parameters
     ----------
@@ -231,7 +230,7 @@ def confirmed(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> tuple[State | None, str]:
-    """The state with an estimated effect in, if runs that were not used confirm it, and why."""
+    """The state with an estimated effect, if the hold-out runs confirm it, and the reason."""
     if not np.isfinite(result.share):
         return None, f"{item.effect} could not be estimated"
     policy = numerics.policy
@@ -243,7 +242,7 @@ def confirmed(
             None,
             f"the posterior of {item.effect} does not exclude its null: {_on_fitted(result)}",
         )
-    callback(f"confirm {item.effect} on runs that were not used")
+    callback(f"confirm {item.effect} on hold-out runs")
     after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
@@ -251,15 +250,15 @@ def confirmed(
     if fall.error == 0.0:
         return None, f"{item.effect} cannot be confirmed: it changes no hold-out run that is solved"
     where = f"hold-out runs: the weighted squared error falls by {fall}"
-    # Halves of a run share whatever is odd in it. They show that a parameter of its own repeats,
-    # which is no news where that leaves more than noise.
+    # Halves of a run share its peculiarities. They confirm a by-run parameter in any case, which is
+    # no evidence where more than noise remains.
     alike = item.absorbs and not result.reached
-    able = fall.undecided and not fall.speaks_against and not alike
+    able = fall.undecided and not fall.contradicts and not alike
     halves = in_halves(roles) if able else None
     if halves is not None:
-        # What happens at the end of the stroke shows only in runs that get there.
+        # An effect at the end of the stroke shows only in runs that reach it.
         callback(
-            f"runs held out hardly show {item.effect}: confirm it on the other half of the periods"
+            f"hold-out runs hardly show {item.effect}: confirm it on the other half of the periods"
         )
         pair = _on_halves(state, after, halves, numerics)
         other = fall_on_hold_out(*pair, result.inflation)
@@ -267,19 +266,19 @@ def confirmed(
         where += f", which hardly shows it, and by {other} on the second half of fitted ones"
     if not fall.confirms:
         errors, alarms = policy.confirming_errors, 100 * policy.false_confirmation
-        asked = f"{errors:.2f} standard errors are asked for (false alarms {alarms:g} %)"
+        asked = f"{errors:.2f} standard errors are required (false alarms {alarms:g} %)"
         return None, f"{item.effect} does not lower the error on {where}; {asked}"
     return after, f"{_explains(item)} and lowers the error on {where}"
 
 
-def speak_against(one: State, other: State, inflation: float) -> bool:
-    """Whether runs that were not used speak against another model instead of one.
+def contradicted(one: State, other: State, inflation: float) -> bool:
+    """Whether hold-out runs contradict another model in the place of one.
 
     Parameters
     ----------
     one, other : State
     inflation : float
-        Variance of the noise along what tells them apart, over that of white noise.
+        Variance of the noise along the difference of the models, over that of white noise.
     """
     if not one.hold_errors.entries:
         return False
@@ -287,7 +286,7 @@ def speak_against(one: State, other: State, inflation: float) -> bool:
 
 
 def _on_fitted(result: Refit) -> str:
-    """By how much an estimate lowers the error on the runs that it was made from."""
+    """The reduction of the error on the fitted runs, as text."""
     # The fall is a non-central chi-square, of variance 2 k + 4 times its non-centrality.
     error = float(np.sqrt(result.inflation * (4.0 * max(result.fall, 0.0) + 2.0 * result.size)))
     fall = with_error(result.fall, error)
@@ -297,7 +296,7 @@ def _on_fitted(result: Refit) -> str:
 def _on_halves(
     before: State, after: State, halves: Roles, numerics: Numerics
 ) -> tuple[State, State]:
-    """Both models estimated on the first half of each fitted run and held against the second."""
+    """Both models estimated on the first half of each fitted run and compared on the second."""
     quick = replace(numerics, steps=after.fit.steps)
     old, new = (
         fit_state(state.assembly, halves, quick, start=state.fit.point.theta)
@@ -307,8 +306,8 @@ def _on_halves(
 
 
 def judged(before: State, after: State) -> tuple[State, State]:
-    """Both states as an effect is judged by them: where it brings parameters of single runs, with
-    each half of a run predicted by what the other half says, alike before and after."""
+    """Both states, prepared for the comparison. Where the effect has by-run parameters, each half
+    of a run is predicted from the other half, both with and without the effect."""
     pairs = []
     for old, new in zip(before.held_out, after.held_out, strict=True):
         if new.re_estimated > old.re_estimated:

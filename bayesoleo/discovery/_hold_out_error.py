@@ -1,15 +1,12 @@
 """Noise of a record, and the prediction of hold-out runs.
 
-The noise of a record: the same whatever the model, and never more than the residual bears out.
+Shared parameters keep their estimates in a hold-out run; by-run parameters are estimated on it.
 
-What the noise of an input does to a prediction is computed by sending its spectrum through the
-model. A model that differentiates its input makes much of it, and the spectrum between the input's
-harmonics may hold a rig's real motion, to which the output answers, or a converter's steps, instead
-of noise. So it counts only as far as the residual has the power for it, band by band: a residual is
-the sum of what the model lacks and of noise, and nowhere smaller than either.
-
-Predict runs that were not used: shared parameters stay, by-run parameters are estimated on the
-run itself.
+The noise of an input is propagated through the model by its spectrum. A model that differentiates
+its input amplifies this noise, and the spectrum between the harmonics of the input may contain real
+motion of the rig, which the output follows, or quantisation steps. A residual is the sum of model
+error and noise and is not smaller than either. The power of the residual therefore limits the
+propagated noise, band by band. The noise is the same for all models.
 """
 
 from __future__ import annotations

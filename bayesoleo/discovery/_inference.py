@@ -1,6 +1,4 @@
-"""From a fitted model to the density that is sampled: its error model, and what scatters between
-runs.
-"""
+"""Error model and run-to-run scatter of a fitted model, for posterior sampling."""
 
 from __future__ import annotations
 

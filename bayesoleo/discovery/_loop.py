@@ -1,13 +1,12 @@
 """The closed loop, and its verdict.
 
-What a search comes to in one word, and how sure the names are that it gives.
+The loop fits the model, searches for missing effects, adds the best and compares models until no
+further effect is found.
 
-An effect counts as found where the model predicts all runs down to what is expected, or where
-effects of physics explain nine tenths of what was missing. What varies by run, what repeats with
-the drive and curves without a name take up a part of whatever is missing; what they explain is no
+An effect counts as found if the model predicts all runs to within the expected error, or if
+physical effects explain nine tenths of the missing part. By-run parameters, forces that repeat with
+the drive and nonparametric curves absorb part of any model error. Their share is therefore no
 evidence that a cause was found.
-
-The closed loop: fit, look for what is missing, add it, compare, until nothing more is found.
 """
 
 from __future__ import annotations
@@ -49,13 +48,13 @@ def verdict_of(
     first, final : State
         The model as declared, and with all effects.
     policy : SearchPolicy
-        Its ``explained`` is the part of the excess that effects of physics must explain where more
-        than is expected is left.
+        Its ``explained`` is the part of the excess that physical effects must explain where the
+        errors exceed the expected ones.
     """
     if _as_expected(final):
         return schema.EFFECT_ADDED if final.assembly.added else schema.NOTHING_MISSING
     if final.too_quiet:
-        return schema.UNEXPLAINED  # by a noise that is too large all is explained
+        return schema.UNEXPLAINED  # too large a noise explains everything
     found = explained_by_physics(rounds, first, final) > policy.explained
     return schema.EFFECT_ADDED if found else schema.UNEXPLAINED
 
@@ -68,7 +67,7 @@ def certainty_of(final: State, certain: bool) -> str | None:
     final : State
         With all effects.
     certain : bool
-        Whether the data leave no doubt of its only effect.
+        Whether the data exclude all alternatives to its only effect.
     """
     steps = final.assembly.steps
     if not steps:
@@ -81,21 +80,21 @@ def certainty_of(final: State, certain: bool) -> str | None:
 
 
 def _as_expected(final: State) -> bool:
-    """Whether all errors are what is expected: less than chance allows is a fault of the noise, and
-    proves nothing."""
+    """Whether all errors are as expected. Errors that are smaller than chance allows show a wrong
+    noise and prove nothing."""
     return final.at_floor and not final.too_quiet
 
 
 def explained_by_physics(rounds: Sequence[Round], first: State, final: State) -> float:
-    """Part of the excess that effects of physics explain, of those that stayed.
+    """Part of the excess that the physical effects of the final model explain.
 
-    Each effect gets what the error fell by in the round that added it.
+    The share of an effect is the fall of the excess in the round that added it.
     """
     added = final.assembly.added
     whole = max(excess(first), 1e-300)
     if all(step.effect.family not in NO_CAUSE for step in final.assembly.steps):
         return (excess(first) - excess(final)) / whole if added else 0.0
-    # A round that replaced an effect begins without it, not where the round before it ended.
+    # A round that replaced an effect begins without that effect.
     return sum(
         (excess(item.before) - excess(item.after)) / whole
         for item in rounds
@@ -104,7 +103,7 @@ def explained_by_physics(rounds: Sequence[Round], first: State, final: State) ->
 
 
 def _is_physics(item: Round, added: Sequence[Added]) -> bool:
-    """Whether a round added an effect of physics that stayed."""
+    """Whether a round added a physical effect that is in the final model."""
     found = item.accepted
     if found is None or (found.effect, found.target) not in added:
         return False
@@ -112,37 +111,37 @@ def _is_physics(item: Round, added: Sequence[Added]) -> bool:
 
 
 def excess(state: State) -> float:
-    """Squared ratio to what is expected beyond one, of held-out runs where there are any."""
+    """Excess of the squared ratio to the expected error over one, of hold-out runs if any."""
     table = state.hold_errors if state.hold_errors.entries else state.fit_errors
     return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
 
 
-#: How a note begins that names parameters.
+#: Beginning of a note that lists parameters.
 ON_LIMIT = "at the limit of their prior's support"
-#: How a note begins of a declared model that was estimated from another start than its own.
-OTHER_OPTIMUM = "from its declared values the model's estimate ended in a lesser optimum, lower"
+#: Beginning of the note on a declared model that was estimated from another start than its own.
+OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
 
-#: How a note begins of parameters whose sign is not the declared one.
-OTHER_SIGN = "of the other sign than declared"
+#: Beginning of the note on parameters whose sign is not the declared one.
+OTHER_SIGN = "opposite in sign to the declared value"
 
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """Everything that happened.
+    """The course and the outcome of a search.
 
     Parameters
     ----------
     rounds : tuple of Round
-        The last one accepts nothing.
+        In order; the last one accepts no effect.
     first, final : State
         The model as declared, and with all effects that were added.
     roles : Roles
     notes : tuple of str
-        What a reader should know.
+        Remarks on the result, as sentences.
     complete : bool
-        Whether the search came to its end.
+        Whether the search was not stopped early.
     policy : SearchPolicy
-        By which it decided.
+        The numbers by which the search decided.
     """
 
     rounds: tuple[Round, ...]
@@ -165,7 +164,7 @@ class ClosedLoop:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Where each of them sits."""
+        """Places of the added effects in the model."""
         return tuple(target for _, target in self.final.assembly.added)
 
     @property
@@ -180,12 +179,12 @@ class ClosedLoop:
 
     @property
     def certain(self) -> bool:
-        """Whether the data leave no doubt of the one effect that was added.
+        """Whether the data exclude all alternatives to the one effect that was added.
 
-        It explains everything by itself - at the floor, nothing else significant - the data can
-        tell it from all others of the catalogue, and it is large enough that one which merely
-        resembles it would have left a significant remainder. Runs that were not used must have
-        confirmed it.
+        The effect must explain everything alone: the errors are at the noise floor and no other
+        effect is significant. The data must distinguish it from all other effects of the catalogue.
+        It must be so large that a merely similar effect would have left a significant remainder.
+        Hold-out runs must have confirmed it.
         """
         if not self.complete or self.final.too_quiet or not self.final.hold_errors.entries:
             return False
@@ -198,7 +197,7 @@ class ClosedLoop:
         if found.same or estimate is None:
             return False
         if found.score.option.candidate.family == FAMILY:
-            return False  # a function without a name has none to be certain of
+            return False  # a nonparametric function names no effect
         level, same = self.policy.significance, self.policy.same_cosine
         if any(item.p_value < level for item in last.ranking):
             return False
@@ -220,7 +219,7 @@ def close_loop(
     keep: Callable[[Progress], None] = lambda _: None,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
-    """Fit a model, and add the effects that it lacks one after the other.
+    """Fit a model and add the effects that it lacks, one after the other.
 
     Parameters
     ----------
@@ -235,15 +234,15 @@ def close_loop(
     seed : int
         For the correction for the search.
     max_effects : int
-        Effects added at most.
+        Largest number of effects to add.
     nonparametric : bool
-        Whether a smooth function may be added where no named effect explains what is left.
+        Whether a smooth function may be added where no named effect explains the residual.
     known : Progress, optional
-        Of the same search, stopped before: it goes on from there.
+        Progress of the same search, stopped before, from which it resumes.
     keep : callable
-        Given the progress once the model is estimated, and after each round.
+        Receives the progress once the model is estimated, and after each round.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
 
     Returns
     -------
@@ -281,7 +280,7 @@ class SearchOptions:
 
 
 def searched(known: Progress, search: SearchOptions) -> Progress:
-    """A search carried on to its end, its final effects looked at again."""
+    """Continue a search to its end, with a review of its final effects."""
     for left in reversed(range(search.max_effects + 1)):
         known = _rounds(known, search)
         roles = _with_noise(search.roles, known)
@@ -295,7 +294,7 @@ def searched(known: Progress, search: SearchOptions) -> Progress:
 
 
 def _rounds(known: Progress, search: SearchOptions) -> Progress:
-    """A search carried on until a round accepts nothing."""
+    """Continue a search until a round accepts no effect."""
     numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
     roles = _with_noise(search.roles, known)
     while not known.finished:
@@ -327,8 +326,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
 
 
 def _with_noise(roles: Roles, known: Progress) -> Roles:
-    """Runs with their noise as the models of a search have found it: what one that goes on has
-    found counts as well."""
+    """The roles with the smallest noise that the models of a search have found, including those
+    of a resumed search."""
     for found in (known.first, known.state):
         noise = least_noise(roles.measured, found.errors.record_noise)
         roles = replace(roles, measured=noise)
@@ -342,20 +341,20 @@ def _begun(
     notes = [] if roles.strategy == "declared" else [roles.description]
     state = fit_state(assembly, roles, numerics, progress=callback)
     if not state.at_floor:
-        callback("more is left than expected: try other starts")
+        callback("the residual exceeds the expected error: try other starts")
         start = better_start(state.fit, numerics)
         if start is not None:
             before = state.fit.point.objective
             state = fit_state(assembly, roles, numerics, start=start, progress=callback)
             notes.append(
-                f"{OTHER_OPTIMUM} by {state.fit.point.objective - before:.3g} in log density: look"
-                " whether the declared values and priors are what is meant"
+                f"{OTHER_OPTIMUM} by {state.fit.point.objective - before:.3g} in log density: check"
+                " the declared values and priors"
             )
     return Progress(state, state, notes=tuple(notes))
 
 
 def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
-    """What a search has found, with what a reader should know of its final model.
+    """The result of a search, with remarks on its final model.
 
     Parameters
     ----------
@@ -371,8 +370,8 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += state.too_quiet
     if not state.at_floor:
         notes.append(
-            "intervals count independent noise only: while an error remains that repeats, they are"
-            " too narrow"
+            "intervals include independent noise only: they are too narrow while a repeating error"
+            " remains"
         )
     return ClosedLoop(
         progress.rounds,
@@ -389,11 +388,11 @@ def _limit(steps: Sequence[AddedEffect], rounds: int, max_effects: int) -> str:
     """Why a round may only rank; empty where it may add an effect."""
     added = len(steps)
     if max_effects == 0:
-        return "effects were to be ranked only, and none added"
+        return "effects were to be ranked only, not added"
     if any(step.effect.family == FAMILY for step in steps):
-        return "an effect without a name was added: what is left may be what its splines leave"
+        return "a nonparametric effect was added: the residual may be the error of its splines"
     if added >= max_effects:
-        return f"as many effects as allowed, {max_effects}, have been added"
+        return f"the largest allowed number of effects, {max_effects}, has been added"
     if rounds > 2 * max_effects:
         return f"effects were added and removed again for {rounds} rounds"
     return ""
@@ -405,11 +404,11 @@ def _ratios(state: State) -> str:
         for role, table in state.by_role.items()
         for output, values in table.items()
     ]
-    return "ratio to what is expected: " + ", ".join(parts)
+    return "ratio to the expected error: " + ", ".join(parts)
 
 
 def _turned(first: ModelFit, final: ModelFit) -> list[str]:
-    """Parameters that came out with the other sign than they were declared with."""
+    """A note on parameters that are opposite in sign to their declared values."""
     turned, least = [], final.policy.opposite_sign
     for name, value, sd in zip(final.problem.names, final.point.theta, final.point.sd, strict=True):
         declared = first.model.parameters.get(name)
@@ -417,7 +416,7 @@ def _turned(first: ModelFit, final: ModelFit) -> list[str]:
             turned.append(f"{name} = {value:.3g}")
     if not turned:
         return []
-    return [f"{OTHER_SIGN}: {', '.join(turned)}; look at the signs of equations and channels"]
+    return [f"{OTHER_SIGN}: {', '.join(turned)}; check the signs of equations and channels"]
 
 
 def _warnings(fit: ModelFit) -> list[str]:

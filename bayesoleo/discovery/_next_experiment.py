@@ -1,4 +1,4 @@
-"""Which run, among those that the rig can do, best tells rival models apart."""
+"""Design of the next run: the feasible run that best separates rival models."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BEYOND_LIMITS = "an output beyond its limits"
 
 @dataclass(frozen=True)
 class ProposedRun:
-    """A run and how well it would tell the rivals apart.
+    """A run and how well it would separate the rivals.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class ProposedRun:
         Of the driving channel, SI.
     separation : Separation
     label : str
-        Of a run that was made, and would be repeated; empty otherwise.
+        Label of an existing run that would be repeated; empty otherwise.
     """
 
     frequency: float
@@ -56,7 +56,7 @@ class ProposedRun:
 
 @dataclass(frozen=True)
 class Proposals:
-    """What to measure next to tell rival models apart.
+    """Proposed runs to distinguish rival models.
 
     Parameters
     ----------
@@ -65,11 +65,11 @@ class Proposals:
     drive : str
         The channel that moves.
     limits : Limits
-        What the rig can do.
+        Limits of the rig.
     trials : tuple of ProposedRun
-        Runs that were not made, the best first.
+        New runs, the best first.
     repeats : tuple of ProposedRun
-        Each run that was made, were it made once more.
+        Each existing run, if repeated.
     left_out : mapping of str to int
         Runs without a prediction by reason.
     policy : SearchPolicy
@@ -84,7 +84,7 @@ class Proposals:
     policy: SearchPolicy = SearchPolicy()
 
     def shortlist(self, count: int = 5) -> tuple[ProposedRun, ...]:
-        """The best run at each frequency, the best first: neighbours on a grid say the same."""
+        """The best run at each frequency, the best first; neighbours on the grid are similar."""
         best: dict[float, ProposedRun] = {}
         for trial in self.trials:
             best.setdefault(trial.frequency, trial)
@@ -92,7 +92,7 @@ class Proposals:
 
     @property
     def best_repeat(self) -> ProposedRun | None:
-        """The run that was made whose repetition would tell most; None if none was solved."""
+        """The existing run with the most informative repetition; None if none was solved."""
         return max(self.repeats, key=lambda trial: trial.separation.information, default=None)
 
     @property
@@ -115,22 +115,22 @@ def propose_runs(
     *,
     jobs: int | None = None,
 ) -> Proposals:
-    """Rank the runs that a rig can do by how well they tell rival models apart.
+    """Rank the feasible runs by how well they separate rival models.
 
-    Each rival was estimated from the runs that there are, and foresees a new one with what these
-    leave unknown of its parameters. The noise of the new run is that of the others, widened where
-    an error remains that no rival explains.
+    Each rival was estimated from the existing runs and predicts a new one with the remaining
+    uncertainty of its parameters. The noise of the new run is that of the others, scaled by the
+    best rival's ratio to noise.
 
     Parameters
     ----------
     rivals : sequence of Rival
         Two or more.
     records : sequence of Record
-        All runs that there are.
+        All existing runs.
     errors : ErrorTable
-        What the best rival leaves, and the noise.
+        Errors of the best rival, and the noise.
     limits : Limits, optional
-        What the rig can do; by default what it did.
+        Limits of the rig; by default those of the existing runs.
     jobs : int, optional
         Threads.
 
@@ -141,8 +141,8 @@ def propose_runs(
     Raises
     ------
     InputError
-        If there are fewer than two rivals, runs are transient, or the model has several inputs,
-        so that it is not clear what a new run would be.
+        If there are fewer than two rivals, a run is transient, or the model has several inputs,
+        so that a new run is not defined.
     """
     drive, policy = drive_of(rivals, records), rivals[0].fit.policy
     outputs = rivals[0].fit.predictor.outputs
@@ -165,7 +165,7 @@ def propose_runs(
 
 @dataclass(frozen=True)
 class _Judge:
-    """Foresees a run, planned or made, with all rivals, and tells how well it separates them."""
+    """Predicts a planned or an existing run with all rivals, and computes their separation."""
 
     rivals: tuple[Rival, ...]
     known: tuple[Knowledge, ...]
@@ -175,7 +175,7 @@ class _Judge:
     noise: Mapping[str, float]
 
     def __call__(self, run: Planned | Record) -> ProposedRun | str:
-        """The trial, or why there is none."""
+        """The trial, or the reason why there is none."""
         record, outputs = self._blank(run), self.rivals[0].fit.predictor.outputs
         pairs = zip(self.rivals, self.known, strict=True)
         found = [
@@ -194,7 +194,7 @@ class _Judge:
         return ProposedRun(run.frequency, move.mean, move.amplitude, separation, run.label)
 
     def _blank(self, run: Planned | Record) -> Record:
-        """The run without its answers; a planned one under the conditions of the nearest made."""
+        """The run without its outputs; a planned one has the conditions of the nearest run."""
         outputs = self.rivals[0].fit.predictor.outputs
         if isinstance(run, Record):
             return blank_record(run, run.frequency, self.drive, run.harmonics[self.drive], outputs)
@@ -210,11 +210,11 @@ def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
     Raises
     ------
     InputError
-        If a run that was not made cannot be foreseen by them.
+        If the rivals cannot predict a new run.
     """
     if len(rivals) < 2:
-        hint = "name two or more effects that might be what is missing"
-        raise ModelError("fewer than two rivals to tell apart", value=len(rivals), hint=hint)
+        hint = "name two or more effects that may be missing"
+        raise ModelError("fewer than two rivals", value=len(rivals), hint=hint)
     check_periodic(records)
     channels = {
         name for rival in rivals for name in rival.fit.model.inputs if name in records[0].samples
@@ -223,15 +223,15 @@ def drive_of(rivals: Sequence[Rival], records: Sequence[Record]) -> str:
     driving = sorted(channels - outputs)
     if len(driving) != 1:
         raise ModelError(
-            "what to measure next is foreseen for models with one input only",
+            "the next run can be proposed for models with one input only",
             value=driving,
-            hint="with several measured inputs it is not clear what they would be in a new run",
+            hint="several measured inputs are not defined in a new run",
         )
     return driving[0]
 
 
 def check_periodic(records: Sequence[Record]) -> None:
-    """Raise where a run is a transient, whose like is not described by a few numbers.
+    """Raise where a run is a transient, because a few numbers do not describe a new transient.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def check_periodic(records: Sequence[Record]) -> None:
     transient = [record.label for record in records if not record.periodic]
     if transient:
         raise CampaignError(
-            "what to measure next is foreseen for periodic runs only",
+            "the next run can be proposed for periodic runs only",
             run=transient[0],
             key="kind",
             value="transient",
@@ -252,8 +252,8 @@ def check_periodic(records: Sequence[Record]) -> None:
 def expected_noise(errors: ErrorTable) -> dict[str, float]:
     """Noise of a new run's average at each of the points compared, by output, SI.
 
-    The median over the runs of the standard error of their averages, brought to these points, times
-    the ratio of what repeats to that noise where it is above one.
+    The median over the runs of the standard error of their averages, converted to these points,
+    times the ratio of the repeating error to that noise where it is above one.
     """
     found = {}
     for output in errors.outputs:
@@ -264,7 +264,7 @@ def expected_noise(errors: ErrorTable) -> dict[str, float]:
 
 
 def _at_points(entry: RunError) -> float:
-    """Noise of an averaged residual at one of so many points, the input's left out."""
+    """Noise of an averaged residual at one of the points, without that of the input."""
     own = entry.average.noise if entry.spectrum is None else entry.spectrum.noise
     return float(own * np.sqrt(POINTS / entry.coefficients))
 
@@ -276,7 +276,7 @@ def _input_variance(records: Sequence[Record], drive: str) -> float:
 
 
 def _distance(record: Record, run: Planned, drive: str) -> float:
-    """How far a run that was made is from one that was not: it gives the conditions."""
+    """Distance of an existing run from a planned one, whose conditions the nearest run gives."""
     mean = Motion.of(record, drive).mean
     apart = abs(mean - run.mean) / run.amplitude if run.amplitude else 0.0
     return float(apart + abs(np.log(record.frequency / run.frequency)))
@@ -300,7 +300,7 @@ def _reach(trials: Sequence[ProposedRun], count: int) -> Array:
 def _ranked(
     trials: Sequence[ProposedRun], count: int, policy: SearchPolicy
 ) -> tuple[ProposedRun, ...]:
-    """By information; where that is all there is to know, by the pair that is separated least."""
+    """Sorted by information; between equal runs by the separation of the weakest pair."""
     first, second = np.triu_indices(count, 1)
     can = _reach(trials, count)[first, second] >= policy.separable
 

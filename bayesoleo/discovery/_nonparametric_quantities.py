@@ -1,12 +1,10 @@
 """Quantities along the motion, and the response of outputs to a small force.
 
-The quantities of a model along its estimated motion, at any phase of any run.
+Quantities of the model are evaluated along its estimated motion, at any phase of any run.
 
-How outputs answer to a small term of any course in a balance.
-
-A score asks for the derivative of the outputs by each coefficient of a spline. The coefficient
-multiplies a function of the *present* motion, which is known: so the term is given as a further
-input, and one model serves for all functions of all quantities.
+A score needs the derivative of the outputs by each coefficient of a spline. The coefficient
+multiplies a function of the *present* motion, which is known. The term is therefore a further
+input, and one model serves all functions of all quantities.
 """
 
 from __future__ import annotations

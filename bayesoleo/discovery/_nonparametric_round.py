@@ -1,13 +1,12 @@
-"""The end of a round that found no name: let a smooth function of one or two quantities explain
-what is left, and say which named effects come closest to it.
+"""A nonparametric round: a smooth function explains the residual where no named effect does.
 
-Named effects go first, one after the other. Two answers compete with what was found so far: the
-function beside the named effects, if they left something, and the function *instead* of them. A
-named effect may have been no more than the nearest to what is in the data, and several together may
-come down to the noise where one law of the same quantities is what they are a part of. The weighted
-sum of squares decides, less the logarithm of the number of averaged values for each unknown
-(Schwarz 1978, Annals of Statistics 6(2)), and where that is not decisive no name is kept; then the
-runs that were not used decide, as for every effect.
+Named effects are tried first, one after the other. Two models then compete with the present one:
+the smooth function beside the named effects, if they left a residual, and the function *instead* of
+them. A named effect may only be the closest to the true one, and several named effects together may
+reach the noise although one law of the same quantities is the cause. The weighted sum of squares
+plus the logarithm of the number of averaged values for each unknown decides (Schwarz 1978, Annals
+of Statistics 6(2)). Where this is not decisive, no named effect is kept. The hold-out runs then
+decide, as for every effect. The named effects closest to the function are reported with it.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from scipy import stats
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
-from bayesoleo.discovery._hold_out_confirmation import confirmed, speak_against
+from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
 from bayesoleo.discovery._nonparametric_quantities import ranges
 from bayesoleo.discovery._nonparametric_search import CurveSearch, Tried, closest, search
 from bayesoleo.discovery._policy import SearchPolicy
@@ -58,28 +57,28 @@ def with_nonparametric(
     room: bool = True,
     callback: ProgressCallback,
 ) -> Round:
-    """A round that accepted nothing, with a nonparametric effect where one explains what is left.
+    """A round that accepted no effect, with a nonparametric effect if one explains the residual.
 
     Parameters
     ----------
     outcome : Round
-        Accepted nothing.
+        It accepted no effect.
     first : Round
-        Of the same loop: its model has none of the effects that were added.
+        The first of the same loop: its model has none of the added effects.
     roles : Roles
         Runs.
     numerics : Numerics
         Scheme, threads.
     room : bool
-        Whether one more effect may be added; else one may only stand instead of others.
+        Whether one more effect may be added; else a function may only replace effects.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
 
     Returns
     -------
     Round
-        Where a function is confirmed it is the accepted effect, first in the ranking. Where it
-        stands instead of effects added before, the new state has none of them.
+        A confirmed function is the accepted effect, first in the ranking. If it replaces earlier
+        effects, the new state has none of them.
     """
     state, policy = outcome.before, numerics.policy
     steps = state.assembly.steps
@@ -88,14 +87,14 @@ def with_nonparametric(
     if nonparametric >= policy.curves or (not named and (state.at_floor or not room)):
         return outcome
     if not room and len(steps) < policy.fewest_replaced:
-        return outcome  # named ones had no chance to come together
-    # At the floor nothing is left that a function could explain but noise.
+        return outcome  # named effects could not be combined
+    # At the noise floor a function could explain noise only.
     beside = room and not state.at_floor
     alone = _stands_by_itself(first, policy)
     instead = named and (not alone or _several_in_one_balance(steps, policy))
     if not (beside or instead):
         return outcome
-    callback("look for an effect without a name")
+    callback("look for a nonparametric effect")
     chances = []
     if not state.at_floor:
         found = _Chance.at(state, outcome, numerics)
@@ -105,7 +104,7 @@ def with_nonparametric(
         if beside:
             chances.append(found)
     if instead:
-        # The present model moves as was measured; one with less in it may not get as far.
+        # The present model moves as measured; a model without its effects may have a smaller range.
         also = ranges(state.fit, state.assembly, first.before.assembly.native)
         chances.append(_Chance.at(first.before, first, numerics, also))
     return _decided(outcome, chances, roles, numerics, callback)
@@ -118,10 +117,10 @@ def _decided(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> Round:
-    """The round with the best function in that the runs not used confirm, or why there is none."""
+    """The round with the best function that the hold-out runs confirm, or the reason for none."""
     reasons, common = [outcome.reason], chances[-1].base
-    # One name that leaves noise alone is no sum of names that a single law may be behind: then the
-    # more likely of the two stands.
+    # A single named effect that leaves only noise is no sum of effects with a common law as their
+    # cause: the more likely model of the two is then taken.
     alone = outcome.before.at_floor and len(outcome.before.assembly.steps) == 1
     policy = numerics.policy
     favour = 0.0 if alone else policy.decisive
@@ -137,11 +136,10 @@ def _decided(
 
 
 def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
-    """Answers that are better than what was found so far, the best first.
+    """Answers that are better than the present model, the best first.
 
-    What was found so far competes too: a function that explains less does not replace it. All are
-    judged by the same noise. What an answer leaves of a transient counts as noise that is not
-    white, and what a worse one leaves is no noise: so by that of the answer that leaves least.
+    All are compared with the same noise. The residual of a transient counts as coloured noise. The
+    residual of a worse answer contains model error, so that the smallest inflation is used.
     """
     least = min((item.refit.inflation for item in answers), default=1.0)
     merits = [merit(item.refit, instead=item.instead, inflation=least) for item in answers]
@@ -150,8 +148,8 @@ def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
 
 
 def _stands_by_itself(first: Round, policy: SearchPolicy) -> bool:
-    """Whether the first effect explained nearly all of the excess alone; one that takes up a part
-    of whatever is missing does so only where it left nothing but noise."""
+    """Whether the first effect explained nearly all of the excess alone. An effect of an absorbing
+    family counts only if it left only noise."""
     found = first.accepted
     if found is None or found.gain < policy.own_right:
         return False
@@ -159,8 +157,8 @@ def _stands_by_itself(first: Round, policy: SearchPolicy) -> bool:
 
 
 def _several_in_one_balance(steps: Sequence[AddedEffect], policy: SearchPolicy) -> bool:
-    """Whether names came together in a balance, where one function of its quantities may be what
-    all of them are a part of."""
+    """Whether a balance has several named effects, which one function of its quantities may
+    explain together."""
     places = [step.target for step in steps if step.effect.family not in ABSORBING_FAMILIES]
     return any(places.count(place) >= policy.fewest_replaced for place in places)
 
@@ -183,18 +181,18 @@ class _Chance:
         numerics: Numerics,
         also: Mapping[str, Axis] | None = None,
     ) -> _Chance:
-        """The functions that a model's remainder asks for; `also` stands for one without names."""
+        """The functions for a model's residual; with ``also`` they replace its named effects."""
         base = state.base()
         found = search(base, state.assembly, numerics.jobs, also)
         return cls(state, base, found, outcome, also is not None)
 
     def answers(self, k: int, merit: Merit, numerics: Numerics) -> list[_Answer]:
-        """The function that does best but for ``k`` others, estimated; none where there are fewer.
+        """The function of rank ``k`` from zero, estimated; none where there are fewer.
 
-        The score says which, by the same measure as estimates are judged. It says how fine, too,
-        where the model is near to the data; a model without the names is far from them, and a step
-        from there describes a curve badly: pieces are cut finer as long as the estimate explains
-        significantly more.
+        The score ranks functions by the criterion that also judges estimates. If the model is close
+        to the data, the score also gives the number of pieces. A model without the named effects is
+        far from the data, where linearisation is poor: there the number of pieces increases as long
+        as the estimate explains significantly more.
         """
         price = float(np.log(max(self.base.noise, 2.0)))
         leading = self.search.leading(numerics.policy.curves_tried)
@@ -218,7 +216,7 @@ class _Chance:
 
 
 def _is_better(fine: _Answer, coarse: _Answer) -> bool:
-    """Whether finer pieces explain significantly more, and come near to what was found so far."""
+    """Whether finer pieces explain significantly more and come close to the present model."""
     least = min(fine.refit.inflation, coarse.refit.inflation)
     gained = (fine.refit.fall - coarse.refit.fall) / least
     more = fine.refit.size - coarse.refit.size
@@ -227,7 +225,7 @@ def _is_better(fine: _Answer, coarse: _Answer) -> bool:
 
 
 def _goes_on(coarse: float, fine: float, p_value: float, policy: SearchPolicy) -> bool:
-    """Whether to go on to finer pieces, by merits and the probability of the fall by noise."""
+    """Whether to try finer pieces, by the merits and the probability of the fall by noise."""
     if not np.isfinite(coarse):
         return True
     if fine <= 0.0:
@@ -244,12 +242,12 @@ def _merit(
     reference: Base,
     favour: float,
 ) -> float:
-    """What a function is worth beyond what was found so far; one that stands instead of names needs
-    none of them, and is favoured by so much."""
+    """Gain of a function over the present model in Schwarz's criterion. A function that replaces
+    named effects needs none of their unknowns and has the advantage ``favour``."""
     gained = fall_from(reference, own.fit) - fall_from(reference, present)
     values = max(reference.noise, 2.0)  # in noise units: the number of averaged values
     more = len(own.fit.problem.names) - len(present.problem.names)
-    # What noise of one colour leaves scatters together: of so many values as many less are news.
+    # In coloured noise fewer values are independent; the inflation divides the gain accordingly.
     merit = gained / inflation - more * float(np.log(values))
     return merit + favour if instead else merit
 
@@ -257,41 +255,43 @@ def _merit(
 def _accepting(
     outcome: Round, answer: _Answer, roles: Roles, numerics: Numerics, callback: ProgressCallback
 ) -> tuple[Round, str]:
-    """The round with the answer accepted, if it is confirmed, and why."""
+    """The round with the answer accepted if it is confirmed, and the reason."""
     result = answer.refit
     near = closest(result.contribution, [item.score for item in answer.ranking])
     gain = min(max(result.share, 0.0), 1.0) if np.isfinite(result.share) else 0.0
-    told_apart = {" @ ".join(it.score.option.key) for it in answer.ranking if _told(result, it)}
+    distinct = {
+        " @ ".join(it.score.option.key) for it in answer.ranking if _distinguished(result, it)
+    }
     same = tuple(
         name.split(" @ ")[0]
         for name, cosine in near
-        if cosine > 0 and cosine**2 > numerics.policy.same_cosine and name not in told_apart
+        if cosine > 0 and cosine**2 > numerics.policy.same_cosine and name not in distinct
     )
     item = Ranked(result.score, answer.search.p_value, gain, True, same, result, near)
     after, reason = confirmed(answer.state, item, result, roles, numerics, callback)
     if after is None:
         return outcome, reason
     if outcome.before.at_floor and not after.at_floor:
-        return outcome, f"{item.effect} leaves more than the effects that have names"
-    if answer.instead and speak_against(outcome.before, after, result.inflation):
-        return outcome, f"{item.effect} predicts runs that were not used worse than the names do"
+        return outcome, f"{item.effect} leaves more than the named effects"
+    if answer.instead and contradicted(outcome.before, after, result.inflation):
+        return outcome, f"{item.effect} predicts hold-out runs worse than the named effects"
     if answer.instead:
         before = [step.effect.id for step in outcome.before.assembly.steps]
-        reason += f", and stands instead of {' and '.join(before)}: they were no more than near it"
+        reason += f", and replaces {' and '.join(before)}, which only resembled it"
     ranking = (item, *outcome.ranking)
     return replace(outcome, ranking=ranking, accepted=item, after=after, reason=reason), reason
 
 
-def _told(own: Refit, other: Ranked) -> bool:
-    """Whether the data tell a function from a name that does nearly the same: by the name's
-    estimate where there is one."""
+def _distinguished(own: Refit, other: Ranked) -> bool:
+    """Whether the data distinguish a function from a similar named effect, by the estimate of the
+    named effect where there is one."""
     if other.refit is not None:
         return not own.resembles(other.refit)
     return own.outdoes(other.score)
 
 
 def nonparametric_notes(rounds: Sequence[Round]) -> list[str]:
-    """What is to be said of effects that were added without a name."""
+    """Remarks on the nonparametric effects that were added, with the most similar named effects."""
     found = []
     for entry in rounds:
         item = entry.accepted
@@ -299,5 +299,5 @@ def nonparametric_notes(rounds: Sequence[Round]) -> list[str]:
             continue
         near = ", ".join(f"{effect} (cosine {cosine:.2f})" for effect, cosine in item.closest)
         text = f"{item.effect} @ {item.target} is no named effect"
-        found.append(text + (f"; the named ones most like it: {near}" if near else ""))
+        found.append(text + (f"; the most similar named effects: {near}" if near else ""))
     return found

@@ -1,18 +1,13 @@
 """Search for a nonparametric effect: a smooth function of one or two quantities.
 
-What of a smooth function the data know beside the present parameters.
+Every quantity of the model is tried in every balance, with splines of several resolutions, by the
+score that also ranks named effects. More pieces always explain more. The criterion is therefore the
+probability that noise alone explains as much with as many coefficients (a chi-square of their
+number), times the number of functions tried.
 
-A function is a sum of splines. Some of them the data do not see, and some combinations of the
-others the present parameters can do as well. What is left are directions of its own; those splines
-that they do not need depend on the others, so that no prior has to hold apart what the data cannot.
-
-Look for an effect without a name: the smooth function of one or two quantities that explains
-what no named effect does.
-
-Every quantity of the model is tried in every balance, with splines of several finenesses, by the
-score that ranks named effects too. More pieces always explain more; the probability that noise
-alone would explain as much with as many coefficients decides (a chi-square of their number), times
-the number of functions that were tried.
+The data do not determine some of the splines, and the present parameters can produce some
+combinations of the others. Only the remaining directions are estimated; the other splines are made
+to depend on them, so that no prior has to separate directions that the data cannot.
 """
 
 from __future__ import annotations

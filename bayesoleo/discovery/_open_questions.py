@@ -1,10 +1,6 @@
 """Rival models that the data leave undecided, and the runs that would decide.
 
-Which models a round of the search leaves standing, and which it leaves open.
-
-What a closed loop leaves to be told apart, and the runs that would.
-
-What to measure next, as the summary and the tree of a result hold it.
+The summary and the result tree report both.
 """
 
 from __future__ import annotations
@@ -36,11 +32,11 @@ from bayesoleo.prediction._records import Record
 
 
 def standing(item: Round, *, policy: SearchPolicy = SearchPolicy()) -> tuple[Ranked, ...]:
-    """Candidates that a round leaves to be told apart, the best first.
+    """Candidates of a round that remain possible, the best first.
 
-    Where an effect was accepted, it and those that the data cannot tell from it; else those that
-    are significant and explain a part of the excess, what merely varies from run to run left out.
-    Fewer than two are no question.
+    If an effect was accepted, these are the effect and those that the data cannot distinguish from
+    it. Else they are the significant effects that explain a part of the excess, without absorbing
+    families. The result is empty if fewer than two remain.
     """
     if item.accepted is not None:
         names = set(item.accepted.same)
@@ -128,26 +124,26 @@ def label(one: Ranked, among: Sequence[Ranked]) -> str:
     return f"{one.effect} @ {one.target}" if several else one.effect
 
 
-#: Why effects are to be told apart.
+#: Reasons to distinguish effects.
 ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
 
 
 @dataclass(frozen=True)
 class Question:
-    """Effects to be told apart, with the runs that would tell most.
+    """Effects that the data leave undecided, with the runs that would best distinguish them.
 
     Parameters
     ----------
     number : int
-        Of the round, from 1.
+        Number of the round, from 1.
     kind : {"indistinguishable", "open", "asked"}
         Whether the round accepted one of them, accepted none, or the user named them.
     rivals : tuple of str
         The effects.
     proposals : Proposals or None
-        ``None`` where no run can be foreseen.
+        ``None`` where no run can be predicted.
     note : str
-        Why not, or which of the effects were left out.
+        The reason, or the effects that were left out.
     """
 
     number: int
@@ -165,7 +161,7 @@ def questions_of(
     effects: Sequence[str] = (),
     callback: ProgressCallback = lambda _: None,
 ) -> tuple[Question, ...]:
-    """What each round leaves to be told apart.
+    """The effects that each round leaves undecided, with proposed runs.
 
     Parameters
     ----------
@@ -177,9 +173,9 @@ def questions_of(
     numerics : Numerics
         Scheme, threads.
     effects : sequence of str, optional
-        These effects of the last round instead.
+        Effects of the last round to distinguish instead.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
     """
     records = [*loop.roles.fitted, *loop.roles.held_out]
     records = list({record.label: record for record in records}.values())
@@ -189,7 +185,7 @@ def questions_of(
         if effects and not last:
             continue
         if item.accepted and (item.accepted.effect, item.accepted.target) not in stayed:
-            continue  # what was taken out again needs no telling from others
+            continue  # the effect was removed again
         chosen = named(item, effects) if effects else standing(item, policy=numerics.policy)
         if chosen:
             kind = ASKED if effects else OPEN if item.accepted is None else ALIKE
@@ -208,9 +204,9 @@ def _answer(
     callback: ProgressCallback,
 ) -> Question:
     names = tuple(label(one, chosen) for one in chosen)
-    callback(f"what would tell {', '.join(names)} apart")
+    callback(f"look for a run that distinguishes {', '.join(names)}")
     try:
-        # Before anything is estimated.
+        # A campaign without a possible next run fails before rivals are estimated.
         drive_of([Rival("", item.before.fit)] * 2, records)
         rivals, failed = rivals_of(item, chosen, numerics)
         note = "; ".join(f"{name} could not be estimated: {why}" for name, why in failed.items())
@@ -228,7 +224,7 @@ def _answer(
 
 
 def _left(item: Round, best: Rival, numerics: Numerics) -> ErrorTable:
-    """What the best rival leaves in the fitted runs."""
+    """Errors of the best rival on the fitted runs."""
     if item.after is not None:
         return item.after.fit_errors
     predictions = predict_fitted(best.fit)
@@ -297,7 +293,7 @@ def _trial(found: Proposals, trial: ProposedRun) -> dict[str, Any]:
 
 
 def proposals_group(questions: Sequence[Question], unit: str) -> dict[str, xr.Dataset]:
-    """The group ``proposal``: how well runs over the rig's range would tell rivals apart.
+    """The group ``proposal``: how well runs over the rig's range would separate rivals.
 
     Parameters
     ----------

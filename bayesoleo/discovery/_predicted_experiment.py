@@ -1,24 +1,20 @@
-"""Runs that a rig can do, their predictive distributions, and how well they separate rivals.
+"""Feasible runs, their predictive distributions, and how well they separate rivals.
 
-What a rig can do: amplitude, frequency and mean of the motion that it imposes, and how far it
-and the specimen may go.
+The rig limits the amplitude, frequency and mean of the imposed motion, and the range of the rig and
+the specimen.
 
-How well one experiment tells rival models apart, from what each of them foresees of it.
-
-Rival ``i`` foresees the outputs as normal, ``N(m_i, I + A_i' A_i)`` in units of the noise: noise of
-the samples, and what the runs made so far leave unknown of its parameters. If ``i`` is true, the
-logarithm of the Bayes factor against ``j`` is expected to be the Kullback-Leibler divergence
+Rival ``i`` predicts the outputs as normal, ``N(m_i, I + A_i' A_i)`` in units of the noise: the
+noise of the samples plus the remaining uncertainty of its parameters. If ``i`` is true, the
+expected logarithm of the Bayes factor against ``j`` is the Kullback-Leibler divergence
 
     KL(i, j) = [tr(S_j^-1 S_i) - n + d' S_j^-1 d + ln(|S_j| / |S_i|)] / 2,   d = m_i - m_j.
 
-What the outcome is expected to say about *which* of several is true is bounded from below by their
-Bhattacharyya distances; unlike a sum over pairs it cannot be made up by one pair alone.
+The Bhattacharyya distances bound the expected information on *which* of several rivals is true from
+below. Unlike a sum over pairs, this bound cannot be large because of one pair alone.
 
 References
 ----------
 Box and Hill (1967), Technometrics 9, 57-71; Kolchinsky and Tracey (2017), Entropy 19, 361.
-
-What an estimated model foresees of a run that was not made, with all that it does not know.
 """
 
 from __future__ import annotations
@@ -41,41 +37,41 @@ from bayesoleo.solvers._orbit import Status
 
 Range = tuple[float, float]
 
-#: Points of a period at which a motion is looked at.
+#: Points of a period at which a motion is evaluated.
 GRID_POINTS = 256
-#: A mean below this part of the amplitude is none.
+#: A mean below this part of the amplitude is zero.
 ROUND_OFF = 1e-9
-#: A mean of the runs below this part of the amplitude is not proposed: no rig is set that finely.
+#: A mean of the runs below this part of the amplitude is not proposed: no rig is set so finely.
 NO_MEAN = 1e-3
 #: Part of a motion's power that its fundamental must hold to be taken as a sine.
 NEARLY_A_SINE = 0.9
 #: Values tried of frequency and amplitude, each a constant factor apart, and of the mean.
 FREQUENCIES, AMPLITUDES, MEANS = 6, 6, 3
-#: Travel, rate and outputs may go beyond those of the runs by this part of their range: the motion
-#: tried is not the measured one to the last harmonic.
+#: Travel, rate and outputs may exceed those of the runs by this part of their range, because a
+#: trial motion does not have all harmonics of the measured one.
 BEYOND = 0.1
-#: What limits can be given of the motion; any other name is an output.
+#: Names of the limits of the motion; any other name is an output.
 MOTION = ("amplitude", "frequency", "mean", "travel", "rate")
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a rig can do with the channel that drives the model.
+    """Limits of the rig for the channel that drives the model.
 
     Parameters
     ----------
     amplitude : (float, float)
-        Half of what lies between the largest and the smallest value, SI.
+        Half of the peak-to-peak value, SI.
     frequency : (float, float)
         Fundamental, Hz.
     mean : (float, float)
         Mean value over a period, SI.
     travel : (float, float)
-        What the motion must stay within, SI.
+        Range of the motion, SI.
     rate : (float, float)
-        What its largest rate of change must stay within, SI per second.
+        Range of the largest rate of change, SI per second.
     outputs : mapping of str to (float, float)
-        What each output is foreseen to stay within, SI.
+        Range of each predicted output, SI.
     """
 
     amplitude: Range
@@ -87,7 +83,7 @@ class Limits:
 
     @classmethod
     def of(cls, records: Sequence[Record], drive: str, outputs: Sequence[str]) -> Limits:
-        """What the rig did in the runs that there are.
+        """Limits that the existing runs suggest.
 
         Parameters
         ----------
@@ -113,10 +109,10 @@ class Limits:
         )
 
     def given(self, limits: Mapping[str, Range]) -> Limits:
-        """With limits of the user's in the place of those that the runs suggest.
+        """The limits, with those of the user in place of those that the runs suggest.
 
-        ``travel`` and ``rate`` follow from amplitude, mean and frequency: where one of these is
-        given, they no longer hold by themselves.
+        ``travel`` and ``rate`` follow from amplitude, mean and frequency. Where one of these is
+        given, the suggested travel or rate no longer limits the motion.
 
         Parameters
         ----------
@@ -127,7 +123,7 @@ class Limits:
         Raises
         ------
         InputError
-            If a name or a range makes no sense.
+            If a name is unknown or a range is empty.
         """
         for name, (low, high) in limits.items():
             known = (*MOTION, *self.outputs)
@@ -159,7 +155,7 @@ def _about(values: Sequence[float]) -> Range:
 
 
 def _within(wanted: Range, own: Range) -> Range:
-    """A side that is left open is that of the runs, if it does not contradict the other."""
+    """Replace an infinite side by that of the runs, if it does not contradict the other side."""
     low, high = wanted
     low = low if np.isfinite(low) else min(own[0], high)
     return low, high if np.isfinite(high) else max(own[1], low)
@@ -177,12 +173,12 @@ class Motion:
 
     @classmethod
     def of(cls, record: Record, channel: str) -> Motion:
-        """Of a channel of a run, by its significant harmonics."""
+        """The motion of a channel of a run, by its significant harmonics."""
         return cls.of_signal(record.harmonics[channel], record.frequency)
 
     @classmethod
     def of_signal(cls, item: Harmonics, frequency: float) -> Motion:
-        """Of a periodic signal."""
+        """The motion of a periodic signal."""
         phase = np.arange(GRID_POINTS) / GRID_POINTS
         x, v = (item.evaluate(phase, frequency, n) for n in (0, 1))
         low, high = float(x.min()), float(x.max())
@@ -191,7 +187,7 @@ class Motion:
         return cls(half, mean, low, high, float(np.abs(v).max()))
 
     def possible(self, limits: Limits) -> bool:
-        """Whether a rig can do it; a rounding error is no obstacle."""
+        """Whether the motion is within the limits, up to rounding."""
         slack = 1e-6 * self.amplitude
         low, high = limits.travel
         return (
@@ -204,7 +200,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Planned:
-    """A run that could be made.
+    """A feasible run.
 
     Parameters
     ----------
@@ -213,7 +209,7 @@ class Planned:
     mean, amplitude : float
         Of the driving channel, SI.
     waveform : Harmonics
-        Of that channel.
+        Harmonics of that channel.
     """
 
     frequency: float
@@ -223,14 +219,14 @@ class Planned:
 
 
 def planned_runs(limits: Limits, records: Sequence[Record], drive: str) -> list[Planned]:
-    """Runs over the whole range of what a rig can do.
+    """Runs over the whole range of the rig.
 
     Parameters
     ----------
     limits : Limits
     records : sequence of Record
-        Give the shape of the motion: a sine if theirs is nearly one, else that of the run nearest
-        in frequency.
+        Runs that give the shape of the motion: a sine if theirs is nearly one, else the shape of
+        the run nearest in frequency.
     drive : str
         The channel that drives the model.
 
@@ -272,32 +268,31 @@ def _nearly_a_sine(item: Harmonics) -> bool:
 
 
 def _factors(limits: Range, count: int) -> Array:
-    """Values a constant factor apart; one where there is nothing to choose."""
+    """Values a constant factor apart; a single value where the limits coincide."""
     low, high = max(limits[0], 1e-3 * limits[1]), limits[1]
     return np.array([high]) if high <= low * 1.001 else np.geomspace(low, high, count)
 
 
 def _even(limits: Range, count: int, size: float) -> Array:
-    """Values an equal step apart; one where the limits are closer than a motion's size matters."""
+    """Values an equal step apart; one where the limits are close relative to the motion."""
     low, high = limits
     if high - low >= 0.05 * size:
         return np.linspace(low, high, count)
-    # Of a motion about zero the means of the runs are noise, which nobody would ask a rig for.
+    # The means of a motion about zero are noise, which is not proposed.
     middle = 0.0 if low <= 0.0 <= high else (low + high) / 2
     return np.array([0.0 if abs(middle) < NO_MEAN * size else middle])
 
 
 @dataclass(frozen=True)
 class PredictiveDistribution:
-    """What a rival foresees of an experiment, in units of the noise.
+    """Predictive distribution of an experiment by one rival, in units of the noise.
 
     Parameters
     ----------
     mean : ndarray, shape (n,)
         Outputs.
     spread : ndarray, shape (r, n)
-        Their change by one standard deviation in each of ``r`` independent directions that are not
-        known.
+        Their change by one standard deviation in each of ``r`` independent uncertain directions.
     """
 
     mean: Array
@@ -306,15 +301,16 @@ class PredictiveDistribution:
 
 @dataclass(frozen=True)
 class Separation:
-    """How well an experiment tells ``k`` rivals apart.
+    """Separation of ``k`` rivals by an experiment.
 
     Parameters
     ----------
     log_bayes_factor : ndarray, shape (k, k)
-        Expected, in nats, for the rival of the row against that of the column if the former is
-        true.
+        Expected value, in nats, for the rival of the row against that of the column if the former
+        is true.
     information : float
-        Least expected information about which of them is true, each as likely before, in bits.
+        Lower bound of the expected information on which of them is true, with equal prior
+        probabilities, in bits.
     """
 
     log_bayes_factor: Array
@@ -332,7 +328,7 @@ class Separation:
 
     @property
     def weakest(self) -> float:
-        """Separation of the pair that is separated least, in standard deviations."""
+        """Separation of the weakest pair, in standard deviations."""
         return float(self.sigma[np.triu_indices(len(self.sigma), 1)].min())
 
 
@@ -360,15 +356,15 @@ def separate(rivals: Sequence[PredictiveDistribution]) -> Separation:
             S, d = covariances[j], means[i] - means[j]
             solved = np.linalg.solve(S, np.column_stack([covariances[i], d]))
             twice = np.trace(solved[:, :-1]) - size + d @ solved[:, -1] + logs[j] - logs[i]
-            factor[i, j] = max(twice / 2, 0.0)  # zero may come out as a last digit below it
+            factor[i, j] = max(twice / 2, 0.0)  # round-off may make zero negative
             overlap[i, j] = np.exp(-_bhattacharyya(covariances[i], S, d, logs[i], logs[j]))
     information = float(-np.mean(np.log2(overlap.mean(axis=1))))
     return Separation(factor, max(information, 0.0))
 
 
 def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Array]]:
-    """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are not
-    sure; in all others they foresee the same."""
+    """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are
+    uncertain; in all others their predictions are equal."""
     moved = [rival.mean - rivals[0].mean for rival in rivals]
     rows = np.concatenate([np.stack(moved), *(rival.spread for rival in rivals)])
     basis, _ = np.linalg.qr(rows.T)
@@ -382,23 +378,23 @@ def _bhattacharyya(A: Array, B: Array, d: Array, log_a: float, log_b: float) -> 
     return max(float(d @ np.linalg.solve(mean, d)) / 8 + between / 2, 0.0)
 
 
-#: Points of a period at which outputs are compared, and steps of the mesh: a choice between runs
-#: needs no more digits than it shows.
+#: Points of a period at which outputs are compared, and steps of the mesh; a choice between runs
+#: needs no higher accuracy.
 POINTS, STEPS = 128, 128
-#: Passes that make a response which is an input as well agree with itself, and the orders of it.
+#: Fixed-point iterations for a response that is also an input, and its highest order.
 PASSES, ORDERS = 4, 12
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A model that stands for what might be true.
+    """A model that may be true.
 
     Parameters
     ----------
     name : str
         The effect by which it differs.
     fit : ModelFit
-        To the runs that there are.
+        Its fit to the existing runs.
     """
 
     name: str
@@ -407,7 +403,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known of a rival's parameters in a run that was not made.
+    """Distribution of a rival's parameters in a new run.
 
     Parameters
     ----------
@@ -424,8 +420,8 @@ class Knowledge:
 
     @classmethod
     def of(cls, fit: ModelFit) -> Knowledge:
-        """Shared parameters as the runs know them; those of single runs as they scatter between
-        these; what few runs say nothing of, as in their priors."""
+        """The distribution by the fit. Shared parameters have their posterior, by-run parameters
+        the scatter between the runs, or their priors where there are few runs."""
         model = fit.model
         layout = Layout.of(model, ["any"])
         values, names = fit.values, fit.problem.names
@@ -447,7 +443,7 @@ class Knowledge:
 
 
 def _root(covariance: Array) -> Array:
-    """Rows whose outer products add up to a covariance; units must not matter to its digits."""
+    """Rows whose outer products add up to a covariance, computed in scaled units."""
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -457,20 +453,20 @@ def _root(covariance: Array) -> Array:
 def blank_record(
     like: Record, frequency: float, drive: str, waveform: Harmonics, outputs: tuple[str, ...]
 ) -> Record:
-    """A run that was not made: one period of a known motion.
+    """A new run without outputs: one period of a known motion.
 
     Parameters
     ----------
     like : Record
-        Gives the conditions.
+        Run that gives the conditions.
     frequency : float
         Hz.
     drive : str
         The channel that moves.
     waveform : Harmonics
-        How it moves.
+        Its motion.
     outputs : tuple of str
-        Channels that are to be predicted.
+        Channels to be predicted.
     """
     phase = np.arange(POINTS) / POINTS
     samples = {name: np.zeros(POINTS) for name in outputs}
@@ -491,17 +487,17 @@ def blank_record(
 def predictive_distribution(
     rival: Rival, known: Knowledge, record: Record, noise: Mapping[str, float]
 ) -> tuple[PredictiveDistribution, Array] | Status:
-    """What a rival foresees of a run.
+    """Predictive distribution of a run by one rival.
 
     Parameters
     ----------
     rival : Rival
     known : Knowledge
-        Of its parameters.
+        Distribution of its parameters.
     record : Record
         From :func:`blank_record`.
     noise : mapping of str to float
-        Standard deviation that the average over the run's periods has at each point, by output, SI.
+        Standard deviation of the average over the run's periods at each point, by output, SI.
 
     Returns
     -------
@@ -510,7 +506,7 @@ def predictive_distribution(
     ndarray, shape (ny, POINTS)
         Outputs, SI.
 
-    Or the status of the solution, where there is none.
+    If there is no solution, its status is returned instead.
     """
     fit = rival.fit
     fed_back = [name for name in known.model.inputs if WITHIN in name]
@@ -538,14 +534,14 @@ def predictive_distribution(
 
 
 def _nothing(fed_back: list[str]) -> dict[str, Harmonics]:
-    """Responses that are inputs too, before they are known."""
+    """Zero responses, as the start of responses that are also inputs."""
     orders = np.arange(ORDERS + 1)
     zero = Harmonics(orders, np.zeros(orders.size, dtype=complex), np.zeros(orders.size))
     return dict.fromkeys(fed_back, zero)
 
 
 def _responses(predictor: Predictor, y: Array, fed_back: list[str]) -> dict[str, Harmonics]:
-    """The same as the model foresees them, at the orders of what it is driven by."""
+    """Predicted responses that are also inputs, at the orders of the driving channel."""
     found = {}
     for name in fed_back:
         channel, _, other = name.partition(WITHIN)

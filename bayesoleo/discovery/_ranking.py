@@ -1,4 +1,4 @@
-"""Candidate effects, scored and ranked: what the search makes of each of them."""
+"""Candidate effects, scored and ranked for one round of the search."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score, classes, corrected_p, score_all, without_twins
 from bayesoleo.effects._effect import Effect
 
-#: Families of effects that take up a part of whatever is missing: what varies from run to run, and
-#: what repeats with the drive.
+#: Absorbing families, whose effects absorb a part of any model error: parameters that vary from run
+#: to run, and forces that repeat with the drive.
 ABSORBING_FAMILIES = frozenset({"run-to-run", "clock"})
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A scored candidate with what the search makes of it.
+    """A scored candidate with its place in the search.
 
     Parameters
     ----------
@@ -33,16 +33,16 @@ class Ranked:
     gain : float
         Share of the excess, after estimation where it was estimated.
     refitted : bool
-        Whether it was.
+        Whether it was estimated.
     same : tuple of str
-        Ids of effects that these data cannot tell from it.
+        Ids of effects that these data cannot distinguish from it.
     refit : Refit or None
         The extended model, where it was estimated.
     closest : tuple of (str, float)
-        Of a nonparametric effect: the named ones most like it, with the cosine between the
+        For a nonparametric effect: the most similar named effects, with the cosine between the
         changes.
     beside : Refit or None
-        Its estimate beside the other effects of the final model, where these are others than when
+        Its estimate beside the other effects of the final model, where these have changed since
         it was added.
     """
 
@@ -62,12 +62,12 @@ class Ranked:
 
     @property
     def target(self) -> str:
-        """Where it sits."""
+        """Its place in the model."""
         return self.score.option.candidate.target
 
     @property
     def absorbs(self) -> bool:
-        """Whether it takes up a part of whatever is missing, and names no cause."""
+        """Whether it is of an absorbing family, which names no cause."""
         return self.score.option.candidate.family in ABSORBING_FAMILIES
 
 
@@ -85,25 +85,25 @@ def score_candidates(
     Parameters
     ----------
     base : Base
-        What they are scored against.
+        Residuals and sensitivities of the present model.
     assembly : Assembly
-        The same model.
+        The present model.
     effects : sequence of Effect or None
         Instead of the catalogue.
     jobs : int or None
         Threads.
     order : callable (option, place in the catalogue) -> int, optional
-        Of effects that are one in other words the first in this order is kept; by default the one
-        with the largest share.
+        Of equivalent effects the first in this order is kept; by default the one with the largest
+        share.
     callback : callable, optional
-        Told what is being done.
+        Receives a message at each step.
 
     Returns
     -------
     scores : list of Score
         In that order, and by falling share.
     failed : dict of str to str
-        Reason by effect where there is no score.
+        Reason by effect without a score.
     """
     scales = scales_of(base.fit, assembly.drive, tuple(assembly.native.dofs))
     options = assembly.options(scales, None if effects is None else tuple(effects))
@@ -122,7 +122,7 @@ def rank(
     *,
     policy: SearchPolicy = SearchPolicy(),
 ) -> tuple[Ranked, ...]:
-    """Scores with what the search makes of them, those first that were estimated.
+    """Candidates in the order of the search, estimated ones first.
 
     Parameters
     ----------
@@ -139,24 +139,24 @@ def rank(
         same = _same(scores, k, groups[k], refits)
         fitted = refits.get(id(score))
         if fitted is not None and not np.isfinite(fitted.share):
-            fitted = None  # an estimate that failed says no more than the score
-        # The excess is known up to noise: what explains all of it must not seem to explain more.
+            fitted = None  # a failed estimate adds nothing to the score
+        # The excess is known up to noise, so that a share may exceed one; it is limited to one.
         gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
         p = corrected_p(score if fitted is None else _estimated(score, fitted), tests)
         ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted))
-    # What was estimated is known better than what was only scored, and comes first.
+    # Estimates are more reliable than scores and come first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
 
 
 def _estimated(score: Score, fitted: Refit) -> Score:
-    """A score with what was found by estimation in place of what was expected at the null."""
+    """A score with the estimated values in place of those expected at the null."""
     return replace(score, fall=fitted.fall, inflation=fitted.inflation, freedom=fitted.freedom)
 
 
 def _same(
     scores: Sequence[Score], k: int, group: Sequence[int], refits: dict[int, Refit]
 ) -> tuple[str, ...]:
-    """Effects that look like number ``k``, by their estimates where both have one."""
+    """Effects that are indistinguishable from number ``k``, by their estimates if both have one."""
     own, found = refits.get(id(scores[k])), []
     for j, other in enumerate(scores):
         estimated = refits.get(id(other))
@@ -165,7 +165,7 @@ def _same(
         if own is not None and estimated is not None and np.isfinite(estimated.share):
             alike = own.resembles(estimated)
         elif own is not None and estimated is not None and own.reached:
-            # An estimate that failed tells nothing apart from what its score promises.
+            # After a failed estimate only the score can distinguish the two.
             alike = not own.outdoes(other)
         else:
             alike = j in group and not (own is not None and own.outdoes(other))
@@ -175,6 +175,6 @@ def _same(
 
 
 def name_among(own: Score, other: Score) -> str:
-    """What the class of an effect calls another one: by its place as well if the id is the same."""
+    """Name of another effect in the class of an effect; with its place if the ids are equal."""
     effect, target = other.option.key
     return f"{effect} @ {target}" if effect == own.option.key[0] else effect

@@ -1,14 +1,13 @@
 """Refit of a model with an added effect, and the weight of evidence for it.
 
-Variance of an estimate from the scatter between a few stretches of the data.
+The refit starts at the values that the score test suggests. The variance of the estimate comes from
+the scatter between a few stretches of the data.
 
 References
 ----------
 Bell and McCaffrey (2002), Bias reduction in standard errors for linear regression with multi-stage
 samples, Survey Methodology 28(2), 169-181; Pustejovsky and Tipton (2018), J. Business and Economic
 Statistics 36(4), 672-683.
-
-Estimate an extended model, starting where its score says, and weigh what it gains.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""The closed loop and its predictions as a DataTree.
+"""The closed loop and its predictions as a DataTree, in the layout of the package's schema.
 
-What the posterior predicts of runs, over one period or the length of a transient.
-
-A closed loop as one DataTree, in the layout of :mod:`bayesoleo.schema`.
+Predictions cover one period of a periodic run, or the length of a transient.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round
 from bayesoleo.discovery._state import State
-from bayesoleo.discovery._summary import titles_of, told
+from bayesoleo.discovery._summary import in_words, titles_of
 from bayesoleo.error_models._base import ErrorModel, RunSamples
 from bayesoleo.estimation._point_estimate import to_dataset
 from bayesoleo.model._parameters import Coordinate
@@ -462,7 +460,7 @@ def _discovery(rounds: Sequence[Round], titles: Mapping[str, str]) -> xr.Dataset
     data[schema.ACCEPTED_TARGET] = xr.Variable(
         schema.ROUND, np.array([e.accepted.target if e.accepted else "" for e in rounds])
     )
-    reasons = [told(entry.reason, titles) for entry in rounds]
+    reasons = [in_words(entry.reason, titles) for entry in rounds]
     data[schema.REASON] = xr.Variable(schema.ROUND, np.array(reasons))
     first = rounds[0].before
     coords = {

@@ -1,9 +1,8 @@
-"""Final effects looked at again, each beside all the others: what else could stand in its place,
-and whether something else does better there.
+"""Review of the final effects: each against all alternatives, beside the others.
 
-While another effect is missing, its error blurs what two candidates would change: they look alike,
-or the nearer one seems better. With everything else in the model, noise alone says how sure their
-difference is. An effect that does better beside the others than the one that was added replaces it
+While another effect is missing, its error blurs the difference between two candidates: they look
+equivalent, or the wrong one seems better. With all other effects in the model, only noise limits
+the comparison. A candidate that does better beside the others replaces the effect that was added
 (sequential replacement; Miller 2002, Subset Selection in Regression, section 3.9).
 """
 
@@ -19,7 +18,7 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import Numerics
-from bayesoleo.discovery._hold_out_confirmation import confirmed, speak_against
+from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import (
     ABSORBING_FAMILIES,
@@ -39,18 +38,18 @@ from bayesoleo.effects._nonparametric import FAMILY
 
 @dataclass(frozen=True)
 class Place:
-    """A final effect's place in the model, and what could stand there.
+    """A final effect's place in the model, and its possible substitutes.
 
     Parameters
     ----------
     number : int
-        Of the round that added the effect, from zero.
+        Number of the round that added the effect, from zero.
     without : State
         The final model without the effect, on the fitted runs.
     own : Ranked
         The effect, estimated there, with its class.
     rivals : tuple of Ranked
-        Others that were estimated, the best first.
+        Other effects that were estimated there, the best first.
     """
 
     number: int
@@ -62,9 +61,9 @@ class Place:
     def better(self) -> tuple[Ranked, ...]:
         """Rivals that make the data more than twenty times as likely, the best first.
 
-        Instead of what merely varies from run to run a cause stands that is as likely. Where a
-        rival leaves more than noise it must also explain as much of what the effect leaves as
-        another effect would have to: two shapes of one cause differ by less.
+        A cause replaces an effect of an absorbing family if it is as likely. A rival that leaves
+        more than noise must also explain as much of the remainder as a further effect would have
+        to, because two shapes of one cause differ by less.
         """
         own = self.own.refit
         assert own is not None
@@ -84,7 +83,7 @@ class Place:
 
 
 def _dispersion(result: Refit, without: State) -> float:
-    """Of what an estimate leaves."""
+    """Dispersion of the residual of an estimate."""
     base = without.base()
     return dispersion(replace(base, excess=base.excess - result.fall))
 
@@ -98,7 +97,7 @@ def reviewed(
     *,
     replacing: bool = True,
 ) -> Progress:
-    """A finished search whose final effects have the classes that they have beside each other.
+    """Review the final effects of a finished search, each beside the others.
 
     Parameters
     ----------
@@ -109,15 +108,15 @@ def reviewed(
     effects : sequence of Effect or None
         Instead of the catalogue.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
     replacing : bool
         Whether an effect may be replaced by one that does better.
 
     Returns
     -------
     Progress
-        Finished, with new classes; or not finished any more, if an effect was replaced: with
-        another one there the search goes on.
+        Finished, with new classes; or unfinished if an effect was replaced, so that the search
+        continues.
     """
     curve = any(step.effect.family == FAMILY for step in progress.state.assembly.steps)
     for step in progress.state.assembly.steps:
@@ -126,8 +125,8 @@ def reviewed(
             continue
         accepted = progress.rounds[number].accepted
         if curve and (accepted is None or not accepted.same):
-            continue  # beside a curve nothing is replaced, and only known rivals are asked again
-        callback(f"look again at what was like {step.effect.id}")
+            continue  # beside a curve no effect is replaced, and only known rivals are estimated
+        callback(f"review the alternatives to {step.effect.id}")
         place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
         if place is None:
             continue
@@ -142,10 +141,10 @@ def reviewed(
 def _smaller(
     progress: Progress, roles: Roles, numerics: Numerics, callback: ProgressCallback
 ) -> Progress:
-    """The search with one effect less, if another in one place makes a second superfluous.
+    """The search with one effect less, if a substitute makes a second effect superfluous.
 
-    An effect that is only near needs a companion for what it lacks; beside each other both seem to
-    be needed, and the true one in its place does without.
+    An effect that only resembles the true one needs a companion. Beside each other both seem to be
+    needed, whereas the true effect in place of the first needs no companion.
     """
     steps = progress.state.assembly.steps
     if len(steps) < 2:
@@ -155,7 +154,7 @@ def _smaller(
         for result, gap in _close_rivals(progress, step):
             state = fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
             base = state.base()
-            callback(f"look whether {result.score.option.key[0]} does without one of the others")
+            callback(f"test whether {result.score.option.key[0]} makes another effect superfluous")
             losses = [
                 loss_without(state, base, other, numerics) for other in state.assembly.steps[:-1]
             ]
@@ -169,12 +168,12 @@ def _smaller(
 
 
 def _close_rivals(progress: Progress, step: AddedEffect) -> list[tuple[Refit, float]]:
-    """Estimates of what could stand in an effect's place, and by how much less they are worth: less
-    than the unknowns of another effect would be."""
+    """Estimates of possible substitutes of an effect, and the difference in worth, which is less
+    than the price of a further effect's unknowns."""
     entry = _entry_of(progress, step)
     own = entry.accepted.refit if entry is not None and entry.accepted is not None else None
     if entry is None or own is None or _added_by(progress, step) is not None:
-        return []  # estimated beside others than there are now
+        return []  # estimated beside other effects than the present ones
     rivals = [
         (item.refit, own.worth - item.refit.worth)
         for item in entry.ranking
@@ -206,26 +205,25 @@ def _without_companion(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> Progress | None:
-    """The search with a rival in a place and without another effect, if runs that were not used
-    have nothing against it."""
+    """The search with a rival in a place and without another effect, unless the hold-out runs
+    contradict it."""
     final, name = progress.state, result.score.option.key[0]
     after = fit_state(result.assembly.without(least.step), roles, numerics)
-    if (final.at_floor and not after.at_floor) or speak_against(final, after, result.inflation):
+    if (final.at_floor and not after.at_floor) or contradicted(final, after, result.inflation):
         return None
     entry = _entry_of(progress, step)
     assert entry is not None
     item = next(one for one in entry.ranking if one.refit is result)
-    told = (
-        f"{name} stands instead of {step.effect.id}, and then {least.step.effect.id} is not needed"
-    )
-    last = replace(entry, accepted=item, after=after, reason=f"{told}: {least}")
-    callback(told)
-    notes = (*progress.notes, f"{told}: {least}")
+    reason = f"{name} replaces {step.effect.id} and makes {least.step.effect.id} superfluous"
+    callback(reason)
+    reason = f"{reason}: {least}"
+    last = replace(entry, accepted=item, after=after, reason=reason)
+    notes = (*progress.notes, reason)
     return Progress(progress.first, after, (*progress.rounds[:-1], last), notes)
 
 
 def _added_by(progress: Progress, step: AddedEffect) -> int | None:
-    """Number of the round that added a final effect, if it was beside others than there are now."""
+    """Number of the round that added a final effect; None if the other effects are the same now."""
     key = step.effect.id, step.target
     for number, item in reversed(list(enumerate(progress.rounds))):
         if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
@@ -245,20 +243,20 @@ def place_of(
     *,
     only_known: bool = False,
 ) -> Place | None:
-    """What could stand in a final effect's place; None where that cannot be said.
+    """Possible substitutes of a final effect; None where they cannot be estimated.
 
-    With ``only_known`` only what was in its class before is estimated.
+    With ``only_known`` only members of its earlier class are estimated.
     """
     final, accepted = progress.state, progress.rounds[number].accepted
     assert accepted is not None
     less = final.assembly.without(step)
     if len(less.steps) != len(final.assembly.steps) - 1:
-        return None  # others act on what it brought
+        return None  # other effects change the terms of this one
     fitted = replace(roles, held_out=(), strategy="none")
     without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
     base = without.base()
     key = step.effect.id, step.target
-    # The effect itself speaks for those that are it in other words.
+    # The effect itself represents those that are equivalent to it.
     scores, _ = score_candidates(
         base, less, effects, numerics.jobs, order=lambda option, _: option.key != key
     )
@@ -282,11 +280,11 @@ def place_of(
 def _from_other_shapes(
     base: Base, refits: Mapping[int, Refit], chosen: Sequence[Score], numerics: Numerics
 ) -> dict[int, Refit]:
-    """Better estimates of effects that came out a little behind the best, by other starts.
+    """Better estimates, from other starts, of effects that are slightly behind the best.
 
-    Where friction switches, the error has several minima along the shape, and the shape that scores
-    best at the null may lie beside the wrong one: then an effect would be told from one that is the
-    same but for its shape.
+    Where friction switches, the error has several minima along the shape, and the shape with the
+    best score at the null may lie near the wrong one. Two effects would then seem distinguishable
+    that differ in their shape only.
     """
     best, policy = max(result.fall for result in refits.values()), base.policy
     better: dict[int, Refit] = {}
@@ -311,7 +309,7 @@ def _worth_estimating(
     only_known: bool,
     policy: SearchPolicy,
 ) -> list[Score]:
-    """Those that score near an effect, the best first, and those that were in its class before."""
+    """Rivals that score near an effect, the best first, and members of its earlier class."""
     absorbs = own.option.candidate.family in ABSORBING_FAMILIES
     near = [
         score
@@ -334,8 +332,7 @@ def _replaced(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> Progress | None:
-    """The search with another effect in a place, if runs that were not used have nothing against
-    it."""
+    """The search with another effect in a place, unless the hold-out runs contradict it."""
     final = progress.state
     before = fit_state(final.assembly.without(step), roles, numerics)
     assert better.refit is not None
@@ -343,12 +340,12 @@ def _replaced(
     after, reason = confirmed(before, better, better.refit, roles, numerics, callback)
     if after is None or (final.at_floor and not after.at_floor):
         return None
-    if speak_against(final, after, better.refit.inflation):
+    if contradicted(final, after, better.refit.inflation):
         return None
     gained = better.refit.worth - place.own.refit.worth
     way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"
     reason += (
-        f"; it stands instead of {step.effect.id}, beside the others the weighted squared error is"
+        f"; it replaces {step.effect.id}: beside the other effects the weighted squared error is"
         f" {way}, unknowns counted{'' if gained > 0 else ', and it names a cause'}"
     )
     tests = progress.rounds[place.number].tests
@@ -361,7 +358,7 @@ def _replaced(
 
 
 def _with_class(progress: Progress, place: Place) -> Progress:
-    """With the class of a final effect as it is beside the others."""
+    """The search with the class of a final effect as found beside the others."""
     item = progress.rounds[place.number]
     assert item.accepted is not None
     new = replace(item.accepted, same=place.own.same, beside=place.own.refit)

@@ -1,9 +1,7 @@
 """One round of the search, and the progress from which a search resumes.
 
-One round of the search: score every effect, estimate the best few, confirm one on runs that were
-not used.
-
-How far a search has come: all that it needs to go on after its last finished round.
+A round scores every effect, estimates the best few and confirms one on the hold-out runs. The
+progress holds everything that the search needs to continue after its last finished round.
 """
 
 from __future__ import annotations
@@ -45,14 +43,15 @@ class Round:
     failed : dict of str to str
         Effects that could not be scored, with the reason.
     accepted : Ranked or None
+        The effect that was added.
     after : State or None
-        With the accepted effect in.
+        The model with the accepted effect.
     reason : str
-        One sentence.
+        Why the effect was accepted, or none was, in one sentence.
     tests : float
         Effective number of independent tests of the search.
     nonparametric : CurveSearch or None
-        The smooth functions that were tried where no named effect explains what is left.
+        The smooth functions that were tried where no named effect explains the residual.
     """
 
     before: State
@@ -92,10 +91,10 @@ def examine(
     limit : str
         Why effects are only ranked and none is accepted; empty where one may be.
     callback : callable
-        Told what is being done.
+        Receives a message at each step.
     """
     if limit and any(step.effect.family == FAMILY for step in state.assembly.steps):
-        # A curve takes up what named effects would have explained: to rank them says nothing.
+        # A curve absorbs the share of named effects, so that a ranking of them is meaningless.
         return Round(state, (), {}, None, None, limit, 1.0)
     base, policy = state.base(), numerics.policy
     scores, failed = score_candidates(
@@ -125,7 +124,7 @@ def _stopping_reason(
     best = max((item.gain for item in ranking), default=0.0)
     if state.at_floor and best < policy.floor_share:
         return (
-            f"nothing is missing: the residual is {worst:.2f} times what is expected at most"
+            f"no effect is missing: the residual is at most {worst:.2f} times the expected error"
             f" and no effect explains more than {100 * best:.0f} % of the excess"
         )
     if not any(_may_be_significant(item, tests, policy) for item in ranking):
@@ -140,8 +139,8 @@ def _refit_best(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> dict[int, Refit]:
-    """Estimate the best few effects of physics, and what takes up anything where that may explain
-    more than they do."""
+    """Estimate the best few physical effects, and effects of absorbing families if these may
+    explain more."""
     policy = numerics.policy
     level = policy.significance
     significant = [item for item in ranking if item.p_value < level and item.gain > 0]
@@ -156,10 +155,10 @@ def _refit_best(
 
 
 def _may_be_significant(item: Ranked, tests: float, policy: SearchPolicy) -> bool:
-    """Whether a score would be significant in white noise, which is what an estimate may find.
+    """Whether a score would be significant in white noise.
 
-    Where a step from the null describes an effect badly its score seems to scatter with what the
-    step leaves; only its estimate tells whether it does.
+    Linearisation at the null is poor for some effects. The inflation of their score then includes
+    the error of the linearisation, and only an estimate shows whether they are significant.
     """
     return corrected_p(replace(item.score, inflation=1.0), tests) < policy.significance
 
@@ -167,7 +166,7 @@ def _may_be_significant(item: Ranked, tests: float, policy: SearchPolicy) -> boo
 def _hidden(
     ranking: Sequence[Ranked], named: Sequence[Ranked], tests: float, policy: SearchPolicy
 ) -> list[Ranked]:
-    """Effects that explain as much as the significant ones do, of which the null says nothing."""
+    """Effects that explain as much as the significant ones, but whose score is inconclusive."""
     enough = named[0].gain if named else 0.0
     return [
         item
@@ -182,7 +181,7 @@ def _hidden(
 def _refit_few(
     base: Base, pool: Sequence[Ranked], most: int, numerics: Numerics, callback: ProgressCallback
 ) -> dict[int, Refit]:
-    """Estimate the best of a pool, best first, as far as they score near it."""
+    """Estimate the best of a pool, and those that score near the best."""
     near = numerics.policy.near_best
     chosen = [item.score for item in pool[:most] if item.gain >= near * pool[0].gain]
     if not chosen:
@@ -195,13 +194,13 @@ def _refit_few(
 
 
 def _only_absorbs(item: Ranked, refits: dict[int, Refit]) -> bool:
-    """Whether an effect merely takes up what another does, without need.
+    """Whether an effect merely absorbs another one.
 
-    Much that physics does differs between runs, so a parameter of each run's own takes a part of it
-    up, whatever is missing; where runs are alike, so does what repeats with the drive; and a mass
-    of less than nothing looks like a spring. Such an effect is needed where it explains all that is
-    left and no effect of physics does, by more than its additional unknowns are worth (Schwarz
-    1978).
+    Most physical effects differ between runs, so that a by-run parameter absorbs a part of any
+    missing effect. Where runs are alike, a force that repeats with the drive does so too, and a
+    negative mass resembles a spring. Such an effect is needed only if it explains the whole
+    residual and no physical effect does, by more than the price of its additional unknowns
+    (Schwarz 1978).
     """
     own = refits[id(item.score)]
     if not (item.absorbs or own.unusual):
@@ -215,9 +214,10 @@ def _only_absorbs(item: Ranked, refits: dict[int, Refit]) -> bool:
 
 
 def _next(tried: Sequence[Ranked], refits: dict[int, Refit]) -> Ranked:
-    """Of effects by falling gain the best for its unknowns, or the simplest near the best.
+    """The next effect to confirm, among effects sorted by falling gain.
 
-    What an unknown is worth is known where only noise is left.
+    If the best leaves only noise, the effect with the best penalised sum of squares is next: the
+    price of an unknown is known there. Otherwise it is the simplest effect near the best.
     """
     best = refits[id(tried[0].score)]
     if best.reached:
@@ -236,10 +236,10 @@ def _choose(
     numerics: Numerics,
     callback: ProgressCallback,
 ) -> tuple[Ranked | None, State | None, str]:
-    """The best effect that the runs not used confirm.
+    """The best effect that the hold-out runs confirm.
 
-    Of effects that leave nothing but noise on the fitted runs and are worth nearly as much there,
-    the first that does so on the others too.
+    Among effects that leave only noise on the fitted runs and have nearly the same penalised sum
+    of squares there, the first that also leaves only noise on the hold-out runs is chosen.
     """
     level = numerics.policy.significance
     last = {id(r): _only_absorbs(r, refits) for r in ranking if r.refitted}
@@ -274,7 +274,7 @@ def _choose(
 
 
 def _as_good(result: Refit, other: Refit) -> bool:
-    """Whether an effect leaves nothing but noise and is worth nearly as much as another one."""
+    """Whether an effect leaves only noise and its worth is close to that of another one."""
     less, policy = other.worth - result.worth, result.policy
     scale = policy.equal_likelihood * max(result.inflation, other.inflation)
     return result.reached and less < policy.compared_worth * scale
@@ -289,12 +289,12 @@ class Progress:
     first, state : State
         The model as declared, and with the effects that the finished rounds added.
     rounds : tuple of Round
-        Those that are finished.
+        The finished rounds.
     notes : tuple of str
-        What a reader should know so far.
+        Remarks on the search so far, as sentences.
     broken : bool
-        Whether it ended before a round found nothing more, or before its final effects had been
-        looked at again.
+        Whether the search was stopped before a round found no further effect, or before the
+        review of its final effects.
     """
 
     first: State
@@ -305,12 +305,12 @@ class Progress:
 
     @property
     def finished(self) -> bool:
-        """Whether the last round accepted nothing, so that no other follows."""
+        """Whether the last round accepted no effect, so that no other round follows."""
         return bool(self.rounds) and self.rounds[-1].after is None
 
     def with_same_noise(self) -> Progress:
-        """With the errors of all states held against the noise that was found last: it is that of
-        the records, and no round has another."""
+        """The search with the errors of all states relative to one noise, that of the records as
+        found last."""
         noise = self.state.errors.record_noise
         for entry in self.rounds:
             noise = least_noise(noise, entry.before.errors.record_noise)
@@ -330,13 +330,12 @@ class Progress:
         return replace(self, first=same(self.first), state=same(self.state), rounds=rounds)
 
     def after(self, outcome: Round, state: State, notes: list[str]) -> Progress:
-        """With one more round."""
+        """The search with one more round."""
         return Progress(self.first, state, (*self.rounds, outcome), tuple(notes))
 
     def ended(self, reason: str) -> Progress:
-        """Broken off: with a last round that examined nothing and accepts nothing, where there is
-        none. After the last round effects are still looked at again, so that one that has it may
-        break off too.
+        """The search, stopped early. An empty last round is added unless the search has a last
+        round; a search that has one may still be stopped during its review.
 
         Parameters
         ----------

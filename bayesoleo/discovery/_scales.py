@@ -1,13 +1,11 @@
 """Sizes of the estimated motion, and the dominant frequency of a residual.
 
-Frequency of what hums in transients: a line in what a model leaves that no input has.
+The sizes place the scan grids of effects.
 
-A frequency that the null leaves undefined cannot be scanned by a coarse grid: its score has a peak
-as narrow as the reciprocal of the record's length. So the highest line of the residual's spectrum
-is taken, if one so high comes by chance less than once in a thousand times; where there is none,
-there is no periodic force to score, and nothing that the search would have to be corrected for.
-
-Sizes of the estimated motion, which place the scan grids of effects.
+The frequency of a periodic force is undefined at the null, and a coarse grid cannot scan it: the
+score has a peak as narrow as the reciprocal of the record's length. The highest line of the
+residual's spectrum is taken instead, if the probability of such a line by chance is less than one
+in a thousand. Without one no periodic force is scored, and the search needs no correction for it.
 """
 
 from __future__ import annotations
@@ -23,15 +21,15 @@ from bayesoleo.discovery._fit import ModelFit, weights
 from bayesoleo.effects._parts import Scales
 from bayesoleo.prediction._records import Record
 
-#: Lines on either side from whose median the level beside a line is taken; cycles over the record
-#: below which a line is a drift.
+#: Lines on either side whose median is the level beside a line; cycles over the record below which
+#: a line is a drift.
 _BESIDE, _FEWEST = 25, 5
-#: A window that keeps strong lines from leaking far makes lines this many bins wide.
+#: Width in bins of a line with the window that limits the leakage of strong lines.
 _WIDE = 3
 
 
 def dominant_residual_frequency(fit: ModelFit) -> float | None:
-    """Frequency at which the residuals of transients hum, Hz; None where they do not."""
+    """Dominant frequency of the residuals of transients, Hz; None without a significant line."""
     best: tuple[float, float] = (FALSE_ALARM, 0.0)
     for r, record in enumerate(fit.records):
         if record.periodic:
@@ -78,12 +76,12 @@ def line_of(values: Array, inputs: Sequence[Array], step: float) -> tuple[float,
 
 
 def _over_level(values: Array) -> Array | None:
-    """Powers of a windowed signal over their level beside them."""
+    """Powers of a windowed signal over the level of their neighbours."""
     window = np.hanning(values.size)
     power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
     if power.size < 4 * _BESIDE or not power.any():
         return None
-    # Of exponential powers the median is ln 2 of the mean.
+    # The median of exponentially distributed powers is ln 2 times the mean.
     level = ndimage.median_filter(power, 2 * _BESIDE + 1, mode="reflect") / np.log(2.0)
     ratio: Array = power / np.maximum(level, 1e-9 * power.mean())
     ratio[:_FEWEST] = 0.0
@@ -112,8 +110,8 @@ POINTS = 512
 def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:
     """Ranges of every coordinate over all fitted runs.
 
-    A dof that the drive replaced moves as the driving channel does; offsets and gains on it are
-    small.
+    A dof that the drive replaced has the motion of the driving channel, up to small offsets and
+    gains.
     """
     position: dict[str, tuple[float, float]] = {}
     velocity: dict[str, float] = {}
@@ -167,13 +165,13 @@ def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) ->
 
 
 def _places(record: Record) -> np.ndarray:
-    """Where to look at the motion: all over a period, or at the samples of a transient."""
+    """Where the motion is evaluated: over a period, or at the samples of a transient."""
     return np.arange(POINTS) / POINTS if record.periodic else record.position
 
 
 def _times(record: Record) -> tuple[float, ...]:
-    """Times on which a run moves: its period; of a transient, its length and, by the channel that
-    is fastest for its size, the period that a harmonic motion as fast would have."""
+    """Time scales of a run: the period, or for a transient its length and, for each channel, the
+    period of a harmonic motion with the same ratio of rate to size."""
     if record.periodic:
         return (record.span,)
     found = [record.span]

@@ -1,16 +1,12 @@
 """The basis of score tests: residuals and sensitivities of the present model.
 
-Project directions out of others by their products alone, and know when nothing is left.
+Both are in units of the noise. Sensitivities include those to parameters that the fitted model
+lacks or holds fixed. Candidates are projected out of the present sensitivities by inner products
+alone, which needs a test of whether anything but round-off remains.
 
-Which sensitivities are real, and which only the round-off of a solution.
-
-A constant force on a coordinate that no output contains moves the model and shows nowhere. Its
-computed sensitivity is not zero but some last digits, and a score divides by it.
-
-How outputs change with parameters that a fitted model lacks or holds fixed, at its estimate.
-
-What every candidate is scored against: residuals and sensitivities of the present model, in
-units of the noise.
+A constant force on a coordinate that no output contains moves the model without a visible effect.
+Its computed sensitivity consists of round-off, and a score divides by it. Such sensitivities are
+therefore detected and left out.
 """
 
 from __future__ import annotations

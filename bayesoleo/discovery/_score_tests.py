@@ -1,20 +1,15 @@
-"""Score tests of candidate effects, corrected for coloured noise and for the choice among many.
+"""Score tests of candidate effects, corrected for coloured noise and multiple testing.
 
-How much more a score varies than white noise would make it: by the noise's spectrum, and by its
-scatter between periods.
+A score test predicts at the null how much of the residual an effect explains, without a refit. With
+residual ``e``, sensitivities ``J`` of the present parameters, ``C`` of the candidate's and weights
+``W``, the candidate adds ``C_perp = C - J (J' W J)^-1 J' W C``; its score is ``s = C_perp' W e``
+with information ``I = C_perp' W C_perp``. The expected parameter is ``I^-1 s`` and the sum of
+squares falls by ``s' I^-1 s`` (Rao's score test). Shape parameters are undefined at the null and
+are scanned.
 
-Score an effect at its null: how much of the residual it would explain, without estimating
-anything anew.
-
-With residual ``e``, sensitivities ``J`` of the present parameters, ``C`` of the candidate's and
-weights ``W``, what the candidate adds is
-``C_perp = C - J (J' W J)^-1 J' W C``; its score is ``s = C_perp' W e`` with information ``I =
-C_perp' W C_perp``. The expected parameter is
-``I^-1 s`` and the sum of squares falls by ``s' I^-1 s`` (Rao's score test). Shape parameters that
-the null leaves undefined are scanned.
-
-How sure an effect is, given that the best of many was picked; and which effects the data cannot
-tell apart.
+Coloured noise increases the variance of a score. The spectrum of the noise and the scatter between
+periods give the factor. The probability of the best candidate accounts for the number of
+candidates, and candidates that the data cannot distinguish are grouped.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """State of the search: a fitted model with its errors on all runs.
 
-Other starts for a fit that leaves more than is expected: a wrong optimum is no missing effect.
+The errors are compared with the noise on fitted and hold-out runs.
 
-Where a resonance lies between the frequencies that were driven, the sum of squares has an optimum
-on either side of each, and an estimate ends in the one that it starts near.
-
-A model in its present state: fitted, held against the noise on fitted and held-out runs.
+Fits with more than the expected error are repeated from other starts, because a local optimum is no
+missing effect. Where a resonance lies between two driven frequencies, the sum of squares has an
+optimum on either side of each, and an estimate ends in the one nearest its start.
 """
 
 from __future__ import annotations
@@ -38,18 +37,18 @@ from bayesoleo.prediction._stability import Stability
 
 
 def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
-    """Unknowns from which the estimate ends higher than it did.
+    """A better optimum of the estimate, from other starts.
 
     Parameters
     ----------
     fit : ModelFit
-        That leaves more than is expected.
+        A fit with more than the expected error.
     numerics : Numerics
 
     Returns
     -------
     ndarray, shape (l,), or None
-        The better optimum; None where none of those that are reached from draws of the priors is.
+        The better optimum; None if no start from draws of the priors leads to one.
     """
     best, height = None, fit.point.objective + numerics.policy.better_optimum_declared
     for start in promising(fit.problem, fit.point.theta, numerics.policy):
@@ -70,18 +69,18 @@ def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
 
 @dataclass(frozen=True)
 class State:
-    """Everything known of one model.
+    """A fitted model with its predictions and errors.
 
     Parameters
     ----------
     assembly : Assembly
-        At the estimate.
+        The model at the estimate.
     fit : ModelFit
-        On the fitted runs.
+        Its fit to the fitted runs.
     fitted, held_out : list of Prediction
-        By run.
+        Predictions by run.
     fit_errors, hold_errors : ErrorTable
-        Of these.
+        Errors of these predictions.
     """
 
     assembly: Assembly
@@ -93,23 +92,23 @@ class State:
 
     @property
     def policy(self) -> SearchPolicy:
-        """By which it is judged."""
+        """The search policy."""
         return self.fit.policy
 
     @property
     def errors(self) -> ErrorTable:
-        """One entry each run and output: that of the held-out prediction where there is one."""
+        """One entry for each run and output: that of the hold-out prediction where there is one."""
         held = {entry.run for entry in self.hold_errors.entries}
         rest = tuple(entry for entry in self.fit_errors.entries if entry.run not in held)
         return ErrorTable((*rest, *self.hold_errors.entries))
 
     @property
     def stability(self) -> Stability | None:
-        """Of the periodic solutions of fitted and held-out runs; None where there are none."""
+        """Stability of the periodic solutions of all runs; None where there are none."""
         known = self.fit.stability
         if known is None:
             return None
-        # Where runs are held out in turn, all of them are fitted as well.
+        # With leave-one-run-out all runs are fitted as well.
         runs = {p.record.label: p.predictor.runs[0] for p in self.held_out}
         runs = {label: run for label, run in runs.items() if label not in known.runs}
         matrices = [run.anchor.monodromy if run.anchor else None for run in runs.values()]
@@ -123,27 +122,27 @@ class State:
 
     @property
     def worst_ratio(self) -> float:
-        """Largest pooled ratio to what is expected over roles and outputs."""
+        """Largest pooled ratio to the expected error over roles and outputs."""
         tables = [t for t in (self.fit_errors, self.hold_errors) if t.entries]
         return float(np.max([table.worst_ratio(key="ratio_to_expected") for table in tables]))
 
     @property
     def at_floor(self) -> bool:
-        """Whether fitted and held-out runs are all down to what is expected of them."""
+        """Whether the errors of all fitted and hold-out runs agree with the expected ones."""
         return all(
             is_at_floor(table, policy=self.policy) for table in (self.fit_errors, self.hold_errors)
         )
 
     @property
     def too_quiet(self) -> tuple[str, ...]:
-        """Where less is left than chance allows: a noise that was measured too large."""
+        """Errors that are smaller than chance allows, because the noise is overestimated."""
         return (
             *too_quiet(self.fit_errors, policy=self.policy),
             *too_quiet(self.hold_errors, policy=self.policy),
         )
 
     def with_noise(self, noise: Noise) -> State:
-        """The same errors held against a noise that was found with another model."""
+        """The same errors relative to a noise that was found with another model."""
         return replace(
             self,
             fit_errors=with_same_noise(self.fit_errors, noise),
@@ -157,13 +156,13 @@ class State:
         return tuple(f"{p.record.label}: {p.status.message}" for p in found if not p.status.ok)
 
     def base(self) -> Base:
-        """What candidates are scored against."""
+        """Residuals and sensitivities for the scores of candidates."""
         entries = self.fit_errors.entries
         return base_of(self.fit, {(entry.run, entry.output): entry for entry in entries})
 
 
 def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:
-    """Predict all runs at a fit and compare with what was measured."""
+    """Predict all runs at a fit and compare with the measurements."""
     fitted = predict_fitted(fit)
     held_out = (
         _left_out(fit, roles)
@@ -207,14 +206,14 @@ def _left_out(fit: ModelFit, roles: Roles) -> list[Prediction]:
     numerics = replace(fit.numerics, steps=fit.steps, scheduler=None)
     left_out = _LeftOut(fit.model, fit.records, numerics, fit.problem.names, fit.point.theta)
     with connected(fit.numerics.scheduler) as client:
-        # Here each fit has all threads for itself.
+        # Each local fit uses all threads.
         found = dict(each_done(left_out, roles.held_out, client=client, jobs=1))
     return [found[index] for index in range(len(roles.held_out))]
 
 
 @dataclass(frozen=True)
 class _LeftOut:
-    """One run predicted by the others, wherever it is sent."""
+    """Prediction of one run by the others, as a task for a worker."""
 
     model: Model
     records: tuple[Record, ...]

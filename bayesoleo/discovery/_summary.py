@@ -1,4 +1,4 @@
-"""The summary of a closed loop: plain dicts that ``summary.json`` is made of."""
+"""Summary of a closed loop: the plain dicts of ``summary.json``."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def summarise(
             "posterior": None if samples is None else samples.branch_jumps,
         },
         "notes": [
-            *(told(note, titles) for note in loop.notes),
+            *(in_words(note, titles) for note in loop.notes),
             *facts.notes,
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
@@ -88,7 +88,7 @@ def titles_of(loop: ClosedLoop) -> dict[str, str]:
     return titles_for([*own, *alike], own)
 
 
-def told(text: str, titles: Mapping[str, str]) -> str:
+def in_words(text: str, titles: Mapping[str, str]) -> str:
     """A sentence about effects with their titles in place of their ids.
 
     A note on parameters stays as it is: an effect's parameter may be called like the effect.
@@ -102,8 +102,8 @@ def _round(item: Round, titles: Mapping[str, str]) -> dict[str, Any]:
         "candidates": [_candidate(ranked) for ranked in item.ranking],
         "accepted": item.accepted.effect if item.accepted else None,
         "accepted_target": item.accepted.target if item.accepted else None,
-        "reason": told(item.reason, titles),
-        "failed": {label: told(reason, titles) for label, reason in item.failed.items()},
+        "reason": in_words(item.reason, titles),
+        "failed": {label: in_words(reason, titles) for label, reason in item.failed.items()},
     }
 
 

@@ -1,8 +1,6 @@
 """The catalogue of built-in effects, their candidates in a model, and their titles.
 
-The effects that come with the package, and every candidate they make of a model.
-
-What effects are called in sentences: by their titles, never by their ids.
+Sentences for readers use the titles of effects, not their ids.
 """
 
 from __future__ import annotations

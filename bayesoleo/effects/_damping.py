@@ -1,8 +1,7 @@
 """Stiffness and damping effects.
 
-Stiffness: forces that follow position.
-
-Damping: forces that grow with velocity, and changes of those a model has.
+Stiffness effects are forces that depend on position. Damping effects are forces that grow with
+velocity, and changes of the damping that a model has.
 
 References
 ----------
@@ -16,7 +15,7 @@ from collections.abc import Callable
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._force_effect import force_effect
+from bayesoleo.effects._force_effect import single_force
 from bayesoleo.effects._parts import Amplitude, ShapeParameter, values, velocity_grid
 from bayesoleo.effects._places import damping_terms, force_places, is_quantity, moving_places
 from bayesoleo.model._expressions import symbol
@@ -35,11 +34,10 @@ def _power(order: int, word: str) -> Effect:
     id_ = f"{word}_stiffness"
     unit = "force/position" if order == 1 else f"force/position**{order}"
     exponent = "" if order == 1 else f"^{order}"
-    return force_effect(
-        id_,
+    return single_force(
+        Amplitude(id_, unit, f"k_{order}", f"{word} stiffness"),
         "stiffness",
         f"{id_}*position**{order}",
-        {id_: Amplitude(id_, unit, f"k_{order}", f"{word} stiffness")},
         formula=f"k_{order} q{exponent}",
         title=f"{word.capitalize()} stiffness",
         source=_SOURCES[order],
@@ -54,45 +52,30 @@ QUINTIC = _power(5, "quintic")
 STIFFNESS_EFFECTS = (LINEAR, STIFFNESS_QUADRATIC, CUBIC, QUINTIC)
 
 
-VISCOUS = force_effect(
-    "viscous_damping",
+VISCOUS = single_force(
+    Amplitude("viscous_damping", "force/(position/s)", "c_1", "viscous damping"),
     "damping",
     "viscous_damping*velocity",
-    {
-        "viscous_damping": Amplitude(
-            "viscous_damping", "force/(position/s)", "c_1", "viscous damping"
-        )
-    },
     formula=r"c_1 \dot q",
     title="Viscous damping",
     source="Den Hartog (1956), Mechanical Vibrations, section 2.1",
 )
 
-QUADRATIC = force_effect(
-    "quadratic_damping",
+QUADRATIC = single_force(
+    Amplitude("quadratic_damping", "force/(position/s)**2", "c_2", "quadratic damping"),
     "damping",
     "quadratic_damping*velocity*abs(velocity)",
-    {
-        "quadratic_damping": Amplitude(
-            "quadratic_damping", "force/(position/s)**2", "c_2", "quadratic damping"
-        )
-    },
     formula=r"c_2 \dot q |\dot q|",
     title="Quadratic damping (orifice)",
     source="Verbeek (1993), eq. 6.1",
 )
 
 # Smooth at rest: a power below one has an infinite slope there, which no Newton iteration survives.
-POWER_LAW = force_effect(
-    "power_law_damping",
+POWER_LAW = single_force(
+    Amplitude("power_law_damping", "force", "F_a", "damping force at the largest velocity"),
     "damping",
     "power_law_damping*velocity/largest_velocity"
     "*((velocity/largest_velocity)**2 + 1e-6)**((exponent - 1)/2)",
-    {
-        "power_law_damping": Amplitude(
-            "power_law_damping", "force", "F_a", "damping force at the largest velocity"
-        )
-    },
     shapes=(
         ShapeParameter(
             "exponent", "", "a", "exponent of the velocity", values(0.25, 0.5, 1.0, 1.5, 2.5)
@@ -141,14 +124,14 @@ def _scaling_effect(
     )
 
 
-def _extending(_: Model, place: Coordinate) -> sp.Expr:
-    assert place.velocity is not None
-    return sp.Heaviside(-place.velocity, sp.Rational(1, 2))
+def _in_sense(sense: int) -> Callable[[Model, Coordinate], sp.Expr]:
+    """One while the velocity has this sign, else zero."""
 
+    def factor(_: Model, place: Coordinate) -> sp.Expr:
+        assert place.velocity is not None
+        return sp.Heaviside(sense * place.velocity, sp.Rational(1, 2))
 
-def _compressing(_: Model, place: Coordinate) -> sp.Expr:
-    assert place.velocity is not None
-    return sp.Heaviside(place.velocity, sp.Rational(1, 2))
+    return factor
 
 
 DIRECTION_DEPENDENT = _scaling_effect(
@@ -158,7 +141,7 @@ DIRECTION_DEPENDENT = _scaling_effect(
     Amplitude(
         "direction_dependent_damping", "", r"\delta_-", "damping in extension over that stated, - 1"
     ),
-    _extending,
+    _in_sense(-1),
 )
 
 COMPRESSION = _scaling_effect(
@@ -168,7 +151,7 @@ COMPRESSION = _scaling_effect(
     Amplitude(
         "compression_damping", "", r"\delta_+", "damping in compression over that stated, - 1"
     ),
-    _compressing,
+    _in_sense(1),
 )
 
 STROKE_DEPENDENT = _scaling_effect(
@@ -192,52 +175,43 @@ TEMPERATURE_DEPENDENT = _scaling_effect(
     requires=("temperature", "temperature_ratio"),
 )
 
-EXTENSION_ONLY = force_effect(
-    "extension_damping",
+EXTENSION_ONLY = single_force(
+    Amplitude(
+        "extension_damping", "force/(position/s)**2", "c_-", "quadratic damping in extension"
+    ),
     "damping",
     "extension_damping*velocity*abs(velocity)*step(-velocity)",
-    {
-        "extension_damping": Amplitude(
-            "extension_damping", "force/(position/s)**2", "c_-", "quadratic damping in extension"
-        )
-    },
     formula=r"c_- \dot q |\dot q| \,[\dot q < 0]",
     title="Quadratic damping in extension only",
     source="Verbeek (1993), section 6.4: rebound valve",
 )
 
-CUBIC_EXTENSION = force_effect(
-    "choked_rebound",
+CUBIC_EXTENSION = single_force(
+    Amplitude(
+        "choked_rebound",
+        "force/(position/s)**3",
+        "c_{3-}",
+        "cubic damping in extension",
+        sign=1,
+    ),
     "damping",
     "choked_rebound*velocity**3*step(-velocity)",
-    {
-        "choked_rebound": Amplitude(
-            "choked_rebound",
-            "force/(position/s)**3",
-            "c_{3-}",
-            "cubic damping in extension",
-            sign=1,
-        )
-    },
     formula=r"c_{3-} \dot q^3 \,[\dot q < 0]",
     title="Flow that chokes in extension",
     source="a term of third order where flow resists more than an orifice does; Milwitzky and Cook"
     " (1953), NACA Report 1154, for orifice and snubber",
 )
 
-CAVITATING = force_effect(
-    "cavitating_rebound",
+CAVITATING = single_force(
+    Amplitude(
+        "cavitating_rebound",
+        "force/(position/s)**2",
+        r"c_\mathrm{cav}",
+        "quadratic damping lost in extension beyond the onset",
+        sign=1,
+    ),
     "damping",
     "cavitating_rebound*positive(-velocity - onset)**2",
-    {
-        "cavitating_rebound": Amplitude(
-            "cavitating_rebound",
-            "force/(position/s)**2",
-            r"c_\mathrm{cav}",
-            "quadratic damping lost in extension beyond the onset",
-            sign=1,
-        )
-    },
     shapes=(
         ShapeParameter(
             "onset",

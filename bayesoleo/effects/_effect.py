@@ -1,18 +1,17 @@
 """Effects: small changes of a model, with parameters, null values and checks.
 
-What can be wrong with a declared effect before any model is there: names, null, units, grids.
-
-What an effect is: a small change of a model, with its parameters, its null and its formula.
-
-An effect is a frozen value that says where in a model it can sit (:attr:`Effect.places`) and what
-it changes there (:attr:`Effect.change`). :meth:`Effect.extend` makes the extended model, at the
-null: with the new amplitudes at their null value it predicts what the old model predicts, so that
+An effect is a frozen value that says where in a model it applies (:attr:`Effect.places`) and how it
+changes the model there (:attr:`Effect.change`). :meth:`Effect.extend` makes the extended model at
+the null: with the new amplitudes at their null value it predicts the same as the old model, so that
 a score test needs no refit.
+
+The checks of a declared effect (names, null, units, scan grids) need no model.
 """
 
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +22,15 @@ import numpy as np
 import sympy as sp
 
 from bayesoleo.effects._parts import Amplitude, Constant, Scales, ShapeParameter, always
-from bayesoleo.effects._places import parse_unit, target_units, unit_of, unit_text
+from bayesoleo.effects._places import (
+    is_quantity,
+    measures,
+    parse_unit,
+    substitute,
+    target_units,
+    unit_of,
+    unit_text,
+)
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model._expressions import FUNCTIONS, derivative_symbol, parse, symbol
 from bayesoleo.model._model import Model
@@ -345,7 +352,7 @@ class Effect:
         if target not in self.places(model):
             where = ", ".join(self.places(model)) or "nowhere in this model"
             raise ModelError(f"effect {self.id} does not apply to {target!r}", hint=where)
-        names = {own: _free(name, model) for own, name in self.names(model, target).items()}
+        names = {own: free_name(name, model) for own, name in self.names(model, target).items()}
         shapes = [shape for shape in self.shapes if shape.needed(model)]
         grids = {shape.name: shape.grid(model, target, scales) for shape in shapes}
         for name, grid in grids.items():
@@ -408,17 +415,37 @@ def _with_prefix(effect: str, name: str) -> str:
     return name if name.startswith(effect) else f"{effect}_{name}"
 
 
-def _free(name: str, model: Model) -> str:
-    """The name, or the first of ``name_2, name_3, …`` that the model does not use yet."""
-    taken = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}
-    if name not in taken:
-        return name
-    number = 2
-    while f"{name}_{number}" in taken:
-        number += 1
-    return f"{name}_{number}"
-
-
 def free_name(name: str, model: Model) -> str:
-    """A name for a new dof or definition that collides with nothing in the model."""
-    return _free(name, model)
+    """The name, or the first of ``name_2, name_3, …`` that the model does not use yet."""
+    if not is_quantity(model, name):
+        return name
+    numbered = (f"{name}_{number}" for number in itertools.count(2))
+    return next(one for one in numbered if not is_quantity(model, one))
+
+
+def error_of(
+    quantity: str, unit: str, amplitude: Amplitude, *, relative: bool = False, **more: Any
+) -> Effect:
+    """An effect that corrects a stated quantity by a new parameter, wherever a model uses it.
+
+    Parameters
+    ----------
+    quantity, unit : str
+        Its name, and the unit that it must have where one is declared.
+    amplitude : Amplitude
+        The error; the effect is named after it.
+    relative : bool
+        Whether it multiplies the quantity by one plus itself; else it is added.
+    **more
+        Further fields of the effect.
+    """
+
+    def places(model: Model) -> Sequence[str]:
+        declared = is_quantity(model, quantity) and measures(model, quantity, unit)
+        return (quantity,) if declared else ()
+
+    def change(model: Model, target: str, names: Names) -> Model:
+        old, error = symbol(target), names[amplitude.name]
+        return substitute(model, {old: old * (1 + error) if relative else old + error})
+
+    return Effect(id=amplitude.name, amplitudes=(amplitude,), places=places, change=change, **more)

@@ -1,16 +1,13 @@
 """End stops and other contacts over part of the stroke, and series compliance.
 
-Contact: springs that act over part of the stroke only.
+The point of contact is stated as a depth below the extreme of the estimated motion: a positive
+length for any zero of the position.
 
-The point of contact is stated as the depth by which the estimated motion goes beyond it: a positive
-length, whatever the zero of the position is.
-
-Compliance in series: the frame gives, so what is measured is not what moves.
-
-Where a force drives the model, the measured position shows what the frame gives as well. Where the
-position drives it, the position behind the frame is what is measured less compliance times the
-force *as measured*. Solving for that position with the predicted force instead would need harmonics
-of the position that are below its noise: dry friction jumps, and so does what the frame gives.
+Compliance in series separates the measured position from that of the specimen. Where a force drives
+the model, the measured position includes the displacement of the frame. Where the position drives
+it, the position behind the frame is the measured one less compliance times the force *as measured*.
+Solving for that position with the predicted force would need harmonics of the position that are
+below its noise, because the displacement of the frame jumps with dry friction.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._force_effect import force_effect
+from bayesoleo.effects._force_effect import single_force
 from bayesoleo.effects._parts import Amplitude, ShapeParameter, range_grid
 from bayesoleo.effects._places import force_places, resisting_places, substitute
 from bayesoleo.model._drive import MAXIMUM_DERIVATIVE
@@ -56,11 +53,10 @@ def _stop(side: str, power: str, word: str) -> Effect:
     unit = "force/position" if not power else "force/position**1.5"
     inside = r"q_\mathrm{min} + h - q" if lower else r"q - q_\mathrm{max} + h"
     sign = "-" if lower else ""
-    return force_effect(
-        id_,
+    return single_force(
+        Amplitude(id_, unit, "k_h", "contact stiffness", 1),
         "contact",
         f"{sign}{id_}*{beyond}{power}",
-        {id_: Amplitude(id_, unit, "k_h", "contact stiffness", 1)},
         shapes=(_DEPTH,),
         formula=rf"{sign} k_h \max({inside}, 0){exponent}",
         title=f"{'End stop' if not power else 'Hertzian contact'} at the {side} end",
@@ -75,15 +71,10 @@ END_STOP_UPPER = _stop("upper", "", "end_stop")
 HERTZIAN_LOWER = _stop("lower", "**(3/2)", "hertzian_contact")
 HERTZIAN_UPPER = _stop("upper", "**(3/2)", "hertzian_contact")
 
-PLAY = force_effect(
-    "play",
+PLAY = single_force(
+    Amplitude("play", "force/position", "k_g", "stiffness that acts beyond the gap only", 1),
     "contact",
     "-play*max(min(position - (lowest_position + highest_position)/2, gap), -gap)",
-    {
-        "play": Amplitude(
-            "play", "force/position", "k_g", "stiffness that acts beyond the gap only", 1
-        )
-    },
     shapes=(
         ShapeParameter(
             "gap", "position", "g", "half the gap about mid-stroke", range_grid(1 / 64, 1 / 4)
@@ -94,11 +85,10 @@ PLAY = force_effect(
     source="Nordin and Gutman (2002), Automatica 38(10), 1633-1649",
 )
 
-PRELOAD = force_effect(
-    "preload",
+PRELOAD = single_force(
+    Amplitude("preload", "force", "F_p", "force that a preloaded spring holds", 1),
     "contact",
     "preload*2/pi*atan((position - (lowest_position + highest_position)/2)/width)",
-    {"preload": Amplitude("preload", "force", "F_p", "force that a preloaded spring holds", 1)},
     shapes=(
         ShapeParameter(
             "width",

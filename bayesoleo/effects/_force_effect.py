@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import sympy as sp
 
@@ -154,6 +155,11 @@ def force_effect(
     )
 
 
+def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any) -> Effect:
+    """A :func:`force_effect` with one amplitude, after which it is named."""
+    return force_effect(amplitude.name, family, expression, {amplitude.name: amplitude}, **more)
+
+
 def _latex(expression: str, used: set[str], effect: str) -> str:
     """LaTeX of an expression whose author gave none."""
     words = {"position": "q", "velocity": r"\dot q", "acceleration": r"\ddot q"}
@@ -180,14 +186,16 @@ _MOTION_CONSTANTS = (
     Constant("highest_position", "position", "highest position reached", _highest),
 )
 
+
+def transition_velocity(name: str) -> ShapeParameter:
+    """The velocity of a smooth sign, to be scanned."""
+    words = "velocity at which friction has half its final size"
+    return ShapeParameter(name, "position/s", "v_0", words, velocity_grid(1 / 512, 1 / 4))
+
+
 #: Velocity over which the sign of a dry friction force changes, where the model states no slope.
-_SMOOTHING = ShapeParameter(
-    "smoothing",
-    "position/s",
-    "v_0",
-    "velocity at which friction has half its final size",
-    velocity_grid(1 / 512, 1 / 4),
-    needed=lambda model: FRICTION_SLOPE not in model.parameters,
+_SMOOTHING = replace(
+    transition_velocity("smoothing"), needed=lambda model: FRICTION_SLOPE not in model.parameters
 )
 
 

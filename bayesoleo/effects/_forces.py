@@ -1,4 +1,4 @@
-"""Forces that follow no motion, and inertia."""
+"""Constant, periodic and drifting forces, and inertia."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects._effect import BY_RUN, Effect, Names
-from bayesoleo.effects._force_effect import force_effect
+from bayesoleo.effects._effect import BY_RUN, Effect, Names, error_of
+from bayesoleo.effects._force_effect import single_force
 from bayesoleo.effects._parts import Amplitude, Scales, Scan, ShapeParameter
 from bayesoleo.effects._places import (
     acceleration,
     balance_terms,
     drives,
     force_places,
-    is_quantity,
-    measures,
     moving_places,
     resistance_sense,
     resisting_places,
-    substitute,
 )
 from bayesoleo.model._expressions import COSINE, SINE, TIME, symbol, within
 from bayesoleo.model._model import Model
@@ -28,25 +25,19 @@ from bayesoleo.model._model import Model
 #: Name under which a model may declare the acceleration of gravity.
 GRAVITY = "gravity"
 
-CONSTANT = force_effect(
-    "constant_force",
+CONSTANT = single_force(
+    Amplitude("constant_force", "force", "F_0", "constant force"),
     "force",
     "constant_force",
-    {"constant_force": Amplitude("constant_force", "force", "F_0", "constant force")},
     formula="F_0",
     title="Constant force (preload, weight)",
     source="Verbeek (1993), eq. 6.1: the weight",
 )
 
-OFFSET_BY_RUN = force_effect(
-    "force_offset_by_run",
+OFFSET_BY_RUN = single_force(
+    Amplitude("force_offset_by_run", "force", "F_{0,r}", "constant force of the run", by_run=True),
     "force",
     "force_offset_by_run",
-    {
-        "force_offset_by_run": Amplitude(
-            "force_offset_by_run", "force", "F_{0,r}", "constant force of the run", by_run=True
-        )
-    },
     formula="F_{0,r}",
     title="Constant force, different in every run",
     source=BY_RUN,
@@ -65,27 +56,16 @@ def _side_of_mass(model: Model, target: str) -> int:
 
 
 MASS = replace(
-    force_effect(
-        "mass_error",
+    single_force(
+        Amplitude("mass_error", "force/(position/s**2)", r"\Delta m", "added mass"),
         "force",
         "mass_error*acceleration",
-        {"mass_error": Amplitude("mass_error", "force/(position/s**2)", r"\Delta m", "added mass")},
         formula=r"\Delta m \, \ddot q",
         title="Mass error (inertia)",
         source="Newton (1687), second law",
     ),
     side=_side_of_mass,
 )
-
-
-def _declares_gravity(model: Model) -> Sequence[str]:
-    """Models that name it: an acceleration, not a force."""
-    named = is_quantity(model, GRAVITY) and measures(model, GRAVITY, "m/s**2")
-    return (GRAVITY,) if named else ()
-
-
-def _heavier(model: Model, target: str, names: Names) -> Model:
-    return substitute(model, {symbol(target): symbol(target) + names["gravity_error"]})
 
 
 #: Harmonics of the drive that a periodic force may have. Dry friction that is as large in every run
@@ -197,16 +177,14 @@ HUMMING = Effect(
     shown=lambda scales: scales.dominant_frequency is not None,
 )
 
-GRAVITY_ERROR = Effect(
-    id="gravity_error",
+# A model that names a force "gravity" is no place: the unit must be that of an acceleration.
+GRAVITY_ERROR = error_of(
+    GRAVITY,
+    "m/s**2",
+    Amplitude("gravity_error", "parameter", r"\Delta g", "acceleration beyond that stated"),
     family="force",
     title="Gravity error (a rig that is not upright)",
     formula=r"g + \Delta g",
-    amplitudes=(
-        Amplitude("gravity_error", "parameter", r"\Delta g", "acceleration beyond that stated"),
-    ),
-    places=_declares_gravity,
-    change=_heavier,
     source="Verbeek (1993), eq. 6.1: the weight",
     applies_to=f"models that declare {GRAVITY}",
 )

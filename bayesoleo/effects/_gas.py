@@ -1,8 +1,6 @@
 """Effects of the gas law: solubility, compliance, volume, pressure and exponent.
 
-The gas law: solubility, compliant oil and cylinder, volume, pressure and exponent.
-
-A model has a gas spring that these effects know if it declares, under these names,
+A model has a gas spring that these effects recognise if it declares, under these names,
 
 ========================= ============================================================
 ``volume_ratio``          definition: gas volume over ``initial_volume``
@@ -15,15 +13,14 @@ A model has a gas spring that these effects know if it declares, under these nam
 ``ambient_pressure``      parameter or condition, Pa (for the thermal effects; optional)
 ========================= ============================================================
 
-as the oleos of :mod:`bayesoleo.systems.oleo` do, each definition in terms of those before it. An
-effect asks for those that it changes or needs; ``volume_ratio`` and ``gas_pressure`` make the
-second and the third where they are not declared (:func:`as_gas_spring`).
+as the oleos of :mod:`bayesoleo.systems` do, each definition in terms of those before it. An effect
+requires the names that it changes or uses. Where the second and the third are not declared,
+``volume_ratio`` and ``gas_pressure`` define them (:func:`as_gas_spring`). :func:`undeclared` lists
+the names that a model lacks.
 
 References
 ----------
 Verbeek (1993), eqs. 6.1-6.4 and section 7.3 (the five causes behind "solubility").
-
-What a model of a gas spring must declare for each effect of the gas to be tried.
 """
 
 from __future__ import annotations
@@ -32,21 +29,21 @@ from collections.abc import Callable, Sequence
 
 import sympy as sp
 
-from bayesoleo.effects._effect import BY_RUN, Effect, Names, free_name
+from bayesoleo.effects._effect import BY_RUN, Effect, Names, error_of, free_name
 from bayesoleo.effects._parts import Amplitude
-from bayesoleo.effects._places import is_quantity, measures, substitute
+from bayesoleo.effects._places import is_quantity
 from bayesoleo.model._expressions import split_derivative, symbol, total_derivative
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Dof
 
-_ROLES = ("volume_ratio", "gas_pressure")
+_LAW = ("volume_ratio", "gas_pressure")
 
 Change = Callable[[Model, str, Names], Model]
 
 
 def has_gas(model: Model, *more: str) -> bool:
     """Whether a model declares a gas spring, and further names."""
-    return all(name in model.definitions for name in _ROLES) and is_quantity(model, *more)
+    return all(name in model.definitions for name in _LAW) and is_quantity(model, *more)
 
 
 def as_gas_spring(model: Model) -> Model:
@@ -75,11 +72,6 @@ def of_gas(change: Change) -> Change:
 
 def _where(target: str, *more: str) -> Callable[[Model], Sequence[str]]:
     return lambda model: (target,) if has_gas(as_gas_spring(model), *more) else ()
-
-
-def _quantity(name: str, unit: str) -> Callable[[Model], Sequence[str]]:
-    """Whatever the model: what is stated may be wrong."""
-    return lambda model: (name,) if is_quantity(model, name) and measures(model, name, unit) else ()
 
 
 # -- solubility ------------------------------------------------------------------------------------
@@ -207,52 +199,37 @@ CYLINDER_EXPANSION = _compliant(
 # -- volume, pressure, exponent --------------------------------------------------------------------
 
 
-def _replacing(name: str, own: str, factor: bool) -> Callable[[Model, str, Names], Model]:
-    """Replace a quantity by itself plus (or times one plus) the new parameter, everywhere."""
-
-    def change(model: Model, target: str, names: Names) -> Model:
-        old = symbol(name)
-        return substitute(model, {old: old * (1 + names[own]) if factor else old + names[own]})
-
-    return change
-
-
-EXTRA_VOLUME = Effect(
-    id="extra_volume",
+EXTRA_VOLUME = error_of(
+    "initial_volume",
+    "m**3",
+    Amplitude("extra_volume", "m**3", "V_e", "volume beyond the initial volume"),
     family="gas",
     title="More gas volume than stated (gauge, lines)",
     formula=r"V_0 + V_e",
-    amplitudes=(Amplitude("extra_volume", "m**3", "V_e", "volume beyond the initial volume"),),
-    places=_quantity("initial_volume", "m**3"),
-    change=_replacing("initial_volume", "extra_volume", factor=False),
     source="Verbeek (1993), section 7.3",
     applies_to="gas springs",
 )
 
-PRESSURE_ERROR = Effect(
-    id="initial_pressure_error",
+PRESSURE_ERROR = error_of(
+    "initial_pressure",
+    "Pa",
+    Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),
+    relative=True,
     family="gas",
     title="Error of the initial pressure, the same in all runs",
     formula=r"p_0 (1 + \epsilon)",
-    amplitudes=(Amplitude("initial_pressure_error", "", r"\epsilon", "relative error of p_0"),),
-    places=_quantity("initial_pressure", "Pa"),
-    change=_replacing("initial_pressure", "initial_pressure_error", factor=True),
     source="Verbeek (1993), eq. 6.2: theta_5",
     applies_to="gas springs",
 )
 
-PRESSURE_ERROR_BY_RUN = Effect(
-    id="initial_pressure_by_run",
+PRESSURE_ERROR_BY_RUN = error_of(
+    "initial_pressure",
+    "Pa",
+    Amplitude("initial_pressure_by_run", "", r"\epsilon_r", "relative error of p_0", by_run=True),
+    relative=True,
     family="gas",
     title="Error of the initial pressure by run (leakage, drift)",
     formula=r"p_0 (1 + \epsilon_r)",
-    amplitudes=(
-        Amplitude(
-            "initial_pressure_by_run", "", r"\epsilon_r", "relative error of p_0", by_run=True
-        ),
-    ),
-    places=_quantity("initial_pressure", "Pa"),
-    change=_replacing("initial_pressure", "initial_pressure_by_run", factor=True),
     source=BY_RUN,
     applies_to="gas springs",
 )
@@ -288,7 +265,6 @@ EFFECTS = (
 )
 
 
-_LAW = ("volume_ratio", "gas_pressure")
 _VOLUME = (*_LAW, "initial_volume", "initial_pressure")
 _ANY = {
     "oil_compressibility": _VOLUME,

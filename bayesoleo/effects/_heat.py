@@ -1,10 +1,8 @@
 """Thermal effects: heat of the gas into the wall and into the oil.
 
-Heat: of the gas, into the wall, into the oil.
-
-Beyond the names of :mod:`bayesoleo.effects.gas`, a model with heat exchange declares the dof
-``temperature`` (of the gas, K) and the definitions ``heat_loss`` and ``gas_power`` (W), and its
-equation holds them. Wall and oil are one more dof each: their temperature above the ambient.
+Beyond the names of a gas spring, a model with heat exchange declares the dof ``temperature`` (of
+the gas, K) and the definitions ``heat_loss`` and ``gas_power`` (W), which its equation contains.
+Wall and oil add one dof each: their temperature above the ambient.
 
 References
 ----------

@@ -1,10 +1,9 @@
-"""An effect without a name: a force, or another term of a balance, that is any smooth function of
-one or two quantities.
+"""Nonparametric effects: any smooth function of one or two quantities, as a term of a balance.
 
-The function is a sum of cubic B-splines on equal pieces of the range that the motion covers; beyond
-that range, of which nothing is known, it fades to zero within three pieces. In two quantities it is
-the sum over products. What the present model can do as well is taken out by letting some of the
-coefficients depend on the others, so that neither loses its meaning.
+The function is a sum of cubic B-splines on equal pieces of the range that the motion covers. Beyond
+that range the function is unknown and fades to zero within three pieces. In two quantities it is a
+sum over products. Directions that the present model can produce are removed: some coefficients
+depend on the others, so that both keep their meaning.
 
 References
 ----------

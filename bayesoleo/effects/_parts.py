@@ -1,9 +1,6 @@
 """Parameters of effects: amplitudes, shapes, constants, and the grids that scan shapes.
 
-Of what effects are made: amplitudes that switch them on, shapes that are scanned, constants, and
-the sizes of the motion that place the scans.
-
-Scan grids of shape parameters, placed by the sizes of the motion.
+Amplitudes switch an effect on. Shapes are scanned on grids that the sizes of the motion place.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Places where effects can act, and units of expressions there.
 
-Units of expressions, so that an effect's parameters carry the right ones wherever it sits.
-
-Where force-like effects can act, and which terms of a balance already resist motion.
+A force-like effect acts in a balance of forces. The units at a place give the parameters of an
+effect their units. The terms of a balance that already resist motion are found by their form.
 """
 
 from __future__ import annotations
@@ -86,10 +85,13 @@ def _unit_of_symbol(item: sp.Symbol, model: Model) -> Any:
     name, order = split_derivative(item)
     if name in model.definitions:
         return unit_of(model.definitions[name], model)
-    declared = {**model.inputs, **{k: v.unit for k, v in model.dofs.items()}}
-    declared |= {k: v.unit for k, v in model.parameters.items()}
-    declared |= {k: v.unit for k, v in model.conditions.items()}
-    return parse_unit(declared[name]) / parse_unit("s") ** order
+    return parse_unit(_declared_units(model)[name]) / parse_unit("s") ** order
+
+
+def _declared_units(model: Model) -> dict[str, str]:
+    declared = model.dofs, model.parameters, model.conditions
+    units = {name: item.unit for items in declared for name, item in items.items()}
+    return {**model.inputs, **units}
 
 
 def _common_unit(expression: sp.Expr, model: Model) -> Any:
@@ -323,10 +325,7 @@ def is_quantity(model: Model, *names: str) -> bool:
 
 def measures(model: Model, name: str, unit: str) -> bool:
     """Whether a declared quantity is in a unit of this kind, as far as units tell."""
-    declared = {**model.inputs, **{key: item.unit for key, item in model.dofs.items()}}
-    declared |= {key: item.unit for key, item in model.parameters.items()}
-    declared |= {key: item.unit for key, item in model.conditions.items()}
-    own = declared.get(name, "")
+    own = _declared_units(model).get(name, "")
     return not own or dimensions(own) == dimensions(unit)
 
 

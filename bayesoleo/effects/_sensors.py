@@ -1,11 +1,10 @@
 """Sensor effects (offset, gain, lag, drift, saturation), and run-to-run parameters.
 
-What changes from run to run though the model takes it as constant.
+A channel shows :math:`m` where the model says :math:`y`. For an output the effect changes the
+expression. For an input, which *is* the measured value, the true quantity of the model is computed
+from it.
 
-Sensors: offset, gain, lag, drift and saturation of a channel.
-
-A channel shows :math:`m` where the model says :math:`y`. Of an output the expression changes;
-of an input, which *is* what was measured, the model's own quantity is got back from it.
+A run-to-run effect lets a parameter vary that the model holds constant over the runs.
 """
 
 from __future__ import annotations

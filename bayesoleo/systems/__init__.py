@@ -1,4 +1,4 @@
-"""Systems that are declared ready to use, with known answers."""
+"""Built-in systems, ready to use, with known answers."""
 
 import lazy_loader
 

@@ -1,22 +1,17 @@
 """The oleo of Verbeek (1993): gas spring, damping, friction; drop test; published values.
 
-Published values of Verbeek (1993): the shaker grid and the estimates run by run.
+The parameters are physical, so that a change of the initial volume reaches every coefficient that
+contains it; the theta of the thesis are definitions of them. The ``thesis`` variants follow the
+thesis instead: theta_4, theta_6 and one more are estimated and the other theta are numbers,
+although they contain the area and the volume. Code ``f16nXdZ``: X dofs, Z outputs. Stroke is
+positive in compression, pressure is gauge.
 
-Numbers as printed; what is illegible in the scan is NaN. They are what a reproduction is held
-against, and no default of any model.
+In the drop test a mass on top is released at rest with the oleo fully extended. Gravity alone
+compresses the oleo, and its force is measured (Verbeek 1993, section 6.4: theta_1 = 350 or 825 kg,
+F_e = 0, theta_2 = -9.81 m/s**2).
 
-The oleo of Verbeek (1993): gas spring, orifice damping and friction; mechanical and thermal.
-
-Parametrised physically, so that a change of the initial volume reaches every coefficient it is in;
-the thesis's theta are definitions of these. The ``thesis`` variants do as the thesis did: theta_4
-and theta_6 and one more are estimated, the rest of the theta are numbers, although the area and the
-volume are in them. Code ``f16nXdZ``: X dofs, Z outputs. Stroke is positive in compression, pressure
-is gauge.
-
-The oleo in a drop test: a mass on top, released at rest with the oleo fully extended.
-
-Gravity compresses, nothing else drives, and the force of the oleo is measured (Verbeek 1993,
-section 6.4: theta_1 = 350 or 825 kg, F_e = 0, theta_2 = -9.81 m/s**2).
+The published values are the shaker grid and the estimates run by run, as printed; digits that are
+illegible in the scan are NaN. Reproductions are compared with them; no model uses them as defaults.
 """
 
 from __future__ import annotations

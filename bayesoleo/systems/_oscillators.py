@@ -1,8 +1,6 @@
 """Springs, dampers, oscillators, a limit cycle and strange attractors.
 
-Springs, dampers and oscillators: the smallest systems that each idea needs.
-
-Systems that move by themselves: a limit cycle and two strange attractors.
+Each is the smallest system that shows one idea.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The built-in systems by name, and equations as text and LaTeX.
 
-A model in words: equations as text and as LaTeX, parameters with units and priors.
-
-The systems that come with the package, by name.
+The description of a model also lists its parameters with units and priors.
 """
 
 from __future__ import annotations

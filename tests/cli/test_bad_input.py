@@ -48,7 +48,7 @@ def test_a_transient_to_propose_from_is_refused_before_anything_is_estimated(
     monkeypatch.setattr("bayesoleo._workflow.closing.run_loop", estimated)
     for frequency in ("frequency = 1.0", "frequency = 2.0"):
         change(campaign / "campaign.toml", frequency, 'kind = "transient"')
-    message = "what to measure next is foreseen for periodic runs only"
+    message = "the next run can be proposed for periodic runs only"
     assert message in refused("propose", campaign, "--model", model)
 
 

@@ -209,7 +209,7 @@ BAD_TOML = [
     ),
     (
         {"frequency = 1.0": "frequency = 1.0\nstart = 9.0"},
-        "key start: nothing is left .*from 0 to 2.98 s",
+        "key start: fewer than three samples .*from 0 to 2.98 s",
     ),
     (
         {"frequency = 1.0": "frequency = 1.0\nstart = 2.0\nstop = 1.0"},

@@ -145,7 +145,7 @@ def test_twice_the_frequency_is_found_out_where_one_channel_does_repeat(tmp_path
     assert record.frequency == pytest.approx(2 * FREQUENCY, rel=1e-3)
     assert periods_per_motion(record) == (2, "displacement")
     (sentence,) = data_warnings([record])
-    assert "displacement repeats after 2 declared periods only" in sentence
+    assert "displacement repeats only after 2 declared periods" in sentence
     assert sentence.endswith("write frequency = 2")
 
 

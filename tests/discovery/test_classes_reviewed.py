@@ -108,9 +108,9 @@ def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(t
         Assembly(damper(cubic=False)), roles, NUMERICS, effects=EFFECTS, known=begun, max_effects=2
     )
     assert set(loop.effects) == {"cubic_stiffness", "coulomb_friction"}
-    told = [entry.reason for entry in loop.rounds if "stands instead of" in entry.reason]
+    told = [entry.reason for entry in loop.rounds if "; it replaces " in entry.reason]
     assert len(told) == 1
-    assert "it stands instead of quintic_stiffness" in told[0]
+    assert "it replaces quintic_stiffness" in told[0]
     assert "±" in told[0]
     assert loop.final.at_floor
 

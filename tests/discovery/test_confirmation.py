@@ -279,9 +279,9 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
 def test_runs_that_speak_against_an_effect_are_not_outvoted():
     """Halves of the fitted runs are asked where the others say little, not where they object."""
     against = Fall(-1070.0, 150.0, 5000.0, 300.0)
-    assert against.speaks_against
-    assert not Fall(-100.0, 150.0, 5000.0).speaks_against
-    assert not Fall(-400.0, 150.0, 5000.0, 300.0).speaks_against
+    assert against.contradicts
+    assert not Fall(-100.0, 150.0, 5000.0).contradicts
+    assert not Fall(-400.0, 150.0, 5000.0, 300.0).contradicts
 
 
 def test_next_to_nothing_confirms_nothing_however_sure():

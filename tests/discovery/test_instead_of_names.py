@@ -28,7 +28,7 @@ def test_a_curve_that_predicts_worse_does_not_stand_instead_of_names(monkeypatch
     after = SimpleNamespace(at_floor=False)
     monkeypatch.setattr(unnamed_round, "closest", lambda *_: ())
     monkeypatch.setattr(unnamed_round, "confirmed", lambda *_: (after, "it explains much"))
-    monkeypatch.setattr(unnamed_round, "speak_against", lambda *_: against)
+    monkeypatch.setattr(unnamed_round, "contradicted", lambda *_: against)
     found, reason = unnamed_round._accepting(outcome, answer, None, NUMERICS, print)
     assert (found is outcome) == against
-    assert ("predicts runs that were not used worse" in reason) == against
+    assert ("predicts hold-out runs worse" in reason) == against

@@ -161,7 +161,7 @@ def test_several_names_in_one_balance_give_way_to_one_curve_that_is_the_law(tmp_
     if len(names) == 1:
         *_, last, _ = loop.rounds
         assert last.before.at_floor, "the names had come down to the noise"
-        assert "stands instead of end_stop_upper" in last.reason
+        assert "replaces end_stop_upper" in last.reason
         # What does nearly the same was estimated, and leaves more than the curve.
         assert last.accepted.same == ()
 
