@@ -1,5 +1,7 @@
-"""How good an estimate is: ``assess`` tests its residuals, ``predict`` scores what it foresees,
-``replicate`` repeats its experiment.
+"""The commands that say how good an estimate is.
+
+``assess`` tests its residuals, ``predict`` scores its predictions, ``replicate`` repeats its
+experiment by simulation.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import typer
 
 from bayesoleo import _schema as schema
 from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._workflow.settings import Settings, words
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,38 +31,26 @@ def add_to(app: typer.Typer) -> None:
 
 
 def assess(
-    results: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULTS.nc", show_default=False, help="results.nc of close or trace."
-        ),
-    ],
+    results: options.ResultPath,
     stage: Annotated[
         str | None,
-        typer.Option(
-            metavar="before|after",
-            show_default="after, where there is one",
-            help="The model as declared, or as extended.",
+        options.option(
+            "--stage",
+            "before|after",
+            "The model as declared, or as extended.",
+            None,
+            "after, where there is one",
         ),
     ] = None,
     figure: Annotated[
-        Path | None,
-        typer.Option(
-            "--figure",
-            metavar="FILE.png",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Draw the assessment; one file an output, its name added.",
-        ),
+        Path | None, options.figure("Draw the assessment; one file an output, its name added.")
     ] = None,
     run: Annotated[
         str | None,
-        typer.Option(
+        options.option(
             "--run",
-            metavar="LABEL",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Draw the tests of this run instead, with the residual against every variable.",
+            "LABEL",
+            "Draw the tests of this run instead, with the residual against every variable.",
         ),
     ] = None,
     as_json: options.Json = False,
@@ -123,44 +114,31 @@ def _draw(data: xr.Dataset, drawn: list[Series], figure: Path) -> None:
         made.savefig(figure.with_stem(f"{figure.stem}-{output}"))
 
 
+@options.of_settings("seed", "jobs")
 def predict(
     results: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULTS.nc",
-            show_default=False,
-            help="results.nc of estimate, sample or close.",
-        ),
+        Path, options.argument("RESULTS.nc", "results.nc of estimate, sample or close.")
     ],
     campaign: options.CampaignPath,
     model: Annotated[
         str | None,
-        typer.Option(
-            "--model",
-            "-m",
-            metavar="MODEL",
-            show_default="that of the result",
-            help="Another model with parameters of the same names, e.g. the specimen on another "
+        options.option(
+            "--model -m",
+            "MODEL",
+            "Another model with parameters of the same names, e.g. the specimen on another "
             "rig. A file is code, and is run.",
+            None,
+            "that of the result",
         ),
     ] = None,
-    runs: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,…", show_default="all", help="Labels of the runs."),
-    ] = None,
+    runs: Annotated[str | None, options.runs("all")] = None,
     draws: Annotated[int, typer.Option(min=2, metavar="N", help="Draws of the parameters.")] = 200,
     figure: Annotated[
         Path | None,
-        typer.Option(
-            "--figure",
-            metavar="FILE.png",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Draw bands and transforms; one file an output, its name added.",
-        ),
+        options.figure("Draw bands and transforms; one file an output, its name added."),
     ] = None,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
+    *,
+    chosen: Settings,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -183,14 +161,13 @@ def predict(
 
     if figure is not None:
         shell.check_writable(figure.parent)
-    labels = None if runs is None else [label.strip() for label in runs.split(",")]
     found = load_result(results).predict(
-        workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet)),
+        workflow.reduce(campaign, jobs=chosen.jobs, progress=shell.progress_shown(quiet)),
         model=None if model is None else load_model(model),
-        runs=labels,
+        runs=None if runs is None else words(runs),
         draws=draws,
-        seed=seed,
-        jobs=jobs,
+        seed=chosen.seed,
+        jobs=chosen.jobs,
     )
     if as_json:
         numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
@@ -203,6 +180,7 @@ def predict(
             found.plot(output=str(output)).savefig(path)
 
 
+@options.of_settings("seed", "jobs", "scheduler", *options.SOLVED)
 def replicate(
     campaign: options.CampaignPath,
     model: options.ModelText,
@@ -213,21 +191,13 @@ def replicate(
             "--replications", "-n", min=2, metavar="N", help="Number of simulated experiments."
         ),
     ] = 1000,
-    runs: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,…", show_default="all to be fitted", help="Labels of the runs."),
-    ] = None,
+    runs: Annotated[str | None, options.runs("all to be fitted")] = None,
     true_inputs: Annotated[
         bool, typer.Option("--true-inputs", help="Leave the measured inputs as they are.")
     ] = False,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    scheduler: options.Scheduler = None,
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
 ) -> None:
     """Repeat an experiment by simulation and compare the scatter of the estimates with theory.
 
@@ -252,14 +222,10 @@ def replicate(
 
     if out is not None:
         shell.check_writable(out)
-    chosen = options.settings(
-        seed=seed, jobs=jobs, drive=drive, scheme=scheme, solver=solver, steps=steps
-    )
     task = workflow.prepare(campaign, load_model(model), chosen)
     records = list(task.roles.fitted)
     if runs is not None:
-        wanted = [label.strip() for label in runs.split(",")]
-        records = [task.reduced.record(label) for label in wanted]
+        records = [task.reduced.record(label) for label in words(runs)]
     if not records:
         raise CampaignError("no run is left", key="--runs", value=runs)
     with shell.stoppable(out):
@@ -271,16 +237,16 @@ def replicate(
             fit.point,
             replications=replications,
             input_noise=not true_inputs,
-            seed=seed,
+            seed=chosen.seed,
             out=out,
-            jobs=jobs,
-            scheduler=scheduler,
+            jobs=chosen.jobs,
+            scheduler=chosen.scheduler,
             progress=shell.progress_shown(quiet),
         )
     console = shell.console()
     console.print(str(found), markup=False, soft_wrap=True)
     if out is not None:
         tree = xr.DataTree.from_dict({schema.SAMPLING_DISTRIBUTION: found.data})
-        tree.attrs.update(provenance(seed, command=chosen.command, model=fit.model.name))
+        tree.attrs.update(provenance(chosen.seed, command=chosen.command, model=fit.model.name))
         write_tree(tree, out / REPLICATIONS)
         console.print(f"result    {out / REPLICATIONS}", markup=False, soft_wrap=True)

@@ -1,15 +1,11 @@
-"""The commands ``close``, ``demo``, ``check`` and ``propose``.
-
-``propose``: which run to make next.
-
-The whole loop: ``close`` on one's own data, ``demo`` on simulated ones, ``check`` beforehand.
-"""
+"""The commands of the whole loop: ``demo``, ``close``, ``check`` and ``propose``."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,12 +13,12 @@ import typer
 
 from bayesoleo import _schema as schema
 from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._workflow.settings import Settings, words
 from bayesoleo.errors import InputError, UnfinishedError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from bayesoleo._workflow.settings import Settings
     from bayesoleo.model._model import Model
 
 
@@ -38,48 +34,34 @@ def add_propose(app: typer.Typer) -> None:
     shell.add(app, PANEL, propose)
 
 
+@options.of_settings("seed", "jobs", "effects", "without", *options.SOLVED, "nuisance")
 def propose(
     campaign: options.CampaignPath,
     model: options.ModelText,
     rivals: Annotated[
         str,
-        typer.Option(
-            metavar="ID,…",
-            show_default=False,
-            rich_help_panel=options.RUNNING,
-            help="Effects to be told apart, by their ids, or id@target; by default those that "
+        options.option(
+            "--rivals",
+            "ID,…",
+            "Effects to be told apart, by their ids, or id@target; by default those that "
             "might be what is missing.",
+            options.RUNNING,
         ),
     ] = "",
     limit: Annotated[
         list[str] | None,
-        typer.Option(
+        options.option(
             "--limit",
-            metavar="NAME=LOW:HIGH[UNIT]",
-            show_default=False,
-            rich_help_panel=options.RUNNING,
-            help="What the rig can do: amplitude, frequency, mean, travel, rate, or an output. SI "
+            "NAME=LOW:HIGH[UNIT]",
+            "What the rig can do: amplitude, frequency, mean, travel, rate, or an output. SI "
             "without a unit; either side may be left out. May be given several times.",
+            options.RUNNING,
         ),
     ] = None,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    drive: options.Drive = None,
-    effects: options.Effects = None,
-    without: options.Without = "",
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
+    *,
+    chosen: Settings,
     figure: Annotated[
-        Path | None,
-        typer.Option(
-            "--figure",
-            metavar="FILE.png",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Draw the separation over frequency and amplitude.",
-        ),
+        Path | None, options.figure("Draw the separation over frequency and amplitude.")
     ] = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -100,15 +82,10 @@ def propose(
     from bayesoleo import _workflow as workflow, plots
     from bayesoleo._workflow.model_files import load_model
 
-    chosen = options.settings(
-        seed=seed, jobs=jobs, drive=drive, effects=effects, scheme=scheme, solver=solver,
-        steps=steps, nuisance=nuisance, without=without,
-    )  # fmt: skip
     limits = dict(_limit(text) for text in limit or [])
-    names = tuple(part.strip() for part in rivals.split(",") if part.strip())
     declared, callback = load_model(model), shell.teller(quiet)
     tree = workflow.propose(
-        campaign, declared, chosen, rivals=names, limits=limits, callback=callback
+        campaign, declared, chosen, rivals=words(rivals), limits=limits, callback=callback
     )
     summary = json.loads(tree.attrs[schema.SUMMARY])
     entries = summary["proposals"]
@@ -170,15 +147,14 @@ def add_loop(app: typer.Typer) -> None:
     shell.add(app, PANEL, demo, close, check)
 
 
+@options.of_settings("seed", "jobs")
 def demo(
     out: Annotated[
         Path,
-        typer.Option(
-            "--out", "-o", metavar="DIR", rich_help_panel=options.OUTPUT, help="Folder to write to."
-        ),
+        options.option("--out -o", "DIR", "Folder to write to.", shown=True),
     ] = Path("bayesoleo-demo"),
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
+    *,
+    chosen: Settings,
     full: Annotated[
         bool,
         typer.Option(
@@ -211,11 +187,11 @@ def demo(
     from bayesoleo._workflow.simulating import demo_campaign
 
     shell.check_writable(out)
-    chosen = options.settings(seed=seed, jobs=jobs, quick=not full)
+    chosen = replace(chosen, quick=not full)
     callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     with shell.stoppable(out):
         callback("simulating a shaker campaign of an oleo")
-        campaign = _fresh_campaign(out, seed, demo_campaign)
+        campaign = _fresh_campaign(out, chosen.seed, demo_campaign)
         model = load_model(DEMO_SYSTEM)
         _closed(campaign, model, chosen, out, callback, progress)
 
@@ -240,26 +216,17 @@ def _is_demo(folder: Path, name: str) -> bool:
         return False
 
 
+@options.of_settings(
+    *options.SAMPLED, "max_effects", "effects", "without", *options.SOLVED,
+    "nuisance", "error_model", "between_runs",
+)  # fmt: skip
 def close(
     campaign: options.CampaignPath,
     model: options.ModelText,
     out: options.Out = None,
-    quick: options.Quick = False,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    scheduler: options.Scheduler = None,
-    effective_size: options.EffectiveSize = 1000,
-    max_effects: options.MaxEffects = 4,
-    effects: options.Effects = None,
-    without: options.Without = "",
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
-    error_model: options.ErrorModel = "independent",
-    between_runs: options.BetweenRuns = "",
 ) -> None:
     """Close the loop: estimate, find what is missing, add it, compare before and after.
 
@@ -285,23 +252,6 @@ def close(
     from bayesoleo._workflow.model_files import load_model
 
     folder = shell.output_folder(out, campaign)
-    chosen = options.settings(
-        seed=seed,
-        jobs=jobs,
-        scheduler=scheduler,
-        quick=quick,
-        effective_size=effective_size,
-        scheme=scheme,
-        solver=solver,
-        steps=steps,
-        max_effects=max_effects,
-        drive=drive,
-        effects=effects,
-        without=without,
-        nuisance=nuisance,
-        error_model=error_model,
-        between_runs=between_runs,
-    )
     callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(folder):
@@ -329,15 +279,12 @@ def _closed(
     _print_loop(tree, folder)
 
 
+@options.of_settings(*options.SOLVED, "nuisance", "without")
 def check(
     campaign: options.CampaignPath,
     model: options.ModelText,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
-    without: options.Without = "",
+    *,
+    chosen: Settings,
     as_json: options.Json = False,
 ) -> None:
     """Read a campaign and a model, say what would be done, and touch nothing.
@@ -353,9 +300,6 @@ def check(
     from bayesoleo import _workflow as workflow
     from bayesoleo._workflow.model_files import load_model
 
-    chosen = options.settings(
-        scheme=scheme, solver=solver, steps=steps, drive=drive, nuisance=nuisance, without=without
-    )
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:
         shell.print_json(tables.plain(plan))

@@ -1,8 +1,7 @@
 """The commands ``reduce``, ``report`` and ``simulate``.
 
-What the records of a campaign hold: the command ``reduce``.
-
-From results: ``report`` writes the page again, ``simulate`` makes new data.
+``reduce`` shows the records of a campaign; ``report`` writes the page of a result again;
+``simulate`` makes new data from a model or a result.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import typer
 
 from bayesoleo import _schema as schema
 from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,21 +31,18 @@ def add_reduce(app: typer.Typer) -> None:
     shell.add(app, RECORDS_PANEL, reduce)
 
 
+@options.of_settings("jobs")
 def reduce(
     campaign: options.CampaignPath,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE.nc",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Write samples, constants and noise to a netCDF file as well.",
+        options.option(
+            "--out -o", "FILE.nc", "Write samples, constants and noise to a netCDF file as well."
         ),
     ] = None,
     as_json: options.Json = False,
-    jobs: options.Jobs = None,
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
 ) -> None:
     """Show what the records of a campaign hold: frequencies, whole periods, harmonics and noise.
@@ -65,7 +62,7 @@ def reduce(
 
     if out is not None:
         shell.check_writable(out.parent)
-    found = workflow.reduce(campaign, jobs=jobs, progress=shell.progress_shown(quiet))
+    found = workflow.reduce(campaign, jobs=chosen.jobs, progress=shell.progress_shown(quiet))
     if out is not None:
         _write_records(found, out)
     if as_json:
@@ -187,21 +184,14 @@ def add_results(app: typer.Typer) -> None:
 
 
 def report(
-    results: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RESULTS.nc", show_default=False, help="results.nc of close or trace."
-        ),
-    ],
+    results: options.ResultPath,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="FILE.html|DIR",
-            show_default="report.html beside the result",
-            rich_help_panel=options.OUTPUT,
-            help="Page to write, or folder for report.html; an older page is replaced as a whole.",
+        options.option(
+            "--out -o",
+            "FILE.html|DIR",
+            "Page to write, or folder for report.html; an older page is replaced as a whole.",
+            shown="report.html beside the result",
         ),
     ] = None,
 ) -> None:
@@ -227,49 +217,38 @@ def report(
     shell.console().print(f"report    {page}", markup=False, soft_wrap=True)
 
 
+@options.of_settings("seed", "jobs", *options.SOLVED)
 def simulate(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="MODEL|RESULTS.nc",
-            show_default=False,
-            help="Built-in system, file.py:object, or a result with its posterior.",
+        options.argument(
+            "MODEL|RESULTS.nc", "Built-in system, file.py:object, or a result with its posterior."
         ),
     ],
     like: Annotated[
         Path,
-        typer.Option(
-            metavar="CAMPAIGN",
-            show_default=False,
-            help="Campaign whose runs, inputs, conditions and channels the new one has.",
+        options.option(
+            "--like",
+            "CAMPAIGN",
+            "Campaign whose runs, inputs, conditions and channels the new one has.",
+            None,
         ),
     ],
     out: Annotated[
         Path,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="DIR",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-            help="Folder of the new campaign; must not hold files.",
-        ),
+        options.option("--out -o", "DIR", "Folder of the new campaign; must not hold files."),
     ],
     values: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            show_default=False,
-            help="Parameter value in SI; may be repeated.",
-        ),
+        options.option("--set", "NAME=VALUE", "Parameter value in SI; may be repeated.", None),
     ] = None,
     noise: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CHANNEL=VALUE",
-            show_default=False,
-            help="Standard deviation of the noise of a channel in SI; may be repeated.",
+        options.option(
+            "--noise",
+            "CHANNEL=VALUE",
+            "Standard deviation of the noise of a channel in SI; may be repeated.",
+            None,
         ),
     ] = None,
     draws: Annotated[
@@ -281,12 +260,8 @@ def simulate(
             help="From a result: simulate with so many draws of its posterior.",
         ),
     ] = None,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
+    *,
+    chosen: Settings,
 ) -> None:
     """Simulate a campaign with a model, or with the model and posterior of a result.
 
@@ -306,9 +281,6 @@ def simulate(
     if out.is_dir() and any(out.iterdir()):
         raise InputError("folder is not empty", file=out, hint="choose another with --out")
     shell.check_writable(out)
-    chosen = options.settings(
-        seed=seed, jobs=jobs, drive=drive, scheme=scheme, solver=solver, steps=steps
-    )
     amounts = pairs(noise or [], "--noise")
     for channel, sd in amounts.items():
         if sd < 0:

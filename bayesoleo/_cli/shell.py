@@ -1,8 +1,6 @@
-"""Common parts of all commands: errors, warnings, progress, tables.
+"""Common parts of all commands: errors, warnings, progress, output folders and tables.
 
-Tables in the terminal; labels of users are printed as they are, not as markup.
-
-What all commands share: how errors, warnings and progress are told, and where to write.
+Labels of users are printed as they are, not as markup.
 """
 
 from __future__ import annotations

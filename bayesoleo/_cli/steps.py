@@ -1,8 +1,6 @@
-"""The commands ``estimate``, ``sample`` and ``trace``.
+"""The commands ``estimate``, ``sample`` and ``trace``: the steps of the loop one by one.
 
-``estimate --each``: the parameters from each run by itself, and how much the runs differ.
-
-Steps of the loop, each a command of its own: estimate, sample, trace.
+``estimate --each`` estimates the parameters from each run by itself and compares the runs.
 """
 
 from __future__ import annotations
@@ -16,12 +14,12 @@ import typer
 from bayesoleo import _schema as schema
 from bayesoleo._cli import options, shell, shell as tables
 from bayesoleo._cli.records import RECORDS_PANEL
+from bayesoleo._workflow.settings import Settings
 
 if TYPE_CHECKING:
     import xarray as xr
     from rich.console import Console
 
-    from bayesoleo._workflow.settings import Settings
     from bayesoleo.model._model import Model
 
 
@@ -102,19 +100,14 @@ def add_to(app: typer.Typer) -> None:
     shell.add(app, RECORDS_PANEL, estimate, sample, trace)
 
 
+@options.of_settings("jobs", *options.SOLVED, "nuisance", "error_model", "between_runs")
 def estimate(
     campaign: options.CampaignPath,
     model: options.ModelText,
     out: options.Out = None,
-    jobs: options.Jobs = None,
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
-    error_model: options.ErrorModel = "independent",
-    between_runs: options.BetweenRuns = "",
     each: Each = False,
     as_json: options.Json = False,
 ) -> None:
@@ -135,16 +128,6 @@ def estimate(
 
     if out is not None:
         out = shell.output_folder(out, campaign)
-    chosen = options.settings(
-        jobs=jobs,
-        scheme=scheme,
-        solver=solver,
-        steps=steps,
-        drive=drive,
-        nuisance=nuisance,
-        error_model=error_model,
-        between_runs=between_runs,
-    )
     declared = load_model(model)
     if each:
         estimate_each(campaign, declared, chosen, out, quiet, as_json)
@@ -220,23 +203,14 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
     return cast(list[str], lines + json.loads(status["notes"]))
 
 
+@options.of_settings(*options.SAMPLED, *options.SOLVED, "nuisance", "error_model", "between_runs")
 def sample(
     campaign: options.CampaignPath,
     model: options.ModelText,
     out: options.Out = None,
-    quick: options.Quick = False,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    scheduler: options.Scheduler = None,
-    effective_size: options.EffectiveSize = 1000,
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
-    error_model: options.ErrorModel = "independent",
-    between_runs: options.BetweenRuns = "",
 ) -> None:
     """Sample the posterior from the estimate until the effective size asked for is reached.
 
@@ -258,20 +232,6 @@ def sample(
     from bayesoleo._workflow.model_files import load_model
 
     folder = shell.output_folder(out, campaign, "-sample")
-    chosen = options.settings(
-        seed=seed,
-        jobs=jobs,
-        scheduler=scheduler,
-        quick=quick,
-        effective_size=effective_size,
-        scheme=scheme,
-        solver=solver,
-        steps=steps,
-        drive=drive,
-        nuisance=nuisance,
-        error_model=error_model,
-        between_runs=between_runs,
-    )
     callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(folder):
@@ -286,20 +246,14 @@ def sample(
     _print_written(folder, console)
 
 
+@options.of_settings("seed", "jobs", "effects", "without", *options.SOLVED, "nuisance")
 def trace(
     campaign: options.CampaignPath,
     model: options.ModelText,
     out: options.Out = None,
-    seed: options.Seed = 0,
-    jobs: options.Jobs = None,
-    effects: options.Effects = None,
-    without: options.Without = "",
+    *,
+    chosen: Settings,
     quiet: options.Quiet = False,
-    drive: options.Drive = None,
-    scheme: options.Scheme = "radau3",
-    solver: options.Solver = "collocation",
-    steps: options.Steps = None,
-    nuisance: options.Nuisance = "",
 ) -> None:
     """Hold the residual against its noise and rank what may be missing; add nothing.
 
@@ -320,17 +274,6 @@ def trace(
 
     if out is not None:
         out = shell.output_folder(out, campaign)
-    chosen = options.settings(
-        seed=seed,
-        jobs=jobs,
-        scheme=scheme,
-        solver=solver,
-        steps=steps,
-        drive=drive,
-        effects=effects,
-        without=without,
-        nuisance=nuisance,
-    )
     callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
     declared = load_model(model)
     with shell.stoppable(out):

@@ -1,9 +1,4 @@
-"""The HTML report: the case in a few sentences, and the page.
-
-The case in a few sentences: what was wrong, where, what it is, how sure that is.
-
-The page: everything a sceptical engineer asks for, in one file that needs no other.
-"""
+"""The HTML report: the case in a few sentences, then all figures and tables, in one file."""
 
 from __future__ import annotations
 

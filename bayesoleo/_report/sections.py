@@ -1,10 +1,7 @@
-"""Figures of the report with their captions.
+"""Figures of the report with their captions; those without data are left out.
 
-Figures and formulas as addresses that hold the picture itself; a page needs no other file.
-
-Pictures are put in ``<img>`` elements: SVG inside the page would share its ids between figures.
-
-The figures of the page with what is said below each; those without data are left out.
+Figures and formulas are embedded as ``<img>`` with their data: SVG inside the page would share its
+ids between figures.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""Sentences of the report: result, certainty, proposed runs.
-
-What the result says, in sentences.
-
-What to measure next, in sentences and as a table.
-"""
+"""Sentences of the report: the result, how certain it is, and the proposed runs."""
 
 from __future__ import annotations
 

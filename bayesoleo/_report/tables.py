@@ -1,7 +1,7 @@
-"""What an error is held against: what is expected of it, by the noise and by what is not known of
-the parameters; of results that were stored without that, the noise.
+"""Tables of the report: rows of text, in engineering units.
 
-The tables of the page: rows of text, in units an engineer reads.
+An error is compared with its expectation from the noise and the uncertainty of the parameters; in
+results that were stored without it, with the noise.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""The result in a terminal, and the plain report without figures.
-
-The page in place of one that could not be made: what the summary says, without figures.
-
-The result in a few lines of a terminal.
-"""
+"""The result in a few lines of a terminal, and the plain report where figures fail."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""The campaign of a session, which shows itself, and progress bars.
+"""The campaign of a session, and the line that shows progress.
 
-Progress of a step, shown only if it takes a while.
-
-A measured campaign that shows itself; its runs are reduced once, when they are first needed.
+Runs are reduced once, when they are first needed.
 """
 
 from __future__ import annotations

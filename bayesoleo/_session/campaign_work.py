@@ -1,9 +1,4 @@
-"""Work on a campaign that the session's verbs ask for.
-
-Settings given as keywords of a step.
-
-What a session computes for a campaign and a model; the command line's functions do the work.
-"""
+"""The computations of a session for a campaign and a model, by the functions of the workflow."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
-"""Tables and small figures with which the objects of a session show themselves.
+"""How the objects of a session show themselves.
 
-Residuals of a result as labelled arrays.
-
-Figures of a session that :mod:`bayesoleo.plots` has no equivalent of.
-
-What all objects of a session have in common: they show themselves, are pickled, keep results.
+All of them are shown as a table and, in a notebook, with a small figure; they can be pickled and
+keep their results. The figures here have no equivalent in :mod:`bayesoleo.plots`.
 """
 
 from __future__ import annotations

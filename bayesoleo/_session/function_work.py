@@ -1,9 +1,4 @@
-"""Work on a user's function that the session's verbs ask for.
-
-A user's function and a table of data as a problem that can be estimated.
-
-What a session computes for a function and a table of data.
-"""
+"""The computations of a session for a user's function and a table of data."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The problem of a session: what is fitted, and its check.
-
-What is to be fitted: a campaign and a model, or a table and a function.
-"""
+"""The problem of a session: a campaign and a model, or a table and a function."""
 
 from __future__ import annotations
 

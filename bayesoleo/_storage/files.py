@@ -1,13 +1,7 @@
-"""Atomic writing of files, one writer a folder, and checks before work begins.
-
-Replace a file as a whole or not at all.
+"""Atomic writing, one writer to a folder, and a check that a folder can be written to.
 
 A new version is written beside the old one under a hidden name, flushed to the disk and then
 renamed over it, so that a reader, a full disk or a power cut never meets half a result.
-
-One writer to a folder at a time.
-
-Whether results can be written to a folder, found out before anything is computed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""Results on disk: one DataTree as netCDF or Zarr, with provenance.
+"""Results on disk: one DataTree as netCDF (one file) or Zarr (a folder), with its provenance.
 
-Where a result comes from: versions, seed and time, as root attributes.
-
-Write and read a result: one DataTree, as netCDF (one file) or Zarr (a folder).
-
-What comes back equals what was written: NaN padding, text, booleans, units. What xarray remembers
-of an earlier file (chunks, compression, fill values) is dropped, or a tree read from one format
-could not be written as the other.
+A tree is read as it was written: NaN padding, text, booleans, units. Encodings of an earlier file
+that xarray remembers (chunks, compression, fill values) are dropped, since a tree read from one
+format could not be written as the other otherwise.
 """
 
 from __future__ import annotations

@@ -1,17 +1,13 @@
-"""Calculations that resume: digests of what they depend on, and pieces kept on disk.
+"""Calculations that resume: a digest of their inputs, their state and their pieces on disk.
 
-A digest of what a calculation depends on: equal where it says the same, in any process.
+Equal digests mean equal inputs, in any process. A state is pickled: a file is only read where its
+first line carries the key of the calculation that asks for it and its content is whole. Pickles are
+code; resume only from folders of your own.
 
-Keep a calculation's state on disk, so that the same calculation goes on after it was stopped.
-
-The state is pickled: a file is only read where its first line carries the key of the calculation
-that asks for it and its content is whole. Pickles are code; go on only in folders of your own.
-
-Numbered pieces of a long calculation on disk: each whole or absent, only missing ones redone.
-
-Where a piece depends on its own number alone (:meth:`Slots.fill`), a calculation that was stopped
-goes on to the same result in any order and with any number of workers. Where each goes on from the
-one before it (:meth:`Slots.chain`), it goes on from the last that is whole.
+A piece is whole or absent, and only missing ones are computed. Where a piece depends on its own
+number alone (:meth:`Slots.fill`), a calculation that was stopped reaches the same result in any
+order and with any number of workers. Where each depends on the one before it (:meth:`Slots.chain`),
+it resumes from the last whole one.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """From a campaign folder and a model to results: the verbs that the command line and scripts call.
 
-In the order in which a user meets them: ``reduce`` and ``check`` (:mod:`~bayesoleo.workflow.task`),
-``estimate`` and ``estimate_each``, ``sample``, ``trace`` and ``close``, ``propose``, ``simulate``.
+In the order in which a user meets them: ``reduce``, ``check``, ``estimate``, ``estimate_each``,
+``sample``, ``trace``, ``close``, ``propose``, ``simulate``.
 """
 
 import lazy_loader

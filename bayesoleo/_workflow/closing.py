@@ -1,8 +1,7 @@
 """The verbs ``trace``, ``close`` and ``propose``.
 
-Look for what is missing: one round that adds nothing, or the whole loop.
-
-What to measure next: the run that would best tell apart what these runs cannot.
+``trace`` runs one round of the search and adds nothing; ``close`` runs the whole loop; ``propose``
+ranks new runs by how well they separate the candidate effects.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from functools import partial
 import xarray as xr
 
 from bayesoleo._types import ProgressCallback
-from bayesoleo._workflow.estimating import draw
+from bayesoleo._workflow.estimating import NOT_SAMPLED, draw
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
     PROPOSALS_STAGE,
@@ -36,8 +35,6 @@ from bayesoleo.model._model import Model
 
 #: What stands in the place of the search's last round while it goes on.
 NOT_YET = "the search had not finished when this was written"
-#: And in that of the posterior until it is sampled.
-NOT_SAMPLED = "the posterior had not been sampled when this was written"
 
 
 def trace(

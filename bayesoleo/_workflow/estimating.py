@@ -1,8 +1,7 @@
-"""The verbs ``estimate`` and ``sample``.
+"""The verbs ``estimate``, ``estimate_each`` and ``sample``.
 
-Estimate the parameters: from all fitted runs together, or from each run by itself.
-
-Sample the posterior from the estimate.
+Parameters are estimated from all fitted runs together, or from each run by itself; the posterior is
+sampled from the estimate.
 """
 
 from __future__ import annotations
@@ -152,7 +151,7 @@ STARTS = 4
 #: Points about the estimate and from the priors from which the sampler climbs itself: few, because
 #: an estimate from a start is the better way.
 CLIMBS = 8
-NOT_YET = "the posterior had not been sampled when this was written"
+NOT_SAMPLED = "the posterior had not been sampled when this was written"
 
 
 def sample(
@@ -175,7 +174,7 @@ def sample(
         fit, groups = estimated(task, stages)
         groups[schema.POINT] = point_group(fit)
         tree = finish(task, groups, fit)
-        mark_unfinished(tree, [*stages.failed, {"stage": POSTERIOR_STAGE, "reason": NOT_YET}])
+        mark_unfinished(tree, [*stages.failed, {"stage": POSTERIOR_STAGE, "reason": NOT_SAMPLED}])
         output.write(tree)
         place, seed = output.checkpoints, settings.seed
         drawn = stages.attempt(

@@ -1,8 +1,7 @@
-"""Output folder and stages: what is known is kept when a later stage fails.
+"""Output folder and stages of a long calculation.
 
-The folder that a result is written to: checked first, written as soon as something is known.
-
-Stages of a long calculation: one that fails takes nothing with it that was known before.
+A folder is checked before anything is computed and written as soon as something is known. A stage
+that fails takes nothing with it that was known before.
 """
 
 from __future__ import annotations

@@ -1,25 +1,112 @@
-"""What a run of the workflow depends on besides data and model."""
+"""Settings: everything that a result depends on besides data and model.
+
+A new setting is one field. Its metadata hold the option of the command line; fields without
+metadata are set from Python only. This file imports no numerics, so that ``--help`` comes at once.
+"""
 
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from bayesoleo.discovery._fit import Numerics
-from bayesoleo.discovery._inference import Inference
-from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.effects._catalogue import catalogue
-from bayesoleo.effects._effect import Effect
-from bayesoleo.effects._nonparametric import FAMILY
-from bayesoleo.error_models._registry import ERROR_MODELS
 from bayesoleo.errors import InputError
-from bayesoleo.prediction._periodic_solver import check_solver
-from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
+
+if TYPE_CHECKING:
+    from bayesoleo.discovery._fit import Numerics
+    from bayesoleo.discovery._inference import Inference
+    from bayesoleo.discovery._policy import SearchPolicy
+    from bayesoleo.effects._effect import Effect
+
+RUNNING, SOLVING = "How it is run", "How the model is solved"
+SCHEMES = ("radau2", "radau3", "gauss2", "gauss3", "thesis")
+SOLVERS = ("collocation", "adaptive", "shooting", "hybrid", "library")
+#: Key of a field's metadata under which its option is.
+OPTION = "option"
+
+
+@dataclass(frozen=True)
+class Option:
+    """The option of a setting.
+
+    Parameters
+    ----------
+    kind : type
+        Type of one value, as the command line reads it.
+    help : str
+        Text of ``--help``.
+    panel : str
+        Heading in ``--help``.
+    default : object
+        Value where the option is not given.
+    read : callable or None
+        Makes the setting from the value; called only where it is not None.
+    shown : mapping of str to object
+        Further keywords of ``typer.Option``, such as ``metavar`` and ``min``.
+    """
+
+    kind: Any
+    help: str
+    panel: str
+    default: Any
+    read: Callable[[Any], Any] | None
+    shown: dict[str, Any]
+
+
+def _setting(
+    default: Any,
+    kind: Any,
+    panel: str,
+    text: str,
+    *,
+    read: Callable[..., Any] | None = None,
+    **shown: Any,
+) -> Any:
+    """A field with an option; a tuple is written with commas on the command line."""
+    value = ",".join(default) if isinstance(default, tuple) else default
+    option = Option(kind, text, panel, value, read, shown)
+    return field(default=default, metadata={OPTION: option})
+
+
+def words(text: str) -> tuple[str, ...]:
+    """Words separated by commas."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _scheme(name: str) -> str:
+    """Check the name of a scheme."""
+    if name not in SCHEMES:
+        close = difflib.get_close_matches(name, SCHEMES, 1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        hint += f"one of: {', '.join(SCHEMES)}"
+        raise InputError("unknown scheme", key="--scheme", value=name, hint=hint)
+    return name
+
+
+def _error_model(word: str) -> str:
+    """Check the name of an error model."""
+    from bayesoleo.error_models._registry import check_word
+
+    return check_word(word)
+
+
+def _effects(text: str) -> tuple[Effect, ...]:
+    """Load the effects of a file, after those of the catalogue."""
+    from bayesoleo._workflow.model_files import load_effects
+
+    return load_effects(text)
+
+
+def _search_policy() -> SearchPolicy:
+    from bayesoleo.discovery._policy import SearchPolicy
+
+    return SearchPolicy()
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run of the workflow depends on besides data and model.
+    """Everything that a result depends on besides data and model.
 
     Parameters
     ----------
@@ -65,25 +152,79 @@ class Settings:
         The numbers by which the search for missing effects decides.
     """
 
-    seed: int = 0
-    jobs: int | None = None
-    quick: bool = False
-    effective_size: int = 1000
-    scheme: str = DEFAULT_SCHEME
-    steps: int | None = None
-    max_effects: int = 4
-    drive: str | None = None
-    effects: tuple[Effect, ...] | None = None
+    seed: int = _setting(
+        0, int, RUNNING, "The same seed gives the same result, whatever the number of threads.",
+        min=0, metavar="N",
+    )  # fmt: skip
+    jobs: int | None = _setting(
+        None, int | None, RUNNING, "Threads.", min=1, metavar="N", show_default="all cores"
+    )
+    quick: bool = _setting(False, bool, RUNNING, "Draw enough for intervals of two digits only.")
+    effective_size: int = _setting(
+        1000, int, RUNNING, "Draw until every parameter has this effective sample size.",
+        min=10, metavar="N",
+    )  # fmt: skip
+    scheme: str = _setting(
+        "radau3", str, SOLVING,
+        f"Discretisation: {', '.join(SCHEMES)} (second-order backward differences).",
+        read=_scheme, metavar="NAME",
+    )  # fmt: skip
+    steps: int | None = _setting(
+        None, int | None, SOLVING, "Steps a period.",
+        min=8, metavar="N", show_default="refined until the estimate stays",
+    )  # fmt: skip
+    max_effects: int = _setting(
+        4, int, RUNNING, "Add at most this many effects.", min=0, metavar="N"
+    )
+    drive: str | None = _setting(
+        None, str | None, SOLVING, "Channel that drives the model; 'model' keeps its own inputs.",
+        metavar="CHANNEL|model", show_default="what the campaign says is controlled",
+    )  # fmt: skip
+    effects: tuple[Effect, ...] | None = _setting(
+        None, str | None, RUNNING,
+        "Effects of your own, one or a list, besides the built-in ones. A file is code.",
+        read=_effects, metavar="FILE.py:OBJECT", show_default=False,
+    )  # fmt: skip
     command: str = ""
-    nuisance: tuple[str, ...] = ()
-    error_model: str = ERROR_MODELS[0]
-    between_runs: tuple[str, ...] = ()
-    scheduler: str | None = None
-    without: tuple[str, ...] = ()
-    solver: str = COLLOCATION
-    policy: SearchPolicy = SearchPolicy()
+    nuisance: tuple[str, ...] = _setting(
+        (), str, SOLVING,
+        "Estimate within declared tolerances: conditions (sd), sensors' offset and gain "
+        "(accuracy).",
+        read=words, metavar="conditions,offset,gain", show_default=False,
+    )  # fmt: skip
+    error_model: str = _setting(
+        "independent", str, SOLVING,
+        "What errors have in common: independent (one variance an output), per-run, full "
+        "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
+        "shared-discrepancy (and is partly alike in all runs).",
+        read=_error_model, metavar="NAME",
+    )  # fmt: skip
+    between_runs: tuple[str, ...] = _setting(
+        (), str, SOLVING,
+        "Parameters that scatter between runs: mean and spread are estimated with them.",
+        read=words, metavar="NAME,…", show_default=False,
+    )  # fmt: skip
+    scheduler: str | None = _setting(
+        None, str | None, RUNNING,
+        "Other machines that take part, by the address of a Dask scheduler, or N processes of "
+        "this one. The result is the same.",
+        metavar="ADDRESS|local:N", show_default="threads of this process",
+    )  # fmt: skip
+    without: tuple[str, ...] = _setting(
+        (), str, RUNNING,
+        "Effects to leave out of the search; 'nonparametric' leaves out smooth functions.",
+        read=words, metavar="EFFECT,…", show_default=False,
+    )  # fmt: skip
+    solver: str = _setting(
+        "collocation", str, SOLVING, f"Solver of periodic runs: {', '.join(SOLVERS)}.",
+        metavar="NAME",
+    )  # fmt: skip
+    policy: SearchPolicy = field(default_factory=_search_policy)
 
     def __post_init__(self) -> None:
+        from bayesoleo.effects._nonparametric import FAMILY
+        from bayesoleo.prediction._periodic_solver import check_solver
+
         check_solver(self.solver, self.scheme)
         known = [effect.id for effect in self._offered] + [FAMILY]
         for name in self.without:
@@ -94,6 +235,8 @@ class Settings:
 
     @property
     def _offered(self) -> tuple[Effect, ...]:
+        from bayesoleo.effects._catalogue import catalogue
+
         return catalogue() if self.effects is None else self.effects
 
     @property
@@ -104,16 +247,22 @@ class Settings:
     @property
     def nonparametric(self) -> bool:
         """Whether a function without a name may be added."""
+        from bayesoleo.effects._nonparametric import FAMILY
+
         return FAMILY not in self.without
 
     @property
     def inference(self) -> Inference:
         """What is assumed of errors and of runs."""
+        from bayesoleo.discovery._inference import Inference
+
         return Inference(self.error_model, self.between_runs)
 
     @property
     def numerics(self) -> Numerics:
         """How models are solved."""
+        from bayesoleo.discovery._fit import Numerics
+
         return Numerics(
             self.scheme,
             self.steps,

@@ -1,11 +1,8 @@
-"""Simulated campaigns: the verb ``simulate`` and the demonstration.
+"""The verb ``simulate``, and the campaign of the demonstration.
 
-Simulate a campaign like another one, with a model or with the model and posterior of a
-result.
-
-Simulate a campaign like a measured one.
-
-A small shaker campaign of an oleo, simulated with one effect that the model it is for lacks.
+A campaign is simulated with the runs of another one, from a model or from the posterior of a
+result. The demonstration is a small shaker campaign of an oleo with one effect more than the model
+that is fitted to it.
 """
 
 from __future__ import annotations

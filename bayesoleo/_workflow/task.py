@@ -1,9 +1,7 @@
-"""A campaign and a model brought together and checked before work begins.
+"""A campaign and a model, brought together and checked before work begins.
 
-What the model says at its nominal values, held against what was measured, before anything is
-estimated: a sign that is turned and a unit that is wrong show here.
-
-A campaign and a model brought together, and what does not fit found early.
+The model is also solved at its nominal values and compared with the measurements: a wrong sign or a
+wrong unit shows there.
 """
 
 from __future__ import annotations

@@ -1,11 +1,4 @@
-"""Figures of the search: ranking, proposals, nonparametric shapes.
-
-The ranking of the candidate effects of one round.
-
-What to measure next: how well runs over the range of a rig would tell rival effects apart.
-
-The shape of an effect without a name: a curve with its band, or a map.
-"""
+"""Figures of the search: ranking of the candidates, proposed runs, nonparametric shapes."""
 
 from __future__ import annotations
 
@@ -55,24 +48,13 @@ def ranking(tree: xr.DataTree, number: int = 0, most: int = 15) -> Figure:
     entry, titles = summary["rounds"][number], summary.get("titles", {})
     candidates = sorted(entry["candidates"], key=lambda candidate: -candidate["gain"])
     shown = candidates[:most]
-    height = RANKING_TOP + ROW * max(len(shown), 2) + RANKING_BOTTOM
-    figure = style.blank(style.WIDTH, height)
-    width = style.WIDTH - RANKING_LEFT - RANKING_RIGHT
-    box = (
-        RANKING_LEFT / style.WIDTH,
-        RANKING_BOTTOM / height,
-        width / style.WIDTH,
-        1 - (RANKING_TOP + RANKING_BOTTOM) / height,
-    )
-    axes = figure.add_axes(box)
-    style.dress(axes, ticks=6)
+    labels = [style.plain(called(name(c), titles), 56) for c in shown]
+    margins = RANKING_LEFT, RANKING_RIGHT, RANKING_TOP, RANKING_BOTTOM
+    figure, axes = style.row_axes(labels, ROW, margins=margins, ticks=6)
     accepted, alike = chosen(entry), similar(entry)
     for row, candidate in enumerate(shown):
         _bar(axes, row, candidate, candidate is accepted, any(candidate is c for c in alike))
-    axes.set_ylim(max(len(shown), 2) - 0.5, -0.5)
-    axes.set_yticks(range(len(shown)), [style.plain(called(name(c), titles), 56) for c in shown])
     axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
     largest = max([100 * candidate["gain"] for candidate in shown], default=0.0)
     axes.set_xlim(0.0, max(1.02 * largest, 10.0))
     axes.set_xlabel("share of the excess error explained in %", fontsize=style.TEXT)

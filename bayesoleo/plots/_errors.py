@@ -1,9 +1,4 @@
-"""Figures of errors before and after, and of estimates by run.
-
-The error before and after, run by run, over what is expected of it.
-
-Estimates of single runs side by side, with what all of them say of mean and spread.
-"""
+"""Figures of the error of each run before and after, and of the estimates of single runs."""
 
 from __future__ import annotations
 
@@ -220,14 +215,8 @@ def by_run(each: xr.Dataset) -> Figure:
     for k, name in enumerate(names):
         row, column = divmod(k, _COLUMNS)
         bottom = height - BY_RUN_TOP - (row + 1) * HIGH - row * GAP
-        axes = figure.add_axes(
-            (
-                (BY_RUN_LEFT + column * wide) / style.WIDTH,
-                bottom / height,
-                0.84 * wide / style.WIDTH,
-                HIGH / height,
-            )
-        )
+        left = BY_RUN_LEFT + column * wide
+        axes = style.add_axes(figure, left, bottom, 0.84 * wide, HIGH)
         style.dress(axes)
         _panel(axes, each.sel({schema.PARAMETER: name}), view, name, good)
     handles: list[Artist] = [
@@ -259,7 +248,7 @@ def _panel(
         axes.axhline(mean, color=style.AFTER, lw=1.2)
         p_value = view.p_value[k]
         text = f"p equal = {p_value:.2g}" if p_value >= 1e-3 else "p equal < 0.001"
-        axes.set_title(text, loc="right", fontsize=style.SMALL, pad=3, color=style.FAINT)
+        style.name_above(axes, right=text)
     axes.errorbar(
         place[good],
         scale.factor * values[good],

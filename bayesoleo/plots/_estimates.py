@@ -1,15 +1,4 @@
-"""Figures of point estimates: regions, profiles, replications, sensitivities, iterations.
-
-Regions of equal fit and profiles: exact against what linearisation says.
-
-The scatter of an estimator over replications, parameter by parameter, against theory.
-
-The way of an estimate, iteration by iteration.
-
-Which parameters matter: a table of shares or of per cents, as colours with their numbers.
-
-How much each quantity leans on its prior and on its data.
-"""
+"""Figures of point estimates: regions, profiles, replications, iterations, sensitivities."""
 
 from __future__ import annotations
 
@@ -163,8 +152,7 @@ def panel_grid(count: int) -> tuple[Figure, list[Axes]]:
         row, column = divmod(place, columns)
         x = REGION_LEFT + column * wide
         y = height - REGION_TOP - 0.2 - (row + 1) * 0.8 * SIDE - row * GAP
-        box = x / style.WIDTH, y / height, (wide - 0.8) / style.WIDTH, 0.8 * SIDE / height
-        panels.append(figure.add_axes(box))
+        panels.append(style.add_axes(figure, x, y, wide - 0.8, 0.8 * SIDE))
     return figure, panels
 
 
@@ -303,14 +291,8 @@ def sensitivity(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     figure = style.blank(style.WIDTH, height)
     wide = style.WIDTH - SENSITIVITY_LEFT - 0.9
     tall = SENSITIVITY_ROW * len(features)
-    axes = figure.add_axes(
-        (
-            SENSITIVITY_LEFT / style.WIDTH,
-            1 - (SENSITIVITY_TOP + tall) / height,
-            wide / style.WIDTH,
-            tall / height,
-        )
-    )
+    bottom = height - SENSITIVITY_TOP - tall
+    axes = style.add_axes(figure, SENSITIVITY_LEFT, bottom, wide, tall)
     table(axes, np.abs(shown) / (top or 1.0), texts, features, names)
     figure.text(0.02, 1 - 0.1 / height, title, va="top", fontsize=style.TEXT, color=style.INK)
     return figure
@@ -360,17 +342,13 @@ def prior_sensitivity(data: xr.Dataset) -> Figure:
         is written in colour.
     """
     names = [str(name) for name in data[schema.QUANTITY].values][:PRIOR_MOST]
-    height = PRIOR_TOP + PRIOR_ROW * max(len(names), 2) + PRIOR_BOTTOM
-    figure = style.blank(style.WIDTH, height)
-    wide = style.WIDTH - PRIOR_LEFT - 0.3
-    box = (
-        PRIOR_LEFT / style.WIDTH,
-        PRIOR_BOTTOM / height,
-        wide / style.WIDTH,
-        1 - (PRIOR_TOP + PRIOR_BOTTOM) / height,
+    figure, axes = style.row_axes(
+        [style.plain(name, 34) for name in names],
+        PRIOR_ROW,
+        margins=(PRIOR_LEFT, 0.3, PRIOR_TOP, PRIOR_BOTTOM),
+        ticks=8,
+        size=style.SMALL,
     )
-    axes = figure.add_axes(box)
-    style.dress(axes, ticks=8)
     rows = np.arange(len(names))
     colours = {"prior": style.BEFORE, "likelihood": style.AFTER}
     for group, mark in (("prior", "D"), ("likelihood", "o")):
@@ -378,9 +356,6 @@ def prior_sensitivity(data: xr.Dataset) -> Figure:
         axes.plot(values, rows, mark, ms=4.5, color=colours[group])
     axes.axvline(THRESHOLD, color=style.NEUTRAL, lw=0.8)
     axes.set_xlim(left=0.0)
-    axes.set_ylim(max(len(names), 2) - 0.5, -0.5)
-    axes.set_yticks(rows, [style.plain(name, 34) for name in names])
-    axes.tick_params(axis="y", length=0, labelsize=style.SMALL)
     for label, diagnosis in zip(axes.get_yticklabels(), data["diagnosis"].values, strict=False):
         if str(diagnosis):
             label.set_color(style.BEFORE)

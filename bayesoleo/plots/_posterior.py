@@ -1,15 +1,4 @@
-"""Figures of the posterior: pairs, corner, forest, traces.
-
-Draws of the posterior as the figures take them.
-
-The posterior, pair by pair.
-
-Draws of two parameters with the regions that the estimate would have given instead.
-
-The point estimate held against the posterior, parameter by parameter.
-
-The chains, to see whether they have settled and agree.
-"""
+"""Figures of the posterior: corner, pairs, comparison with the point estimate, chains."""
 
 from __future__ import annotations
 
@@ -352,25 +341,14 @@ def point_against_posterior(tree: xr.DataTree) -> Figure:
     """
     table = point_table(tree)
     names = [name for name in table if name in tree["posterior"]][:FOREST_MOST]
-    height = FOREST_TOP + ROW * max(len(names), 2) + FOREST_BOTTOM
-    figure = style.blank(style.WIDTH, height)
-    width = style.WIDTH - FOREST_LEFT - RIGHT
-    box = (
-        FOREST_LEFT / style.WIDTH,
-        FOREST_BOTTOM / height,
-        width / style.WIDTH,
-        1 - (FOREST_TOP + FOREST_BOTTOM) / height,
-    )
-    axes = figure.add_axes(box)
-    style.dress(axes, ticks=9)
+    labels = [style.plain(name, 30) for name in names]
+    margins = FOREST_LEFT, RIGHT, FOREST_TOP, FOREST_BOTTOM
+    figure, axes = style.row_axes(labels, ROW, margins=margins, ticks=9)
     largest = 3.2
     for row, name in enumerate(names):
         largest = max(largest, _row(axes, row, draws(tree, name).ravel(), table[name]))
     axes.axvline(0.0, color=style.NEUTRAL, lw=0.8, zorder=0)
-    axes.set_ylim(max(len(names), 2) - 0.5, -0.5)
     axes.set_xlim(-min(largest, 12.0), min(largest, 12.0))
-    axes.set_yticks(range(len(names)), [style.plain(name, 30) for name in names])
-    axes.tick_params(axis="y", length=0, labelsize=style.TEXT)
     axes.spines["left"].set_visible(False)
     text = "distance from the posterior mean in posterior standard deviations"
     axes.set_xlabel(text, fontsize=style.TEXT)
@@ -445,8 +423,7 @@ def trace(tree: xr.DataTree, most: int = 7) -> Figure:
     for place, (name, unit, values) in enumerate(rows):
         line, column = divmod(place, columns)
         x, y = TRACE_LEFT + column * wide, height - TRACE_TOP - (line + 1) * HIGH - line * GAP
-        box = (x / style.WIDTH, y / height, (wide - TRACE_LEFT - 0.15) / style.WIDTH, HIGH / height)
-        axes = figure.add_axes(box)
+        axes = style.add_axes(figure, x, y, wide - TRACE_LEFT - 0.15, HIGH)
         _chains(axes, name, unit, values, _ensembles(tree, values.shape[0]))
         axes.tick_params(labelbottom=place + columns >= len(rows))
     middle = 0.12 / height

@@ -1,13 +1,4 @@
-"""Figures of predictions: posterior predictive, hold-out runs, trajectories, branches.
-
-What the posterior predicts, held against the measurement.
-
-Predictions of runs that were not used, with their intervals, and how well they were foreseen.
-
-A motion that multiple shooting found, with what was measured of it.
-
-A branch of periodic answers: how large they are, which of them last, and where they meet.
-"""
+"""Figures of predictions: posterior predictive, other runs, trajectories, branches."""
 
 from __future__ import annotations
 
@@ -208,10 +199,7 @@ def forecast(found: LabelledResult | xr.Dataset | xr.DataTree, output: str | Non
 
 
 def _band(figure: Figure, bottom: float, one: xr.Dataset, factor: float) -> None:
-    height = figure.get_figheight()
-    axes = figure.add_axes(
-        (LEFT / style.WIDTH, bottom / height, 6.2 / style.WIDTH, FORECAST_HIGH / height)
-    )
+    axes = style.add_axes(figure, LEFT, bottom, 6.2, FORECAST_HIGH)
     style.dress(axes)
     time = one[schema.TIME].values
     axes.fill_between(
@@ -221,40 +209,20 @@ def _band(figure: Figure, bottom: float, one: xr.Dataset, factor: float) -> None
     axes.plot(time, factor * one["measured"].values, color=style.INK, lw=0.8)
     axes.set_xlim(0, float(np.nanmax(time)))
     axes.set_xlabel("time in s", fontsize=style.SMALL, labelpad=2)
-    axes.set_title(
-        style.plain(str(one[schema.RUN].values), 40),
-        loc="left",
-        fontsize=style.SMALL,
-        pad=3,
-        fontweight="bold",
-    )
-    axes.set_title(
-        f"rms {factor * float(one['rms']):.3g}, expected {factor * float(one['expected_rms']):.3g}",
-        loc="right",
-        fontsize=style.SMALL,
-        pad=3,
-        color=style.FAINT,
-    )
+    rms, expected = (factor * float(one[key]) for key in ("rms", "expected_rms"))
+    run = style.plain(str(one[schema.RUN].values), 40)
+    style.name_above(axes, run, f"rms {rms:.3g}, expected {expected:.3g}")
 
 
 def _transform(figure: Figure, bottom: float, one: xr.Dataset) -> None:
-    height, left = figure.get_figheight(), LEFT + 6.2 + 0.6
-    axes = figure.add_axes(
-        (left / style.WIDTH, bottom / height, 2.2 / style.WIDTH, FORECAST_HIGH / height)
-    )
+    axes = style.add_axes(figure, LEFT + 6.2 + 0.6, bottom, 2.2, FORECAST_HIGH)
     style.dress(axes)
     bins = one["bin"].values
     axes.bar(bins, one["pit"].values, width=1 / bins.size, color=style.SIMILAR)
     axes.axhline(1.0, color=style.INK, lw=0.8)
     axes.set_xlim(0, 1)
     axes.set_xlabel("probability integral transform", fontsize=style.SMALL, labelpad=2)
-    axes.set_title(
-        f"inside {100 * float(one['coverage']):.1f} %",
-        loc="right",
-        fontsize=style.SMALL,
-        pad=3,
-        color=style.FAINT,
-    )
+    style.name_above(axes, right=f"inside {100 * float(one['coverage']):.1f} %")
 
 
 TRAJECTORY_HIGH, TRAJECTORY_GAP, TRAJECTORY_TOP, TRAJECTORY_BOTTOM = 1.25, 0.22, 0.5, 0.5

@@ -1,10 +1,6 @@
-"""Figures of records: channels over a period, period search, fits.
+"""Figures of records: channels over one period, the search of the period, the fit.
 
-The records as measured: every channel of every run over one period.
-
-How a period is found: figures B.1 and B.2 of Verbeek (1993).
-
-The fit: what was measured against what the model predicts, before and after.
+The search of the period is shown as in figures B.1 and B.2 of Verbeek (1993).
 """
 
 from __future__ import annotations
@@ -46,8 +42,8 @@ def records(tree: xr.DataTree) -> Figure:
         x = LEFT + column * wide
         for place, run in enumerate(runs):
             y = height - TOP - (place + 1) * row
-            box = (x / style.WIDTH, y / height, 0.82 * wide / style.WIDTH, 0.86 * row / height)
-            _channel(figure, box, tree, name, run, place == len(runs) - 1)
+            axes = style.add_axes(figure, x, y, 0.82 * wide, 0.86 * row)
+            _channel(axes, tree, name, run, place == len(runs) - 1)
         _head(figure, tree, name, x + 0.41 * wide, height)
     for place, run in enumerate(runs):
         _row_label(figure, run, 1 - (TOP + (place + 0.55) * row) / height)
@@ -57,16 +53,8 @@ def records(tree: xr.DataTree) -> Figure:
     return figure
 
 
-def _channel(
-    figure: Figure,
-    box: tuple[float, float, float, float],
-    tree: xr.DataTree,
-    name: str,
-    run: reading.RunView,
-    last: bool,
-) -> None:
+def _channel(axes: Axes, tree: xr.DataTree, name: str, run: reading.RunView, last: bool) -> None:
     """One channel of one run; all runs of a channel share its scale."""
-    axes = figure.add_axes(box)
     style.dress(axes, ticks=2)
     data = reading.variable(tree, schema.RECORDS, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))

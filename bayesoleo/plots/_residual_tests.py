@@ -1,9 +1,4 @@
-"""Figures of residual tests and assessments.
-
-All tests of one residual, each number beside the picture that it summarises.
-
-What an assessment found, in one figure: correlogram, fit against noise, dependence.
-"""
+"""Figures of residual tests: all tests of one residual, and the assessment of an output."""
 
 from __future__ import annotations
 
@@ -82,21 +77,13 @@ def _box(figure: Figure, row: int, column: int, width: int = 1) -> Axes:
     cell = (style.WIDTH - 0.85) / _COLUMNS
     bottom = height - 0.55 - (row + 1) * _HIGH - row * _GAP
     wide = (width - 1) * cell + 0.78 * cell
-    axes = figure.add_axes(
-        (
-            (0.75 + column * cell) / style.WIDTH,
-            bottom / height,
-            wide / style.WIDTH,
-            _HIGH / height,
-        )
-    )
+    axes = style.add_axes(figure, 0.75 + column * cell, bottom, wide, _HIGH)
     style.dress(axes)
     return axes
 
 
 def _titled(axes: Axes, left: str, right: str, below: str) -> None:
-    axes.set_title(left, loc="left", fontsize=style.SMALL, pad=3, fontweight="bold")
-    axes.set_title(right, loc="right", fontsize=style.SMALL, pad=3, color=style.FAINT)
+    style.name_above(axes, left, right)
     axes.set_xlabel(style.plain(below), fontsize=style.SMALL, labelpad=2)
 
 
@@ -235,19 +222,15 @@ def assessment(
     cells = 0.26 * max(len(runs), 2)
     height = 0.6 + HIGH + 1.45 + cells + 0.3
     figure = style.blank(style.WIDTH, height)
-
-    def box(left: float, bottom: float, wide: float, tall: float) -> Axes:
-        size = style.WIDTH, height
-        return figure.add_axes((left / size[0], bottom / size[1], wide / size[0], tall / size[1]))
-
     top = height - 0.6 - HIGH
-    _correlogram(box(0.85, top, 4.9, HIGH), one)
-    _ratios(box(6.6, top, 3.2, HIGH), one, runs)
+    _correlogram(style.add_axes(figure, 0.85, top, 4.9, HIGH), one)
+    _ratios(style.add_axes(figure, 6.6, top, 3.2, HIGH), one, runs)
     shares = one["share"].values
     sure = one["share_p"].values * shares.size < 0.01
     texts = [[f"{100 * s:.2g} %" if p else "" for s, p in zip(row, known, strict=True)]
              for row, known in zip(shares, sure, strict=True)]  # fmt: skip
-    table(box(1.6, 0.3, 7.5, cells), np.where(sure, shares, 0.0), texts, runs, variables)
+    axes = style.add_axes(figure, 1.6, 0.3, 7.5, cells)
+    table(axes, np.where(sure, shares, 0.0), texts, runs, variables)
     handles = [
         style.line(style.BEFORE, "residual"),
         style.line(style.AFTER, "what does not repeat"),

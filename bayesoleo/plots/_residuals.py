@@ -1,9 +1,4 @@
-"""Figures of residuals over phase, velocity and stroke, and by harmonic.
-
-The residual: what the model leaves, over phase, velocity or stroke, with the noise it has.
-
-Where the repeating error lives: by harmonic, and by what it may be a function of.
-"""
+"""Figures of residuals: over phase, velocity or stroke, and by harmonic."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
 """Stored figures of long studies, and the table of errors before and after.
 
-Results of long studies: computed where that is possible, and otherwise shown from a store.
-
-Pages of the gallery use it. The store is the folder ``studies/figures`` of the repository; a page
-that was downloaded alone has none, and says what it leaves out. With
-``BAYESOLEO_STORE_FIGURES=1`` a run of a page renews what is stored.
-
-The table of a closed loop: errors before and after, and the posterior of what was added.
+Pages of the gallery compute a study where that is possible and show its stored figures elsewhere.
+The store is the folder ``studies/figures`` of the repository; a page that was downloaded alone has
+none and says what is left out. With ``BAYESOLEO_STORE_FIGURES=1`` a run of a page renews it.
 """
 
 from __future__ import annotations

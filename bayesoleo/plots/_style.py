@@ -1,11 +1,8 @@
 """Common style of all figures, and engineering units of axes.
 
-One look for all figures: few colours, told apart by the colour-blind, each with one meaning.
-
-Sizes are in inches and margins fixed, instead of found by a layout engine: that is fast, and the
-same figure looks the same for 2 runs and for 14.
-
-SI values as an engineer reads them: 0.0123 m as 12.3 mm, 52 000 N as 52 kN.
+Colours are few, distinguishable by the colour-blind, and each has one meaning. Sizes are in inches
+and margins fixed, instead of found by a layout engine: that is fast, and a figure looks the same
+for 2 runs and for 14. Values are in SI and shown with prefixes: 0.0123 m as 12.3 mm.
 """
 
 from __future__ import annotations
@@ -67,6 +64,56 @@ def blank(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), facecolor="white")
 
 
+def add_axes(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes in a figure, their place and size in inches."""
+    wide, high = figure.get_size_inches()
+    return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
+
+
+def name_above(axes: Axes, left: str = "", right: str = "") -> None:
+    """Write a bold title on the left of axes, a faint remark on the right."""
+    if left:
+        axes.set_title(left, loc="left", fontsize=SMALL, pad=3, fontweight="bold")
+    if right:
+        axes.set_title(right, loc="right", fontsize=SMALL, pad=3, color=FAINT)
+
+
+def row_axes(
+    labels: Sequence[str],
+    row: float,
+    *,
+    margins: tuple[float, float, float, float],
+    ticks: int,
+    size: float = TEXT,
+) -> tuple[Figure, Axes]:
+    """A figure with one row for each label, the first on top.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        Written on the left.
+    row : float
+        Height of a row, inches; there is room for two at least.
+    margins : tuple of float
+        Left, right, top and bottom, inches.
+    ticks : int
+        Intervals of the horizontal axis at most.
+    size : float
+        Of the labels, points.
+    """
+    left, right, top, bottom = margins
+    count = max(len(labels), 2)
+    height = top + row * count + bottom
+    figure = blank(WIDTH, height)
+    wide, high = (WIDTH - left - right) / WIDTH, 1 - (top + bottom) / height
+    axes = figure.add_axes((left / WIDTH, bottom / height, wide, high))
+    dress(axes, ticks)
+    axes.set_ylim(count - 0.5, -0.5)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.tick_params(axis="y", length=0, labelsize=size)
+    return figure, axes
+
+
 def dress(axes: Axes, ticks: int = 4) -> None:
     """Remove what is not data; at most ``ticks`` intervals an axis, numbers without offsets."""
     axes.spines[["top", "right"]].set_visible(False)
@@ -105,7 +152,7 @@ def panels(runs: Sequence[RunView], *, free_x: bool = False) -> Panels:
     for place, run in enumerate(runs):
         row, column = divmod(place, columns)
         x, y = left + column * wide, height - top - (row + 1) * high - row * gap
-        panel = figure.add_axes((x / WIDTH, y / height, 0.86 * wide / WIDTH, high / height))
+        panel = add_axes(figure, x, y, 0.86 * wide, high)
         dress(panel)
         title(panel, run)
         # The axis of a panel stays where no panel of the next row stands below it.

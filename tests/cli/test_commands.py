@@ -11,9 +11,10 @@ import typer.main
 from rich.console import Console
 
 from bayesoleo import _schema as schema, _workflow as workflow
-from bayesoleo._cli import app, options, shell, shell as tables
+from bayesoleo._cli import app, shell, shell as tables
 from bayesoleo._cli.listing import readable
 from bayesoleo._storage.result_files import read_tree, write_tree
+from bayesoleo._workflow.settings import SCHEMES
 from bayesoleo.effects import catalogue
 from bayesoleo.solvers._schemes import scheme
 from bayesoleo.systems import systems
@@ -275,6 +276,6 @@ def test_whole_loop_on_a_small_campaign(run, campaign, model, tmp_path):
     assert {path: path.read_bytes() for path in before} == before
 
 
-@pytest.mark.parametrize("name", options.SCHEMES)
+@pytest.mark.parametrize("name", SCHEMES)
 def test_schemes_in_the_help_exist(name):
     assert scheme(name, (2,)) is not None

@@ -7,6 +7,7 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo._cli import options
+from bayesoleo._workflow import settings
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.simulating import to_simulated_run
 from bayesoleo._workflow.task import check
@@ -202,7 +203,7 @@ def test_what_cannot_be_solved_says_what_to_use():
         options.settings(solver="euler")
     with pytest.raises(InputError, match=r"'thesis' needs equal steps.*use .*solver collocation"):
         Settings(solver="adaptive", scheme="thesis")
-    assert options.SOLVERS == SOLVERS
+    assert settings.SOLVERS == SOLVERS
     model = system("linear_oscillator")
     jerk = Model(
         "jerk",
