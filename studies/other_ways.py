@@ -26,7 +26,6 @@ from matplotlib.figure import Figure
 from numpy.polynomial import chebyshev
 
 import bayesoleo
-import bayesoleo._workflow
 from bayesoleo import _workflow as workflow
 from bayesoleo.discovery import State, fit_state
 from bayesoleo.effects import called

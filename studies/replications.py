@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 
 import bayesoleo
-import bayesoleo._workflow
 from bayesoleo._display import LabelledResult
-from bayesoleo.data import dataset_folder
+from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.discovery import Numerics, fit_model
 from bayesoleo.estimation import FunctionProblem, sampling_distribution
 from bayesoleo.model import Normal, driven_by
@@ -87,7 +86,7 @@ def repeat_oleo(
     replications: int = 1000, out: str | os.PathLike[str] | None = None, jobs: int | None = None
 ) -> Timed:
     """Estimate an oleo from one run again and again, with new noise on outputs and input."""
-    reduced = bayesoleo._workflow.task.reduce(dataset_folder("shaker-plain"), jobs=jobs)
+    reduced = reduce_campaign(load_campaign(dataset_folder("shaker-plain")), jobs=jobs)
     model = driven_by(bayesoleo.system("f16n2d2"), "displacement")
     fit = fit_model(model, [reduced.record(OLEO_RUN)], Numerics(jobs=jobs))
     return _timed(fit.problem, fit.point, replications=replications, block=20, out=out, jobs=jobs)

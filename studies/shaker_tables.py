@@ -18,7 +18,7 @@ import xarray as xr
 import bayesoleo
 import bayesoleo._workflow
 from bayesoleo import Model, Parameter
-from bayesoleo.data import ReducedCampaign
+from bayesoleo.data import ReducedCampaign, load_campaign, reduce_campaign
 from bayesoleo.discovery import ModelFit, Numerics, fit_model
 from bayesoleo.errors import InputError
 from bayesoleo.model import driven_by
@@ -112,7 +112,7 @@ class Shaker:
         if root is None:
             raise InputError("BAYESOLEO_DATA is not set", hint="name the folder with campaigns/")
         return cls(
-            bayesoleo._workflow.task.reduce(Path(root) / "campaigns" / "shaker-plain", jobs=jobs),
+            reduce_campaign(load_campaign(Path(root) / "campaigns" / "shaker-plain"), jobs=jobs),
             jobs,
         )
 
@@ -157,7 +157,7 @@ class Shaker:
     def each(self, physics: str, variant: str, drive: str) -> xr.Dataset:
         """Estimates of each run."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive=drive)
-        return bayesoleo._workflow.estimating.estimate_each(
+        return bayesoleo._workflow.estimate_each(
             self.reduced, self.model(physics, variant), settings
         )
 
@@ -166,7 +166,7 @@ class Shaker:
         """Table 6.5 by force with the friction of the thesis's tables C.1 and D.1."""
         settings = bayesoleo.Settings(jobs=self.jobs, drive="force")
         model = bayesoleo.system(MODELS["thermo-mechanical", "thesis"])
-        return bayesoleo._workflow.estimating.estimate_each(self.reduced, model, settings)
+        return bayesoleo._workflow.estimate_each(self.reduced, model, settings)
 
     @cache  # noqa: B019
     def joint(self, physics: str, variant: str, drive: str) -> ModelFit:

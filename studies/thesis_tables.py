@@ -77,9 +77,7 @@ def table_6_5_to_6_2(variant: str, jobs: int | None = None) -> xr.Dataset:
         channels = {"force": ("F", "N"), "displacement": ("q", "m")}
         write_campaign(path, name="table 6.5", channels=channels, runs=runs)
         settings = bayesoleo.Settings(drive="model", steps=1024, jobs=jobs)
-        each = bayesoleo._workflow.estimating.estimate_each(
-            path, bayesoleo.system("f16n1d1_thesis"), settings
-        )
+        each = bayesoleo._workflow.estimate_each(path, bayesoleo.system("f16n1d1_thesis"), settings)
     highest = [float(made[run].samples["pressure"].max()) for run in each.run.values]
     each["pressure"] = ("run", highest)
     each.attrs["no_orbit"] = failed

@@ -6,11 +6,12 @@ Runs are reduced once, when they are first needed.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import cached_property
 
+import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from tqdm.auto import tqdm
@@ -19,9 +20,12 @@ from bayesoleo import _schema as schema, _workflow as workflow, data
 from bayesoleo._display import columns
 from bayesoleo._session import display as figures
 from bayesoleo._session.display import html
+from bayesoleo._workflow.simulating import demo_campaign, to_simulated_run
 from bayesoleo.data._reduction import ReducedCampaign
 from bayesoleo.discovery._result_tree import records_tree
+from bayesoleo.model._model import Model
 from bayesoleo.plots._style import format_value
+from bayesoleo.prediction._simulate import RunPlan, simulate_run
 
 #: Seconds before anything is shown.
 DELAY = 2.0
@@ -60,11 +64,84 @@ class Campaign(data.CampaignData):
     Examples
     --------
     >>> from tempfile import mkdtemp
-    >>> from bayesoleo._workflow.simulating import demo_campaign
-    >>> campaign = load_campaign(demo_campaign(mkdtemp()))
+    >>> campaign = Campaign.demo(mkdtemp())
     >>> round(float(campaign.frequencies.sel(run="j")), 3)
     2.0
     """
+
+    @classmethod
+    def demo(cls, folder: str | os.PathLike[str], seed: int = 0) -> Campaign:
+        """Simulate the campaign of ``bayesoleo demo``: six runs of an oleo with Stribeck friction.
+
+        Parameters
+        ----------
+        folder : path-like
+            Where it is written; must be empty.
+        seed : int
+            Of the noise and of the scatter between runs.
+
+        Returns
+        -------
+        Campaign
+        """
+        return load_campaign(demo_campaign(folder, seed))
+
+    @classmethod
+    def simulate(
+        cls,
+        folder: str | os.PathLike[str],
+        model: Model,
+        plans: Sequence[RunPlan],
+        values: Mapping[str, float] | None = None,
+        *,
+        noise: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> Campaign:
+        """Simulate periodic runs with a model and write them as a campaign.
+
+        Parameters
+        ----------
+        folder : path-like
+            Where it is written; must be empty.
+        model : Model
+            Its first input becomes the controlled channel.
+        plans : sequence of RunPlan
+            One for each run.
+        values : mapping of str to float, optional
+            Parameters that are not at their nominal value, SI.
+        noise : mapping of str to float, optional
+            Standard deviation of the measurement noise by channel, SI.
+        seed : int
+            Of the noise.
+
+        Returns
+        -------
+        Campaign
+
+        Examples
+        --------
+        >>> from tempfile import mkdtemp
+        >>> from bayesoleo import system
+        >>> from bayesoleo.prediction import RunPlan, motion
+        >>> plan = RunPlan("a", 1.0, {"force": motion(0.0, [2.0])})
+        >>> [run.label for run in Campaign.simulate(mkdtemp(), system("duffing"), [plan]).runs]
+        ['a']
+        """
+        units = {name: item.unit for name, item in model.conditions.items()}
+        streams = np.random.default_rng(seed).spawn(len(plans))
+        runs = [
+            to_simulated_run(simulate_run(model, plan, values, noise=noise, rng=rng), units)
+            for plan, rng in zip(plans, streams, strict=True)
+        ]
+        channels = {**model.inputs, **{name: item.unit for name, item in model.outputs.items()}}
+        data.write_campaign(
+            folder,
+            name=f"{model.name} simulated",
+            controlled=next(iter(model.inputs), None),
+            channels={name: (name, unit) for name, unit in channels.items()},
+            runs=runs,
+        )
+        return load_campaign(folder)
 
     @cached_property
     def reduced(self) -> ReducedCampaign:

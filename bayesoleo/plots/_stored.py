@@ -1,8 +1,11 @@
-"""Stored figures of long studies, and the table of errors before and after.
+"""Results of long studies for the gallery, computed or stored, and the table of errors.
 
-Pages of the gallery compute a study where that is possible and show its stored figures elsewhere.
-The store is the folder ``studies/figures`` of the repository; a page that was downloaded alone has
-none and says what is left out. With ``BAYESOLEO_STORE_FIGURES=1`` a run of a page renews it.
+A page of the gallery computes a long study where data and time allow it, and otherwise shows the
+stored result. The store is the folder ``studies/figures`` of the repository. A page that was
+downloaded alone has no store; it says so, and shows its own short computation only. A run with
+``BAYESOLEO_STORE_FIGURES=1`` renews the store.
+
+The table compares the errors of a model before and after effects were added.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import contextlib
 import io
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,6 +31,24 @@ from bayesoleo.plots._discovery import chosen
 from bayesoleo.plots._style import engineering, format_number
 
 DPI = 100
+
+
+def _where(data: str) -> str:
+    """How to get a data set."""
+    if data.startswith("measured/"):
+        return f'bayesoleo.data.dataset_folder("{Path(data).name}") fetches it'
+    return "BAYESOLEO_DATA names the folder in which it is looked for"
+
+
+def _folder_of(data: str) -> Path | None:
+    """Folder of a data set below ``BAYESOLEO_DATA``, or of a measured one fetched before."""
+    root = os.environ.get("BAYESOLEO_DATA")
+    if root:
+        return Path(root) / data
+    if data.startswith("measured/") and find_spec("pooch") is not None:
+        cache: Path = import_module("pooch").os_cache("bayesoleo")
+        return cache / data.removeprefix("measured/")
+    return None
 
 
 def studies_folder() -> Path | None:
@@ -48,27 +70,35 @@ class Study:
         Whether to compute only when the store is to be renewed.
     needs : sequence of str
         Modules of the repository's folder ``studies`` that the computation imports.
+    declaration : str, optional
+        Text of the ``campaign.toml`` of a measured set, which names its files.
 
     Attributes
     ----------
     folder : Path or None
         Of the data set.
     campaign : Path or None
-        Folder that declares it: of a measured set that in the repository, else the data set's.
+        Folder with its ``campaign.toml``: a new one with the text given, else the data set's.
     live : bool
         Whether results are computed.
     """
 
     def __init__(
-        self, name: str, data: str | None = None, *, slow: bool = False, needs: Sequence[str] = ()
+        self,
+        name: str,
+        data: str | None = None,
+        *,
+        slow: bool = False,
+        needs: Sequence[str] = (),
+        declaration: str = "",
     ) -> None:
         self.name = name
         self.studies = studies_folder()
-        root = os.environ.get("BAYESOLEO_DATA")
-        self.folder = Path(root) / data if root and data else None
+        self.folder = None if data is None else _folder_of(data)
         self.campaign = self.folder
-        if data is not None and data.startswith("measured/"):
-            self.campaign = None if self.studies is None else self.studies / data
+        if declaration:
+            self.campaign = Path(tempfile.mkdtemp())
+            (self.campaign / "campaign.toml").write_text(declaration, encoding="utf-8")
         self.storing = os.environ.get("BAYESOLEO_STORE_FIGURES") == "1"
         reason = self._reason(data, slow, needs)
         self.live = not reason
@@ -78,9 +108,7 @@ class Study:
     def _reason(self, data: str | None, slow: bool, needs: Sequence[str]) -> str:
         """Say why results are not computed; empty if they are."""
         if data is not None and (self.folder is None or not self.folder.is_dir()):
-            return f"The data set {data} is not on this machine (BAYESOLEO_DATA)."
-        if data is not None and self.campaign is None:
-            return f"The declaration of this campaign is studies/{data} of the repository."
+            return f"The data set {data} is not on this machine; {_where(data)}."
         if slow and not self.storing:
             return "This takes minutes; to compute it, set BAYESOLEO_STORE_FIGURES=1."
         missing = [module for module in needs if find_spec(module) is None]

@@ -2,71 +2,73 @@ r"""
 Finding a missing effect in simulated data
 ==========================================
 
-What ``bayesoleo demo`` does, step by step: a shaker campaign of an oleo, the shock strut of an
-aircraft, is simulated with one effect that the fitted model lacks. The loop is then closed on it as
-on measured data. It is not told what is missing.
+An oleo is the shock strut of an aircraft: a gas spring with oil damping. This page simulates a
+shaker test of one, with a friction effect that the fitted model lacks. The package then has to find
+that effect, as it would in measured data. The command ``bayesoleo demo`` does the same.
 """
 
 # %%
-# The campaign is a folder as a rig would write it: one file a run, and ``campaign.toml``. Four runs
-# are fitted, two are held out.
+# The campaign is a folder as a test rig would write it: one file for each run, and
+# ``campaign.toml``. Four runs are fitted. Two are held out to test the prediction.
 
 import json
 import tempfile
 from pathlib import Path
 
-from rich.console import Console
+import bayesoleo as bo
 
-import bayesoleo
-import bayesoleo._report
-import bayesoleo._workflow
-from bayesoleo import plots
-from bayesoleo._workflow.simulating import DEMO_EFFECT, DEMO_SYSTEM, DEMO_TRUTH, demo_campaign
-from bayesoleo.effects import called
-
-folder = demo_campaign(Path(tempfile.mkdtemp()) / "campaign", seed=0)
-model = bayesoleo.system(DEMO_SYSTEM)
-for name, value in bayesoleo._workflow.task.check(folder, model).items():
-    print(f"{name:16} {value}")
+campaign = bo.Campaign.demo(Path(tempfile.mkdtemp()) / "campaign", seed=0)
+problem = bo.Problem(campaign, bo.system("f16n2d2"), seed=0, quick=True)
+print(problem.check())
 
 # %%
-# One call estimates the parameters, holds the residual against the noise, names what is missing,
-# adds it, samples the posterior and compares the error before and after.
+# ``explain`` tests every effect of the catalogue, adds the best one, estimates the model again and
+# compares the errors. It stops when no effect is significant. ``sample`` then draws from the
+# posterior of the extended model.
 
-tree = bayesoleo._workflow.closing.close(folder, model, bayesoleo.Settings(seed=0, quick=True))
-summary = json.loads(tree.attrs["summary"])
-bayesoleo._report.terminal.print_summary(summary, Console(width=100))
-
-# %%
-# What the first round saw. Each bar is a candidate of the catalogue, scored without a refit by the
-# share of the excess error that it would explain. A letter marks candidates that these data cannot
-# tell apart.
-
-ranking = plots.ranking(tree, most=10)
+found = problem.fit(progress=False).explain(progress=False)
+posterior = found.sample(progress=False)
+print(found)
 
 # %%
-# The truth is known here. The effect that was put in is the one found, and most parameters lie
-# within two standard deviations of what made the data:
+# Each bar is an effect of the catalogue, with the share of the excess error that it would explain.
+# The scores need no new fit. Effects with the same letter are equivalent for these data.
 
-print("put in:", called(DEMO_EFFECT, {}))
-print("found: ", ", ".join(called(effect, {}) for effect in summary["effects"]))
+ranking = bo.plots.ranking(found.tree, most=10)
+
+# %%
+# The true values are known here. The effect that was put in is the one that was found, and most
+# parameters lie within two standard deviations of their true values.
+
+TRUTH = {
+    "piston_area": 3.449e-3,
+    "initial_volume": 9.274e-4,
+    "friction_base": 78.0,
+    "friction_per_pressure": 1.6e-5,
+    "friction_slope": 4080.0,
+    "solubility": -1.334e-8,
+    "heat_conduction": 1.925,
+    "stribeck_friction": 140.0,
+    "stribeck_friction_decay": 0.006,
+}
+print("put in: stribeck_friction")
+print("found: ", ", ".join(found.effects))
 print(f"{'parameter':26}{'truth':>12}{'estimate':>12}{'sd':>10}  off by (sd)")
-for name, found in summary["parameters"].items():
-    if name in DEMO_TRUTH:
-        off = (found["estimate"] - DEMO_TRUTH[name]) / found["sd"]
-        row = f"{DEMO_TRUTH[name]:12.4g}{found['estimate']:12.4g}{found['sd']:10.2g}"
-        print(f"{name:26}{row}{off:8.1f}")
+for name, row in json.loads(found.tree.attrs["summary"])["parameters"].items():
+    if name in TRUTH:
+        off = (row["estimate"] - TRUTH[name]) / row["sd"]
+        print(f"{name:26}{TRUTH[name]:12.4g}{row['estimate']:12.4g}{row['sd']:10.2g}{off:8.1f}")
 
 # %%
-# The error of every run, before and after. At 1 the part of the residual that repeats from period
-# to period is what noise alone would leave in the average: nothing is missing any more.
+# The error of each run, before and after. At 1 the repeating part of the residual is as large as
+# noise alone would make it: nothing is missing any more.
 
-error = plots.error(tree)
+error = found.plot()
 
 # %%
-# Where the model went wrong: the force that it could not explain, over one period. The grey band is
-# one standard error of the average. Friction that drops as the strut breaks away leaves a spike at
-# each reversal.
+# The force that the first model could not explain, over one period. The grey band is one standard
+# error of the average. Friction that falls as the strut breaks away leaves a spike at each reversal
+# of the motion.
 
-residual = plots.residual(tree, "force")
+residual = bo.plots.residual(found.tree, "force")
 # sphinx_gallery_thumbnail_number = -1

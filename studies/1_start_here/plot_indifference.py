@@ -2,16 +2,18 @@ r"""
 Parameters that data cannot tell apart
 ======================================
 
-A good fit says that one parameter vector explains the data. It does not say that no other does. The
-*indifference region* (Verbeek 1993, eq. 2.43) holds all that fit about as well. This page draws it
-for a gas spring, exactly and by Taylor's second order, and lets the sloppy direction name itself.
+A good fit shows that one parameter vector explains the data. Others may explain them equally well.
+The *indifference region* (Verbeek 1993, eq. 2.43) contains all vectors that fit nearly as well.
+This page draws it for a gas spring, exactly and to second order, and finds the direction that the
+data determine worst.
 """
 
 # %%
 # The spring's pressure is :math:`p = p_0 (1 - A x / V)^{-n}`. Piston area :math:`A` and gas volume
-# :math:`V` appear as a quotient only: that they cannot be told apart can be seen in the formula.
-# That :math:`p_0` and :math:`n` nearly trade off over a short stroke cannot.
+# :math:`V` occur only as a quotient, so the data cannot separate them. The formula does not show
+# that :math:`p_0` and :math:`n` nearly compensate each other over a short stroke.
 
+# sphinx_gallery_thumbnail_number = 1
 import numpy as np
 import xarray as xr
 
@@ -41,7 +43,7 @@ PRIORS = [Normal(4.9, 0.5), Normal(1.2, 0.15), Normal(3.5, 0.35), Normal(9.2, 0.
 
 def spring(stroke, theta):
     pressure, exponent, area, volume = theta
-    with np.errstate(invalid="ignore"):  # no gas is left: the estimator is told so by NaN
+    with np.errstate(invalid="ignore"):  # no gas is left: NaN
         return pressure * (1 - 10 * area * stroke / volume) ** -exponent
 
 
@@ -53,22 +55,22 @@ print(point)
 
 # %%
 # The curvature of the likelihood, with every parameter in units of its prior's standard deviation,
-# has principal axes. Information below one means that the data say less about a direction than the
-# prior does.
+# has principal axes. If the information of a direction is below one, the data determine it less
+# than the prior does.
 
 print(principal_axes(problem, point))
 
 # %%
-# Relative to the values a direction is a product of powers. Area and volume have opposite exponents
-# in what is known and equal ones in what is not: the quotient is measured, the product is not.
+# Relative to the values, a direction is a product of powers. Area and volume have opposite
+# exponents in the well-determined direction and equal ones in the other: the data determine the
+# quotient, but not the product.
 
 print(principal_axes(problem, point, scale="value"))
 
 # %%
 # Contours where the log posterior has fallen by 3: the profiled ones are the 95 % regions of their
-# two parameters. In solid lines the exact region, in dashed ones the ellipse of the curvature. The
-# conditional section, with the other parameters held, is what a single plane of the objective
-# shows, and is far too optimistic.
+# two parameters. Solid lines are the exact region, dashed lines the ellipse of the curvature. The
+# conditional section, with all other parameters held constant, is far too small.
 
 region = indifference(
     problem,
@@ -79,18 +81,18 @@ region = indifference(
 figure = plots.indifference(region.data)
 
 # %%
-# Along single parameters the same is told by profiles. Those of the *likelihood* leave area and
-# volume open: nothing but the prior bounds them.
+# Profiles show the same for single parameters. The profiles of the *likelihood* are open for area
+# and volume: only the prior bounds them.
 
 by_data = profile(problem, estimate(problem), ["pressure", "exponent", "area"], kind="likelihood")
 print(by_data)
 figure_profile = plots.profile(by_data.data)
 
 # %%
-# **And the posterior?** A region of equal fit is not a credible region: it says how far the
-# objective falls, not how much is inside. For a normal posterior the profiled region of a fall of 3
-# holds 95 % in each plane of two parameters. Where the posterior is skewed or bent it need not; the
-# draws tell.
+# **The posterior.** A region of equal fit is not a credible region: it limits the objective, not
+# the probability. For a normal posterior the profiled region of a fall of 3 contains 95 % in each
+# plane of two parameters. For a skewed or curved posterior it need not, so draws are compared with
+# it.
 
 density = LogDensity(problem)
 draws = sample(
@@ -106,10 +108,9 @@ tree = xr.DataTree.from_dict(groups)
 figure_pairs = plots.pairs(tree)
 
 # %%
-# The table of every result, ``compare``: the posterior's mean against the estimate, its width
-# against the linearised covariance and against the region's extent, and its skewness. One by one
-# the parameters are as good as normal. Together they are not: the last line compares variances over
-# all directions, and across the narrow ridge, along the best known axis, draws lie wider than its
-# ellipse, because the ridge is bent.
+# ``compare`` holds the posterior's mean against the estimate, and its width against the linearised
+# covariance and the region. Each parameter alone is nearly normal. All together are not: the last
+# line compares variances over all directions. Across the narrow ridge the draws are wider than the
+# ellipse, because the ridge is curved.
 
 print(comparison_text(compare(tree)))

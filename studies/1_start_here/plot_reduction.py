@@ -2,9 +2,9 @@ r"""
 Finding the period of a record
 ==============================
 
-A shaker repeats its motion, but the sampling clock knows nothing of it: a period is no whole number
-of samples. This page finds the period of a noisy record as Verbeek (1993), appendix B, does it,
-carries the record to a grid of one period in two ways, and looks for drift.
+A shaker repeats its motion, but a period is not a whole number of samples. This page finds the
+period of a noisy record by the method of Verbeek (1993), appendix B. It then maps the record to a
+grid of one period in two ways, and tests for drift.
 """
 
 # %%
@@ -39,15 +39,15 @@ record = pressure(FREQUENCY * time) + rise + rng.normal(0.0, 3e3, time.size)
 
 # %%
 # The residual time shift function :math:`\frac1n \sum (y_\mu - y_{\mu+\eta})^2` falls to the noise
-# where the shift is a period; the autocovariance peaks there. Next to one period a quadratic goes
-# through the valley, and its minimum is the period. The declared frequency may be 2 % off.
+# where the shift is a period; the autocovariance has its maximum there. The minimum of a quadratic
+# through the values near one period is the estimate. The declared frequency is 2 % off here.
 
 search = period_search(record, STEP, nominal=1.02 * FREQUENCY)
 figure = plots.period_search(search, unit="Pa", name="pressure")
 
 # %%
-# That is good to a fraction of a sample. Least squares on all harmonics that stand above the noise
-# then uses every period at once; late periods against early ones see a frequency best.
+# This is accurate to a fraction of a sample. Least squares on all harmonics above the noise then
+# uses all periods at once, and the whole length of the record determines the frequency.
 
 refined = find_frequency(record, STEP, FREQUENCY)
 shifts = np.arange(450, 550)
@@ -61,8 +61,8 @@ for name, value in (
 print(f"{'its standard deviation':27} {refined.sd:.7f} Hz")
 
 # %%
-# A solver wants a regular grid. Linear interpolation of one period, the thesis's way, keeps all of
-# the noise of that period. The band-limited map averages the four, and adds no error of its own.
+# A solver needs a regular grid. Linear interpolation of one period, as in the thesis, keeps all of
+# the noise of that period. The band-limited map averages the four periods and adds no error.
 
 points = 800
 truth = pressure(np.arange(points) / points)
@@ -70,12 +70,12 @@ print("\nroot mean square error on the grid")
 for method in ("linear", "band-limited"):
     error = on_grid(record, STEP, refined.value, points, method=method) - truth
     print(f"{method:13} {np.sqrt(np.mean((error - error.mean()) ** 2)) / 1e3:5.2f} kPa")
-print(f"what an average over four periods has to have: {3 / np.sqrt(4):.2f} kPa")
+print(f"expected of an average over four periods: {3 / np.sqrt(4):.2f} kPa")
 
 # %%
-# The average over periods also measures the noise, without any model: what does not repeat. A drift
-# does not repeat either, so it has to be looked for. It is found with the right size, and
-# ``bayesoleo reduce`` would warn of it.
+# The average over periods also measures the noise without any model: noise is the part that does
+# not repeat. A drift does not repeat either, so it needs a test of its own. The test finds it with
+# the right size, and ``bayesoleo reduce`` would warn of it.
 
 average = periodic_average(record, STEP, refined.value)
 found = drift(record, STEP, refined.value, "pressure")

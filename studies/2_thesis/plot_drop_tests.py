@@ -2,15 +2,14 @@ r"""
 Drop tests predicted from the shaker
 ====================================
 
-A shaker moves an oleo slowly; a drop does not. Verbeek (1993), section 6.4, predicted two drop
-tests with the parameters found on the shaker and had to double the orifice damping to fit them.
-This page asks what the shaker could have known, with the simulated campaign ``shaker-plain``, and
-with the thesis's own numbers.
+An oleo is the shock strut of an aircraft. A shaker moves it slowly, a drop test fast. Verbeek
+(1993), section 6.4, predicted two drop tests with parameters from the shaker, and had to double the
+orifice damping to fit them. This page asks how well shaker data determine that damping.
 """
 
 # %%
-# The mass sits on top and is released with the oleo extended. ``drop_test`` turns an oleo into that
-# model: no input, gravity compresses, and the force is an output.
+# A mass on top of the extended oleo is released. ``drop_test`` turns an oleo into the model of this
+# test: it has no input, gravity compresses it, and the force is an output.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -25,23 +24,23 @@ study = Study("drop_tests", data="campaigns/shaker-plain", slow=True, needs=NEED
 tests, shaker = study.helper("drop_tests"), study.helper("shaker_tables")
 
 # %%
-# **What does the shaker say of the orifice damping** :math:`\theta_3`? It is known beforehand to 10
-# %. At 0.1 m/s it makes 29 N, below the 90 N to which the thesis's force sensor is accurate.
+# **Orifice damping from the shaker.** The prior of :math:`\theta_3` has a standard deviation of 10
+# %. At 0.1 m/s its force is 29 N, less than the 90 N to which the thesis's force sensor is
+# accurate.
 
 found = study.run(lambda: tests.fitted(shaker.Shaker.load().reduced.records))
 
 study.text("damping", lambda: tests.print_damping(found))
 
 # %%
-# A slow run alone adds nothing, and the output says so. All fourteen together do, but only because
-# the noise of this campaign is independent from sample to sample and the model is exact: fifty
-# thousand samples average 20 N down to a tenth of a newton. A rig whose errors are systematic, like
-# the thesis's 90 N, has no such average, and there :math:`\theta_3` should be left to its
-# tolerance.
+# A slow run alone adds no information, as the output says. All fourteen runs do, but only because
+# the noise is independent between samples and the model is exact: fifty thousand samples average 20
+# N to a tenth of a newton. Systematic errors, like the thesis's 90 N, do not average out. There
+# :math:`\theta_3` should keep its prior.
 #
-# **The drops** then are predicted both ways, with 200 draws of the parameters each; a constant that
-# was held is drawn from its tolerance. The truth is simulated with the true parameters as far as
-# they are given, and the joint estimate for the rest.
+# **The drops** are predicted in both ways, with 200 draws of the parameters each. A constant that
+# was held is drawn from its prior. The truth is simulated with the true parameters where they are
+# given, and with the joint estimate otherwise.
 
 made = study.run(lambda: tests.predictions_of(found))
 
@@ -84,16 +83,16 @@ thesis = study.figure(
 )
 
 # %%
-# What scatters by a few per cent from run to run makes the pressure of the heavy drop uncertain by
-# a factor of two, since it ends next to the pole of the gas law; strokes beyond 264 mm would have
-# hit the stop, which no model here has. Beside that the 10 % of the damping, above, are little. The
-# draws are independent between parameters, as the table says nothing of how they go together.
+# A scatter of a few per cent between runs makes the pressure of the heavy drop uncertain by a
+# factor of two, because the stroke ends near the pole of the gas law. Beyond 264 mm the oleo would
+# hit the stop, which these models lack. The 10 % of the damping matter little in comparison. The
+# draws are independent between parameters, because the table has no correlations.
 
 # %%
-# **The thesis's remedy, and what it leaves.** Nominal parameters: twice the orifice damping
-# fitted the light drop, 2.3 times the heavy one. Peaks of velocity and pressure fall. The end stays
-# as it is: for half a minute the gas of the model cools and the oleo sinks on, while the real one
-# had come to rest. Pressures are absolute.
+# **The thesis's remedy.** With nominal parameters, twice the orifice damping fitted the light drop
+# and 2.3 times the heavy one. The peaks of velocity and pressure fall. The end does not change: the
+# gas of the model cools for half a minute and the oleo sinks further, while the real one had come
+# to rest. Pressures are absolute.
 
 time = np.linspace(0.0, 40.0, 20_001)
 

@@ -2,16 +2,18 @@ r"""
 Parameters of chaotic records
 =============================
 
-A chaotic motion forgets its start: what is measured after some Lyapunov times is no usable function
-of the initial state and the parameters any more. Multiple shooting gives every short piece of the
-record an initial state of its own and asks for continuity of the result only (Bock 1987, Baake et
-al. 1992; Verbeek 1993, section 4.4). This page does it for the systems of Lorenz and Rössler.
+A chaotic motion forgets its initial state. After some Lyapunov times the samples are too sensitive
+to the initial state and the parameters to be fitted directly. Multiple shooting gives each short
+piece of the record its own initial state and requires continuity of the result only (Bock 1987,
+Baake et al. 1992; Verbeek 1993, section 4.4). This page applies it to the systems of Lorenz and
+Rössler.
 """
 
 # %%
 # Samples of the Lorenz system, 20 units of time - eighteen Lyapunov times - with noise of 5 % of
 # the spread of each component, made by an integrator of SciPy's.
 
+# sphinx_gallery_thumbnail_number = 2
 import matplotlib.pyplot as plt
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -43,10 +45,9 @@ noisy = motion + noise * np.random.default_rng(7).standard_normal(motion.shape)
 record = transient_record("lorenz", time, dict(zip("xyz", noisy, strict=True)))
 
 # %%
-# Fitting the initial state and the parameters alone is *single* shooting. Even with all else at its
-# true value, the misfit has one minimum only while the record is short. Over the whole record it
-# is a comb, at the height of what two unrelated motions differ by, and the minimum at the truth is
-# too narrow to be found.
+# *Single* shooting fits the parameters and one initial state. Even with all other values true, the
+# misfit has a single minimum only for a short record. Over the whole record it is a comb, as high
+# as for two unrelated motions, and the minimum at the truth is too narrow to be found.
 
 rhos = np.linspace(24.0, 32.0, 241)
 ways = [solved(lorenz, motion[:, 0], time, 1e-6, 10.0, rho) for rho in rhos]
@@ -60,16 +61,16 @@ panels[0].set_ylabel("misfit over variance")
 plt.show()
 
 # %%
-# Multiple shooting from the same record, its parameters 20 % off to begin with. States start on the
-# smoothed samples.
+# Multiple shooting with the same record. The parameters start 20 % off, the states at the smoothed
+# samples.
 
 model = bayesoleo.system("lorenz")
 found = multiple_shooting(model, [record], start=[12.0, 22.4, 3.2], backend="numpy")
 print(found)
 
 # %%
-# One component is enough where it determines the others. From ``x`` alone - the other two start at
-# their declared guess - the parameters come back too, and with them what was not measured.
+# One component suffices if it determines the others. From ``x`` alone the parameters are found too,
+# and with them the components that were not measured. These start at their declared guess.
 
 record_of_x = transient_record("lorenz", time, {"x": noisy[0]})
 alone = multiple_shooting(model, [record_of_x], start=[12.0, 22.4, 3.2], backend="numpy")
@@ -78,10 +79,10 @@ truth = {name: (time, row) for name, row in zip("xyz", motion, strict=True)}
 hidden = plots.trajectory(alone.trajectories[0], truth=truth)
 
 # %%
-# Fifty records of each system, with other noise and another start each time: all three states, or
-# one component. Errors are in units of the standard error that each fit states. All of them stay
-# below three, and they scatter as they should. Below: the same records by single shooting with as
-# many iterations, which ends nowhere near.
+# Fifty records of each system, each with other noise and another start, with all three states or
+# one component measured. The errors, in units of the standard error of each fit, stay below three
+# and scatter as expected. The lower panel has the same records by single shooting with as many
+# iterations; it does not reach the truth.
 
 study = Study("chaos", slow=True, needs=("chaos", "chaos_figures"))
 chaos, figures = study.helper("chaos"), study.helper("chaos_figures")

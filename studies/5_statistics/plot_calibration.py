@@ -17,12 +17,13 @@ intervals promise too much: the second half of this page counts how much.
 # drawn from their priors, a hundred samples are simulated, and the posterior is sampled, fifty
 # times.
 
+# sphinx_gallery_thumbnail_number = -1
 import matplotlib.pyplot as plt
 import numpy as np
 
-from bayesoleo import Normal
 from bayesoleo.error_models import error_model
 from bayesoleo.estimation import FunctionProblem
+from bayesoleo.model import Normal
 from bayesoleo.plots import Study
 from bayesoleo.posterior import LogDensity, laplace_mixture, rank_of, sample, uniformity
 

@@ -3,15 +3,16 @@ Sampling distribution of an estimate
 ====================================
 
 How much would an estimate scatter if the experiment were repeated? Theory answers by linearisation,
-and sets a limit that no unbiased estimator can pass (Cramér and Rao). Simulation answers without
-either (Verbeek 1993, eqs. 2.18-2.20). This page compares the two on the gas spring, and then asks
-what repetition cannot show.
+with a lower bound for unbiased estimators (Cramér and Rao). Simulation needs no linearisation
+(Verbeek 1993, eqs. 2.18-2.20). This page compares the two on a gas spring, and then shows an error
+that repetition cannot reveal.
 """
 
 # %%
 # The gas spring of section 3.4.2, :math:`y = (1 - x)^{-\theta}` with :math:`\theta = 1.2` and noise
 # of :math:`2\sigma` = 1 % of full scale, estimated ten thousand times.
 
+# sphinx_gallery_thumbnail_number = 2
 import time
 
 import numpy as np
@@ -39,15 +40,15 @@ print(found)
 print(f"{time.perf_counter() - begin:.1f} s")
 
 # %%
-# No bias is seen, although ten thousand replications would show some hundredths of a standard
-# deviation. The efficiency is one: no unbiased estimator scatters less than least squares here.
+# There is no visible bias; ten thousand replications would show some hundredths of a standard
+# deviation. The efficiency is one: no unbiased estimator scatters less here.
 
 figure = plots.sampling_distribution(found.data)
 
 # %%
-# With two parameters that trade off, ten points only and much more noise the picture changes. Both
-# estimates are biased by a tenth of their standard deviation, and the exponent scatters more than
-# linearisation says: its distribution is skewed, which an interval from a covariance cannot be.
+# With two correlated parameters, only ten points and much more noise, linearisation is poor. Both
+# estimates are biased by a tenth of their standard deviation. The exponent scatters more than
+# linearisation predicts, and its distribution is skewed, unlike an interval from a covariance.
 
 short = np.linspace(0.0, 0.9, 10)
 pair = FunctionProblem(
@@ -64,9 +65,9 @@ figure_wide = plots.sampling_distribution(wide.data)
 # %%
 # **A thousand runs of an oleo.** The same with all seven parameters of the thermo-mechanical oleo,
 # from a single run of a simulated shaker campaign, with new noise on force, pressure and on the
-# displacement that drives it. The friction slope alone is not what linearisation says: it stands in
-# an arctan. The command is ``python tests/benchmarks/replications.py oleo``; a thousand estimates
-# take seconds, and with ``--out`` a calculation that is stopped goes on where it was.
+# displacement that drives it. Linearisation is poor only for the friction slope, which is the
+# argument of an arctan. The command is ``python tests/benchmarks/replications.py oleo``; a thousand
+# estimates take seconds, and with ``--out`` a calculation that is stopped goes on where it was.
 
 NEEDS = {"data": "campaigns/shaker-plain", "needs": ("replications",)}
 study = Study("sampling_distribution", slow=True, **NEEDS)
@@ -77,11 +78,11 @@ figure_oleo = study.figure("oleo", lambda: plots.sampling_distribution(oleo.data
 
 # %%
 # All of this holds if the model is right. If it is not, repetition of the *same* experiment gives
-# narrow intervals round a wrong value. Here the data have the undeclared factor 0.95 of the thesis.
-# Runs over different strokes then disagree by many of their standard deviations. That is why the
-# thesis takes its intervals over experiments (eq. 2.42): such an interval at least knows that
-# something differs. The truth, 1.2, lies outside of it all the same, for all runs err to one side.
-# What gives the model away is the order of the residuals.
+# narrow intervals about a wrong value. Here the model lacks a factor 0.95, as in the thesis. Runs
+# over different strokes then differ by many of their standard deviations. The thesis therefore
+# takes its intervals over experiments (eq. 2.42), which includes these differences. The truth, 1.2,
+# still lies outside, because all runs err to one side. The order of the residuals reveals the
+# error.
 
 rng = np.random.default_rng(1)
 points, problems = [], []

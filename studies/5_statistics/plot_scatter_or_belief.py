@@ -20,7 +20,7 @@ from scipy import stats
 
 from bayesoleo.estimation import FunctionProblem, estimate, polish, sampling_distribution
 from bayesoleo.model import Normal
-from bayesoleo.plots import _style as style
+from bayesoleo.plots import AFTER, BEFORE
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 
 NOISE, TRUTH = 0.005 * 10**1.2, 1.2
@@ -94,10 +94,10 @@ for axes, (tree, name, truth) in zip(panels, cases, strict=True):
     span = np.quantile(np.concatenate([repeated, belief]), [0.001, 0.999])
     axes.hist(repeated, 45, range=span, density=True, color="0.75", label="estimates, repeated")
     axes.hist(
-        belief, 45, range=span, density=True, histtype="step", color=style.AFTER, lw=1.3,
+        belief, 45, range=span, density=True, histtype="step", color=AFTER, lw=1.3,
         label="posterior of one",
     )  # fmt: skip
-    axes.axvline(truth, color=style.BEFORE, lw=1, label="truth")
+    axes.axvline(truth, color=BEFORE, lw=1, label="truth")
     axes.set(xlabel=name, yticks=[])
 panels[0].set_title("100 good samples", fontsize=10)
 panels[1].set_title("10 poor samples", fontsize=10)
@@ -132,12 +132,12 @@ belief = (scatter**-2 + widths**-2) ** -0.5
 inside = np.mean(np.abs(modes - TRUTH) < 1.96 * belief[:, None], axis=1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.3), layout="constrained")
 left.loglog(widths, np.full(widths.size, scatter), "k--", label="scatter of MBE")
-left.loglog(widths, belief, "o-", color=style.AFTER, label="posterior sd")
-left.loglog(widths, modes.std(axis=1), "s-", color=style.BEFORE, label="scatter of BE")
-left.loglog(widths, belief**2 / scatter, ":", color=style.BEFORE, label="as theory says")
+left.loglog(widths, belief, "o-", color=AFTER, label="posterior sd")
+left.loglog(widths, modes.std(axis=1), "s-", color=BEFORE, label="scatter of BE")
+left.loglog(widths, belief**2 / scatter, ":", color=BEFORE, label="as theory says")
 left.set(xlabel="sd of the prior", ylabel="standard deviation")
 left.legend(frameon=False, fontsize=8)
-right.semilogx(widths, 100 * inside, "o-", color=style.AFTER)
+right.semilogx(widths, 100 * inside, "o-", color=AFTER)
 right.axhline(95, color="0.6", lw=0.8)
 right.set(xlabel="sd of the prior", ylabel="intervals that hold 1.2, %", ylim=(0, 102))
 for axes in (left, right):

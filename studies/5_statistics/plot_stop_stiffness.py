@@ -4,8 +4,8 @@ Posterior of an end stop's stiffness
 
 The stiffness of an end stop is seen only while the stop is touched. This page simulates the oleo of
 Verbeek (1993, section 4.3.3) with a stop of :math:`\theta = 100` under three forcings, from a hard
-blow to one that falls short, and asks each time what a point estimate says of the stiffness, what
-the posterior says, and how much of the answer was in the prior.
+blow to one that does not reach it. For each it compares the point estimate of the stiffness, the
+posterior, and the influence of the prior.
 """
 
 # %%
@@ -23,7 +23,7 @@ from scipy.interpolate import make_interp_spline
 import bayesoleo
 from bayesoleo.estimation import FunctionProblem, estimate, polish
 from bayesoleo.model import LogNormal
-from bayesoleo.plots import _style as style
+from bayesoleo.plots import BEFORE
 from bayesoleo.posterior import (
     LogDensity,
     compare,
@@ -43,7 +43,10 @@ model = bayesoleo.system("end_stop")
 def stroke(amplitude):
     """The stroke over two periods as a function of the logarithm of the stiffness."""
     plan = RunPlan("run", 1.0, {"force": motion(23.0, [amplitude])})
-    stiffness, options = {"stop_stiffness": table}, {"tolerance": 1e-6, "backend": "numpy"}
+    stiffness, options = (
+        {"stop_stiffness": table},
+        {"tolerance": 1e-6, "stiffness": "stop_stiffness"},
+    )
     found = periodic_orbit(model, plan, stiffness, "adaptive", **options)
     return make_interp_spline(np.log(table), found.dof("stroke", phase % 1.0))
 
@@ -71,9 +74,9 @@ for amplitude in (20.0, 7.6, 7.45, 7.0):
 
 # %%
 # The maximum of the likelihood (MBE) with its linearised standard deviation, and the posterior.
-# *Into the stop* is how far the stroke goes there, over the noise of a sample. The sensitivity says
-# how far the posterior moves if the prior counts double (Kallioinen et al. 2024); above 0.05 it is
-# worth a look.
+# *Into the stop* is how far the stroke goes there, over the noise of a sample. The sensitivity is
+# the shift of the posterior if the prior counts double (Kallioinen et al. 2024). Above 0.05 it is
+# noteworthy.
 
 print("forcing  into the stop        MBE     sd   posterior  95 % interval  skewness  sensitivity")
 print(f"{'':55}{'':17}of k  of ln k  to prior")
@@ -88,12 +91,12 @@ for amplitude, (deepest, mbe, tree) in runs.items():
     )
 
 # %%
-# A hard blow tells the stiffness to a per cent, and point and posterior are the same. Where the
-# stroke ends less than one standard deviation of the noise inside the stop, a stop that is half as
-# stiff would show, one that is twice as stiff hardly: the posterior leans to the stiff side, and an
-# interval about the point, which is the same on both sides, is wrong on both. On the logarithm most
-# of the skewness is gone, so that is the scale to state a stiffness on. Where the stop is not
-# reached, the posterior is the prior; the point still prints a number, the one it started from.
+# A hard blow determines the stiffness to a per cent, and estimate and posterior agree. If the
+# stroke ends less than one standard deviation of the noise inside the stop, half the stiffness
+# would be visible in the data, twice the stiffness hardly. The posterior is skewed to the stiff
+# side, and a symmetric interval is wrong on both sides. The logarithm of the stiffness is nearly
+# symmetric, so a stiffness is better stated on that scale. If the stop is not reached, the
+# posterior is the prior, and the estimate stays at its start.
 
 figure, panels = plt.subplots(2, 4, figsize=(10, 4.6), layout="constrained")
 for (upper, lower), (amplitude, (deepest, mbe, tree)) in zip(panels.T, runs.items(), strict=True):
@@ -102,7 +105,7 @@ for (upper, lower), (amplitude, (deepest, mbe, tree)) in zip(panels.T, runs.item
     low, high = (low, high) if amplitude > 7 else (0.0, 1200.0)
     fine = np.linspace(low, high, 300)
     upper.hist(k, 45, range=(low, high), density=True, color="#8cbbd9", label="posterior")
-    upper.plot(fine, stats.norm.pdf(fine, point, sd), color=style.BEFORE, label="point, linearised")
+    upper.plot(fine, stats.norm.pdf(fine, point, sd), color=BEFORE, label="point, linearised")
     prior = np.exp(PRIOR.log_density(fine[fine > 0]))
     upper.plot(fine[fine > 0], prior, "--", color="0.5", lw=1, label="prior")
     upper.axvline(TRUTH, color="k", lw=0.8, label="truth")
@@ -112,7 +115,7 @@ for (upper, lower), (amplitude, (deepest, mbe, tree)) in zip(panels.T, runs.item
     fine = np.linspace(log_low, log_high, 300)
     lower.hist(np.log(k), 45, range=(log_low, log_high), density=True, color="#8cbbd9")
     on_log = stats.norm.pdf(fine, np.log(point), sd / point)
-    lower.plot(fine, on_log, color=style.BEFORE)
+    lower.plot(fine, on_log, color=BEFORE)
     lower.plot(
         fine, stats.norm.pdf(fine, np.log(PRIOR.median), PRIOR.log_spread), "--", color="0.5", lw=1
     )

@@ -2,10 +2,10 @@ r"""
 A posterior with two modes
 ==========================
 
-The thesis ends at the mode. This page takes its gas spring with the undeclared factor 0.95
-(:doc:`../2_thesis/plot_gas_spring`) on to the whole posterior :math:`p^*(\theta, v)`, which two
-parameters allow to be checked by quadrature: is the sampler right where there are two modes, which
-of the two is worth more, and what does a density know of the missing effect that a point does not?
+A narrow prior far from the data can give a posterior with two modes. This page samples such a
+posterior :math:`p^*(\theta, v)`, that of the gas spring with an undeclared factor 0.95
+(:doc:`../2_thesis/plot_gas_spring`). It has two parameters only, so quadrature gives the exact
+result. The page checks the sampler, weighs the two modes, and compares estimate and posterior.
 """
 
 # %%
@@ -17,7 +17,7 @@ import xarray as xr
 
 from bayesoleo.estimation import FunctionProblem, multistart
 from bayesoleo.model import Normal
-from bayesoleo.plots import _style as style
+from bayesoleo.plots import AFTER, BEFORE
 from bayesoleo.posterior import LogDensity, compare, laplace_mixture, sample, to_datasets
 
 TRUTH = 1.2
@@ -49,8 +49,8 @@ found = {sd: sampled(problem) for sd, problem in problems.items()}
 # **Against quadrature.** The posterior on a fine grid of :math:`\theta` and :math:`\ln v`, summed
 # up. The wide prior leaves one mode, the narrow one makes two: the exponent of the prior with much
 # noise, and that of the data with little. A chain of small steps would never cross from one to the
-# other. Here walkers start from both, and a proposal from the mixture of both goes anywhere. The
-# standard errors follow from the effective sizes that the sampler reports.
+# other. Here walkers start from both, and proposals come from the mixture of both. The standard
+# errors follow from the effective sizes that the sampler reports.
 
 exponents, log_v = np.linspace(0.97, 1.28, 1241), np.linspace(-6.5, 2.5, 721)
 
@@ -85,9 +85,9 @@ for sd, (_, _, draws) in found.items():
 row("  part below 1.14", (theta < BETWEEN) * 1.0, by_theta[exponents < BETWEEN].sum())
 
 # %%
-# Left of each pair the grid in grey and draws in blue, right the marginal density of the exponent.
-# With the narrow prior the posterior cannot be said by one number and its standard deviation, and
-# its *mean* is a value that neither prior nor data believe in.
+# Left: the exact density in grey and draws in blue. Right: the marginal density of the exponent.
+# With the narrow prior no mean and standard deviation describe the posterior, and its *mean* is
+# improbable under both prior and data.
 
 figure, panels = plt.subplots(2, 2, figsize=(10, 6.2), layout="constrained", width_ratios=(1.6, 1))
 for (plane, marginal), (sd, (modes, _, draws)) in zip(panels, found.items(), strict=True):
@@ -96,25 +96,26 @@ for (plane, marginal), (sd, (modes, _, draws)) in zip(panels, found.items(), str
     near = (exponents > low) & (exponents < high)
     drop = np.log(grids[sd].max() / np.maximum(grids[sd], 1e-300))[near].T
     plane.contourf(exponents[near], log_v, drop, [0, 0.5, 2, 4.5, 8], cmap="Greys_r", alpha=0.55)
-    plane.plot(theta[::3], u[::3], ".", ms=1.5, color=style.AFTER)
+    plane.plot(theta[::3], u[::3], ".", ms=1.5, color=AFTER)
     for mode in modes:
         plane.plot(mode["exponent"], np.log(mode.variance[0]), "k*", ms=11, mec="white")
-    plane.axvline(TRUTH, color=style.BEFORE, lw=1)
+    plane.axvline(TRUTH, color=BEFORE, lw=1)
     plane.set(xlim=(low, high), ylim=(-5.6, -3.4) if sd == 0.10 else (-5.8, 1.5), ylabel="ln v")
-    plane.set_title(f"prior 1.0 ± {sd:.2f}", loc="left", fontsize=style.TEXT)
+    plane.set_title(f"prior 1.0 ± {sd:.2f}", loc="left", fontsize=9)
     marginal.hist(theta, 150, range=(low, high), density=True, color="#8cbbd9", label="draws")
     step = exponents[1] - exponents[0]
     marginal.plot(
         exponents[near], grids[sd].sum(axis=1)[near] / step, "k", lw=1, label="quadrature"
     )
-    marginal.axvline(TRUTH, color=style.BEFORE, lw=1, label="truth")
+    marginal.axvline(TRUTH, color=BEFORE, lw=1, label="truth")
     marginal.set(xlim=(low, high), ylabel="density of the exponent")
     marginal.set_xlabel("exponent θ")
-    marginal.legend(frameon=False, fontsize=style.SMALL)
+    marginal.legend(frameon=False, fontsize=8)
 
 # %%
-# **What are the modes worth?** Their heights do not say; a broad mode that is lower may hold more.
-# Laplace's approximation takes each mode's curvature into account and is nearly right here.
+# **Weights of the modes.** The heights are not the weights: a lower but broader mode may contain
+# more probability. Laplace's approximation includes the curvature of each mode and is nearly right
+# here.
 
 modes, density, draws = found[0.01]
 places = np.array([mode.theta for mode in modes])
@@ -132,8 +133,8 @@ for name, part in parts.items():
 # %%
 # **Point against posterior**, the table that every result of ``bayesoleo sample`` holds: how far
 # the posterior's mean lies from the estimate, how wide it is beside the linearised standard
-# deviation, and how skewed. With the wide prior the point says all. With the narrow one it says
-# what one of the two modes is like, and nothing of the other.
+# deviation, and how skewed. With the wide prior the estimate suffices. With the narrow one it
+# describes only one of the two modes.
 
 
 print(f"{'prior':>6}{'estimate':>10}{'sd':>9}{'shift':>8}{'sd ratio':>10}{'skewness':>10}")
@@ -146,12 +147,11 @@ for sd, (modes, density, draws) in found.items():
     print(f"{point}{table['shift'].item():8.2f}{ratio:10.2f}{table['skewness'].item():10.2f}")
 
 # %%
-# **And the undeclared factor?** With the wide prior point and posterior agree perfectly, and both
-# are wrong: the truth lies many of their standard deviations away. The density is right about the
-# model it was given, and the model is not. An error model that allows for residuals that go on does
-# not find the factor. But a misfit that is smooth costs it less, so the exponent is bent less to
-# avoid one: the interval is wider and lies nearer to the truth. It is off all the same. What helps
-# is to look for what is missing.
+# **The undeclared factor.** With the wide prior estimate and posterior agree, and both are wrong:
+# the truth lies many standard deviations away, because the model is wrong. An error model with
+# autocorrelated residuals does not find the factor. But it penalises a smooth misfit less, so the
+# exponent is less biased, and its interval is wider and nearer to the truth. It still misses it.
+# The remedy is to find the missing effect.
 
 print("errors         95 % interval of the exponent   off by (sd)")
 for word in ("independent", "correlated", "discrepancy"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -131,3 +132,28 @@ def test_page_shows_the_model_of_its_campaign(name: str) -> None:
     model = text[text.index("model = Model(") :]
     page = "mbari" if name == "mbari_gas_spring" else name
     assert model in next(STUDIES.glob(f"*/plot_{page}.py")).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["silverbox", "mr_damper", "mbari_gas_spring"])
+def test_page_declares_its_campaign(name: str) -> None:
+    page = next(STUDIES.glob(f"*/plot_{name.removesuffix('_gas_spring')}.py"))
+    nodes = ast.parse(page.read_text(encoding="utf-8")).body
+    names: dict[str, object] = {}
+    for node in nodes[: 1 + next(k for k, n in enumerate(nodes) if _assigns(n, "DECLARATION"))]:
+        if isinstance(node, ast.Assign):
+            exec(compile(ast.Module([node], []), str(page), "exec"), names)
+    declared = tomllib.loads(str(names["DECLARATION"]))
+    stored = tomllib.loads((STUDIES / "measured" / name / "campaign.toml").read_text("utf-8"))
+    assert declared == {key: item for key, item in stored.items() if key != "description"}
+
+
+def _assigns(node: ast.stmt, name: str) -> bool:
+    return isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name
+
+
+PRIVATE = re.compile(r"bayesoleo(\.\w+)*\._|from bayesoleo[\w.]* import (.*\b)?_")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_uses_public_names_only(page: Path) -> None:
+    assert not PRIVATE.search(page.read_text(encoding="utf-8").replace("__version__", ""))
