@@ -13,7 +13,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from PIL import Image
 
-import bayesoleo
+import bayesoleo as bo
 from bayesoleo import plots
 from bayesoleo._workflow.simulating import DEMO_SYSTEM, demo_campaign
 
@@ -42,9 +42,8 @@ def main() -> None:
     """Close the loop on the campaign of the demo; store residual and ranking of the effects."""
     with tempfile.TemporaryDirectory() as folder:
         campaign = demo_campaign(Path(folder) / "campaign", seed=0)
-        settings = bayesoleo.Settings(seed=0, quick=True)
-        tree = bayesoleo.close(campaign, bayesoleo.system(DEMO_SYSTEM), settings)
-    shown = [plots.residual(tree, "force"), plots.ranking(tree, most=6)]
+        found = bo.Problem(campaign, bo.system(DEMO_SYSTEM), seed=0, quick=True).fit().explain()
+    shown = [plots.residual(found.tree, "force"), plots.ranking(found.tree, most=6)]
     stacked([picture(figure) for figure in shown]).save(TARGET, optimize=True)
 
 
