@@ -3,13 +3,13 @@ Stability of difference schemes
 ===============================
 
 Verbeek (1993), section 4.3.1, replaced both derivatives of a periodic motion by second-order
-*backward* differences, after trying every combination with central ones: these "could go unstable".
-This page shows where, and why, and what the package uses instead.
+*backward* differences, because combinations with central ones "could go unstable". This page shows
+where and why they do, and the scheme that the package uses instead.
 """
 
 # %%
-# An oscillator with dry friction, the arctan of the oleo, and a mass that will be made smaller: the
-# oleo's own inertia is 39 N at most, beside forces of kilonewtons.
+# The test is an oscillator with dry friction, the arctan of the oleo, and a decreasing mass. In the
+# oleo, the shock strut of an aircraft, inertia is 39 N at most, beside forces of kilonewtons.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -52,14 +52,14 @@ def displacement(scheme, steps, *, plan=plan, phases=phases, **values):
 
 
 # %%
-# **Where inertia rules** (no friction, left) all converge at their orders. **Where friction rules**
-# (middle, 512 steps, the mass falling) a central acceleration with a velocity that looks back finds
-# nothing any more, though the motion is no harder: the others err as before. **Where little holds
-# the position** (right, a damper with a weak spring and one short pulse a period, 64 steps) two
-# central differences answer the pulse with a saw's teeth.
+# **Dominant inertia** (left, no friction): all schemes converge at their orders. **Dominant
+# friction** (middle, 512 steps, decreasing mass): a central acceleration with a backward velocity
+# finds no solution, though the other schemes err as before. **A weak spring** (right, a damper and
+# one short pulse each period, 64 steps): two central differences oscillate from node to node after
+# the pulse.
 #
-# The reason is one motion: that which alternates from node to node. Against it an oscillator with
-# mass :math:`m`, damping :math:`c` and stiffness :math:`k` on steps :math:`h` puts up
+# The cause is the motion that alternates from node to node. An oscillator with mass :math:`m`,
+# damping :math:`c` and stiffness :math:`k` on steps :math:`h` resists it with the stiffness
 #
 # .. math::
 #
@@ -83,7 +83,7 @@ pulse = RunPlan("pulse", 0.2, {"force": motion(0.0, [0.02] * 32)})
 weak = {"mass": 0.0, "damping": 0.5, "stiffness": 0.02, "friction": 0.0}
 nodes = np.arange(64) / 64
 
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 4.5), layout="constrained")
+figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10, 4.5), layout="constrained")
 for scheme, title in schemes.items():
     error = [np.abs(displacement(scheme, n, **smooth) - exact).max() for n in steps]
     left.loglog(steps, error / np.abs(exact).max(), styles[scheme], label=title)

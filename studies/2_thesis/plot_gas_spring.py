@@ -2,10 +2,10 @@ r"""
 A gas spring with a model error
 ===============================
 
-A narrow prior says that a parameter is well known. If the model itself is wrong, the classical
-Bayesian estimator believes the prior, explains the difference as noise, and stays near its start.
-The modified Bayesian estimator (MBE) uses the same prior only to scale its steps and arrives at
-what the data say. This page repeats the numerical experiment of Verbeek (1993), section 3.4.2.
+A narrow prior states that a parameter is well known. If the model is wrong, the classical Bayesian
+estimator trusts the prior, takes the difference for noise, and stays near its start. The modified
+Bayesian estimator (MBE) uses the prior only to scale its steps, and reaches the maximum of the
+likelihood. This page repeats the numerical experiment of Verbeek (1993), section 3.4.2.
 """
 
 # %%
@@ -61,12 +61,12 @@ for sd, found in points.items():
         )
 
 # %%
-# With the wide prior it does not matter. With the narrow one BE converges, without complaint, to
-# an exponent near the prior and to far too much noise. MVE locks up: its steps shrink as the
-# reciprocal of the iteration, so that a test of their size alone would take it for converged. Its
-# status says otherwise, because the distance to the fixed point is tested as well.
+# With the wide prior all agree. With the narrow prior BE converges to an exponent near the prior,
+# with far too much noise. MVE stalls: its steps shrink as the reciprocal of the iteration, and a
+# test of their size alone would report convergence. Its status is right, because the distance to
+# the fixed point is tested too.
 #
-# BE has not failed as an optimiser. The posterior has two modes, and it found the one on its side:
+# BE has not failed as an optimiser. The posterior has two modes, and BE found the nearer one:
 
 narrow = problems[0.01]
 modes = multistart(narrow, 4, np.random.default_rng(1))
@@ -77,10 +77,10 @@ for mode in modes:
     )
 
 # %%
-# The figure shows the log posterior :math:`\Phi_B(\theta, v)`, dark where it is high, and the way
-# that each estimator took, as figures 3.2 and 3.3 do. On the right BE ends at the upper mode; the
-# others pass by it and go on to the maximum of the likelihood, close to the lower one. From there a
-# few steps of BE reach that mode: what the package calls the estimate.
+# The figure shows the log posterior :math:`\Phi_B(\theta, v)`, dark where it is high, and the path
+# of each estimator, as in figures 3.2 and 3.3. On the right BE ends at the upper mode. The others
+# pass it and reach the maximum of the likelihood, close to the lower mode. From there a few steps
+# of BE reach that mode, which the package reports as the estimate.
 # :doc:`../5_statistics/plot_two_modes` weighs the modes against each other.
 
 
@@ -121,10 +121,10 @@ panels[0].legend(frameon=False, loc="lower left")
 
 # %%
 # Every one of these points lies on the *solution path*: the variance is staged, so that it is the
-# best one for its exponent. Along this path the likelihood has one top only, but the narrow prior
-# makes a second one (left, a star on each). On the right is how far each estimator still is from
-# where it is going, as in figure 3.4: MVE shrinks its steps until it hardly moves; MMVE and MBE
-# differ in their first steps, where MBE is held back more, and end alike.
+# best one for its exponent. Along this path the likelihood has one maximum, but the posterior with
+# the narrow prior has two (left, stars). The right panel shows the distance of each estimator from
+# the final estimate, as in figure 3.4. MVE shrinks its steps until it hardly moves. MMVE and MBE
+# differ only in the first steps, which are shorter for MBE.
 
 counts = output_counts(narrow.counts)
 sums = narrow.misfit(exponents[:, None]).sum_of_squares[:, 0]

@@ -2,16 +2,16 @@ r"""
 Folds of a Duffing oscillator
 =============================
 
-An oscillator whose spring stiffens (Duffing 1918) can answer one force in three ways. Two of the
-answers last, the one between them does not, and where it meets one of the others both vanish: the
-response jumps. This page follows the branch through its folds, says which part of it a rig can be
-on, and shows how an estimate tells that it has jumped.
+An oscillator with a stiffening spring (Duffing 1918) can have three periodic responses to one
+force. Two are stable, the one between them is not. Where it meets one of the others both vanish, at
+a fold, and the response jumps. This page follows the branch through its folds, shows its stable
+part, and shows how an estimate detects a jump.
 """
 
 # %%
 # The declared oscillator of 1 kg, 0.5 N s/m and 100 N/m with a cubic spring, under a force of 6 N.
-# One call follows its answers along the frequency. A step goes along the branch, not along the
-# frequency, so that it may turn round (pseudo-arclength continuation, Keller 1977).
+# One call follows the response over the frequency. A step goes along the branch, not along the
+# frequency, so the branch may turn back (pseudo-arclength continuation, Keller 1977).
 
 from dataclasses import replace
 
@@ -43,18 +43,18 @@ for fold in branch.branch.of_kind("fold"):
     )
 
 # %%
-# The same answers along the force, at 2.5 Hz: a rig that is turned up stays on the small answer
-# until the fold and jumps, one that is turned down stays on the large answer.
+# The response over the force, at 2.5 Hz. With increasing force a rig stays on the small response
+# until the fold and jumps; with decreasing force it stays on the large one.
 
 loud = RunPlan("level", 2.5, {"force": motion(0.0, [6.0])})
 along_force = follow_branch(model, loud, "amplitude", (0.02, 2.0), longest=0.02, steps=64)
 level_figure = plots.branch(along_force, "displacement")
 
 # %%
-# An estimate moves parameters, and so it may walk over a fold. Here the stiffness goes from 100 to
-# 140 N/m, each solution started from the last as an estimator does. At 125 N/m the small answer
-# vanishes. Newton's method finds the large one in the end, and would do so without a word; but
-# small steps do not lead there, and that is said.
+# An estimate changes the parameters and may cross a fold. Here the stiffness goes from 100 to 140
+# N/m, and each solution starts from the last one, as in an estimate. At 125 N/m the small response
+# vanishes. Newton's method then finds the large one. Small steps do not lead there, so the solver
+# reports a jump.
 
 record = record_of(model, replace(loud, periods=4))
 blank = replace(record, samples=record.samples | {"displacement": np.zeros(record.time.size)})
@@ -79,10 +79,10 @@ axes.plot(walk, [500 * np.ptp(a.y) for a in answers], "k.", ms=7, zorder=6)
 axes.set_xlim(80.0, 140.0)
 
 # %%
-# What becomes of an estimate that follows the wrong branch: the record is of the large answer at
-# 150 N/m, the solutions start on the small one. It cannot find the truth, and says what happened
-# on the way. (Records of a campaign start from their own measured motion, which is the right branch
-# from the beginning: the second fit.)
+# An estimate on the wrong branch: the record has the large response at 150 N/m, the solutions start
+# on the small one. The first fit cannot find the truth, and reports the jump. The second fit starts
+# from the measured motion, as records of a campaign do, and is on the right branch from the
+# beginning.
 
 one = model.fixing("damping", "cubic_spring")
 maker = Predictor(one, [blank], steps=64, backend="numpy")

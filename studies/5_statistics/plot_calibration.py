@@ -2,11 +2,11 @@ r"""
 Coverage of intervals
 =====================
 
-A 90 % interval should hold the truth in nine experiments of ten. Whether sampler and density are
-right can be tested: draw the truth from the prior, simulate, sample the posterior, and rank the
-truth among its draws. Over many replications the ranks are uniform (simulation-based calibration,
-Talts et al. 2018). Whether the *model* is right cannot be tested so, and where an effect is missing
-intervals promise too much: the second half of this page counts how much.
+A 90 % interval should contain the truth in nine of ten experiments. This can be tested: draw the
+truth from the prior, simulate, sample the posterior, and rank the truth among its draws. Over many
+replications the ranks are uniform if sampler and density are right (simulation-based calibration,
+Talts et al. 2018). The test says nothing about the *model*. If an effect is missing, intervals are
+too narrow; the second half of this page measures by how much.
 """
 
 # %%
@@ -47,9 +47,9 @@ def ranks(seed):
 found = np.array([ranks(seed) for seed in range(50)])
 
 # %%
-# The part of the ranks up to a place, less that of a uniform variable. A curve that stays inside
-# its band is what chance makes of a right posterior; one that leans has a bias, one that is bent
-# twice has the wrong width.
+# The distribution function of the ranks minus the uniform one. A right posterior gives a curve
+# within the band. A curve on one side of zero shows a bias, a curve that changes sides a wrong
+# width.
 
 figure, panels = plt.subplots(1, 2, figsize=(9, 2.6), sharey=True, layout="constrained")
 for axes, column, name in zip(panels, found.T, ("exponent", "log variance"), strict=True):
@@ -61,8 +61,8 @@ panels[0].set_ylabel("part of the ranks − uniform")
 plt.show()
 
 # %%
-# Two thousand of them take longer; these and the tables below are those of the commands that they
-# name.
+# Two thousand replications take longer. Their results, and the tables below, come from the commands
+# listed here.
 
 study = Study("calibration", needs=("calibration_figures",))
 figures = study.helper("calibration_figures")
@@ -72,56 +72,56 @@ if study.live:
 figure = study.run(lambda: figures.ranks_figure("spring"))
 
 # %%
-# The same of seven parameters and two variances of an oleo, four runs of a shaker campaign.
+# The same for an oleo (the shock strut of an aircraft): seven parameters and two variances, four
+# runs of a shaker campaign.
 
 figure = study.run(lambda: figures.ranks_figure("oleo"))
 
 # %%
-# Each band holds 95 % of uniform ranks, so of nine quantities one or none may leave theirs by
-# chance. Of the first 300 of these experiments the variance of the pressure did (p = 0.003); twice
-# as many tell chance from a mistake. Weighted draws
-# (:func:`~bayesoleo.posterior.importance_sample`) cost a tenth; of the same experiments and more,
-# they test the density where walkers test the sampler too.
+# Each band contains 95 % of uniform ranks, so of nine quantities one or none may leave it by
+# chance. In the first 300 experiments the variance of the pressure did (p = 0.003); twice as many
+# show whether that was chance. Weighted draws (:func:`~bayesoleo.posterior.importance_sample`) cost
+# a tenth. They test the density alone; the walkers test the sampler too.
 
 if study.live:
     figures.print_ranks()
 figure = study.run(lambda: figures.ranks_figure("oleo-weighted"))
 
 # %%
-# An effect that nobody declared
-# ------------------------------
+# A missing effect
+# ----------------
 #
 # Parameters, the effect and its size are drawn anew in each replication: direction-dependent
 # damping, a linear stiffness, Stribeck friction or a wall that stores heat, one as likely as
 # another, of a size of half to four times the noise (rms of what it changes, in the output that
-# shows it most; uniform in the logarithm). The posterior knows nothing of the effect.
+# shows it most; uniform in the logarithm). The fitted model does not contain the effect.
 #
-# What can one ask of it? A parameter whose signature the effect bears stands for the sum of both:
-# no assumption on errors tells them apart, and such a parameter does not keep its meaning. Which
-# these are the model says, without data: the part of what an effect changes that lies along what
-# only this parameter changes, cos² of the angle between them, is compared with that of smooth
-# misfits by chance. Left out besides are parameters that an effect redefines: the heat conduction
-# of a wall that stores heat, base and slope of a friction with a Stribeck peak.
+# If an effect and a parameter change the outputs in the same way, the estimate is the sum of both.
+# No assumption on errors separates them, and the parameter does not keep its meaning. The model
+# alone shows which parameters these are: cos² of the angle between the change by the effect and the
+# change by this parameter only is compared with that of random smooth misfits. Parameters that an
+# effect redefines are left out too: the heat conduction of a wall that stores heat, and base and
+# slope of a friction with a Stribeck peak.
 
 if study.live:
     figures.print_imitation()
 
 # %%
-# How often the intervals hold the truth, and what that costs in width:
+# How often the intervals contain the truth, and how wide they are:
 
 if study.live:
     figures.print_coverage()
 
 # %%
-# Filled: parameters that keep their meaning. Open: the others. Errors assumed independent count
-# each sample as news. The others know that a residual which stays off is one error and not a
-# hundred, and the last that several runs may show one error and not several.
+# Filled: parameters that keep their meaning. Open: the others. Independent errors count each sample
+# as new information. The other error models treat a persistent residual as one error, and the last
+# one lets several runs share one error.
 #
-# What is left of the misses has two places. Of a linear stiffness the parameters together take over
-# 95 % (last column of the table above): an error model learns the size of the misfit from the
-# twentieth that is left, and the initial volume is off by more than that. A wall that stores
-# heat changes pressure and force as volume and solubility of the gas do, in both outputs at once
-# and with no curve that the runs share. What the parameters have taken over is not in the residual,
-# and no error model sees it: so it pays to look for the effect first.
+# Two effects cause the remaining misses. The parameters together absorb 95 % of a linear stiffness
+# (last column of the table above). The error model learns the size of the misfit from the remaining
+# twentieth, but the initial volume errs by more. A wall that stores heat changes pressure and force
+# as volume and solubility of the gas do, in both outputs at once and differently in each run. An
+# absorbed effect is not in the residual, and no error model sees it. It is therefore better to find
+# the effect first.
 
 figure = study.run(lambda: figures.coverage_figure())

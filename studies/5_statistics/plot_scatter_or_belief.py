@@ -2,16 +2,16 @@ r"""
 Sampling distribution and posterior
 ===================================
 
-A *sampling distribution* is how an estimate scatters when the experiment is repeated; a *posterior*
-is what one experiment leaves to be believed. They answer different questions, and an engineer is
-often shown one for the other. This page computes both, by replication and by sampling, where they
-agree, where a prior parts them, and where their agreement proves nothing.
+A *sampling distribution* is the scatter of an estimate when the experiment is repeated. A
+*posterior* is the probability of the parameters given one experiment. The two answer different
+questions and are often confused. This page computes both by simulation: in a case where they agree,
+in one where a prior separates them, and in one where their agreement proves nothing.
 """
 
 # %%
-# **Where they agree.** The gas spring of section 3.4.2, :math:`y = (1 - x)^{-\theta}`, a hundred
-# samples with noise of :math:`2\sigma` = 1 % of full scale: four thousand repetitions on one side,
-# draws given a single one of them on the other.
+# **Agreement.** The gas spring of Verbeek (1993), section 3.4.2, :math:`y = (1 - x)^{-\theta}`, has
+# a hundred samples with noise of :math:`2\sigma` = 1 % of full scale. Four thousand repetitions are
+# compared with draws of the posterior of a single one.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -65,15 +65,14 @@ good = both(problem, [TRUTH], NOISE)
 show(good, NOISE)
 
 # %%
-# The same shape, at different places: the scatter lies about the truth, which only a simulation
-# knows; the posterior about the one estimate there is. Its width is the scatter's but for one
-# thing: an experiment learns its noise from the same samples, and this one saw too little of it.
-# With many good data it makes no difference which of the two is computed (Bernstein and von Mises),
-# and the linearised covariance would have done.
+# Both have the same shape at different places. The scatter lies about the truth, which only a
+# simulation knows; the posterior lies about the one estimate. The widths differ slightly, because
+# an experiment estimates its noise from the same samples, and here that estimate is low. With many
+# good data the two agree (Bernstein and von Mises), and the linearised covariance suffices.
 #
-# **Where the data are few.** Ten samples, much noise, and a pressure that trades off with the
-# exponent. How wide the posterior is depends on the experiment, and shapes differ: one is a
-# distribution of estimates at one truth, the other of truths at one estimate.
+# **Few data.** Ten samples, much noise, and a pressure that is correlated with the exponent. The
+# width of the posterior depends on the experiment, and the shapes differ: one is a distribution of
+# estimates for one truth, the other a distribution of truths for one estimate.
 
 short = np.linspace(0.0, 0.9, 10)
 pair = FunctionProblem(
@@ -104,13 +103,13 @@ panels[1].set_title("10 poor samples", fontsize=10)
 panels[0].legend(frameon=False, fontsize=7, loc="upper right")
 
 # %%
-# **Where a prior parts them.** The spring again with noise a hundred times as large, and priors
-# about 1.1 of any width; the truth is 1.2. A narrow prior makes the posterior narrow. It does not
-# make MBE scatter less, whose fixed point knows no prior, and it makes the mode (BE) scatter *even
-# less* than the posterior is wide: it hardly listens to the data. So the scatter of a Bayesian
-# estimate is no measure of what is not known. On the right, how often the 95 % interval of the
-# posterior holds *this* truth: not in 95 % unless the data decide. Over truths drawn from the prior
-# it would at any width, which is what a Bayesian interval promises.
+# **Influence of the prior.** The spring again with a hundred times the noise, and priors about 1.1
+# of different widths; the truth is 1.2. A narrow prior makes the posterior narrow. It does not
+# reduce the scatter of MBE, whose fixed point does not depend on the prior. The mode (BE) scatters
+# *even less* than the posterior is wide, because it depends little on the data. So the scatter of a
+# Bayesian estimate does not measure its uncertainty. The right panel shows how often the 95 %
+# interval of the posterior contains *this* truth: in 95 % only if the data dominate. Over truths
+# drawn from the prior it would be 95 % at any width, as a Bayesian interval promises.
 
 rough, centre = 100 * NOISE, 1.1
 
@@ -145,10 +144,10 @@ for axes in (left, right):
     axes.minorticks_off()
 
 # %%
-# **Where agreement proves nothing.** Both are computed from the model. If the model lacks
-# something, here the factor 0.95 of the thesis, they agree with each other and on a wrong value;
-# no repetition of the same experiment will tell. Runs under other conditions will
-# (:doc:`/gallery/5_statistics/plot_sampling_distribution`), and so will the order of the residuals.
+# **Agreement on a wrong value.** Both are computed from the model. If the model lacks an effect,
+# here the factor 0.95 of the thesis, both agree on a wrong value. Repetition of the same experiment
+# does not reveal it. Runs under other conditions do
+# (:doc:`/gallery/5_statistics/plot_sampling_distribution`), and so does the order of the residuals.
 
 wide = [Normal(1.0, 0.1)]
 lacking = FunctionProblem(lambda x, t: 0.95 * spring(x, t), position, exact, wide, ["n"])
