@@ -68,7 +68,7 @@ class BlockKernel:
 
     @property
     def address(self) -> int:
-        """Of the compiled function, for :func:`caller`."""
+        """Address of the compiled function, for :func:`caller`."""
         return int(self.pointer.address)
 
     def __call__(self, z: Array, u: Array, p: Array, lanes: Integers, *results: Array) -> None:
@@ -108,7 +108,7 @@ class ArrayKernel:
 
     @property
     def address(self) -> int:
-        """Of that callback."""
+        """Address of that callback."""
         return int(self.pointer.__wrapper_address__())
 
     def _block(self, z: int, u: int, p: int, out: int, count: int) -> None:
@@ -195,8 +195,9 @@ pointer: Any = intrinsic(_pointer)
 
 
 def _after(typing: Any, start: Any, offset: Any) -> tuple[Any, Any]:
-    """Address so many numbers behind another: an array that is passed instead has its references
-    counted, which costs more than a short loop.
+    """Address ``offset`` numbers behind another.
+
+    An array passed instead has its references counted, which costs more than a short loop.
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -209,7 +210,7 @@ after: Any = intrinsic(_after)
 
 
 def caller(signature: Any) -> Any:
-    """How compiled code calls a compiled function at an address: ``call(address, arguments)``.
+    """Make ``call(address, arguments)``, by which compiled code calls a function at an address.
 
     An address is a number. Passing the function itself costs the interpreter ten microseconds, more
     than many a block takes.

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-#: Word for workers on this machine; with a number behind a colon, so many.
+#: Name of workers on this machine; a number behind a colon sets how many.
 LOCAL = "local"
 #: Rounds in which workers are lost and not one task is done before it is given up.
 ROUNDS = 3
 #: Seconds to wait for a scheduler.
 PATIENCE = 10
 
-#: What a worker keeps of one crew: its token and its function.
+#: State of one worker pool on a worker: its token and its function.
 _kept: dict[str, Callable[[Any], Any]] = {}
 
 
@@ -194,7 +194,7 @@ class WorkerPool:
                 yield index, result
             idle = idle + 1 if len(missing) == before else 0
             if missing:
-                self._shared = None  # what was sent may be lost with those who had it
+                self._shared = None  # data sent may be lost with the workers that held it
             if idle == ROUNDS:
                 raise ResultsError(
                     f"workers were lost {ROUNDS} times before one task was done",
@@ -211,7 +211,7 @@ class WorkerPool:
 
 
 def _is_loss(error: BaseException) -> bool:
-    """Whether a task failed because of where it was, not because of what it is."""
+    """Whether a task failed because its worker was lost, not by its own error."""
     from distributed import KilledWorker
     from distributed.client import FutureCancelledError
     from distributed.comm.core import CommClosedError

@@ -18,7 +18,7 @@ _limit: int | None = None
 
 
 def limit_threads(count: int | None) -> None:
-    """Let this process use so many threads at most, whatever is asked for; None lifts it.
+    """Limit the number of threads of this process; None removes the limit.
 
     For a worker that shares its machine with others like it.
     """
@@ -37,7 +37,7 @@ def available_cores() -> int:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Linear algebra libraries of this process; to look for them takes milliseconds."""
+    """Linear algebra libraries of this process; finding them takes milliseconds."""
 
     return ThreadpoolController()
 
@@ -105,7 +105,7 @@ if hasattr(os, "register_at_fork"):  # threads do not follow into a forked proce
 
 
 def _gather[T, R](pool: ThreadPoolExecutor, function: Callable[[T], R], work: list[T]) -> list[R]:
-    """Results in order; nothing is left running behind an error or an interrupt."""
+    """Results in order; after an error or an interrupt no task keeps running."""
     futures = [pool.submit(function, item) for item in work]
     try:
         return [future.result() for future in futures]

@@ -19,6 +19,23 @@ from bayesoleo.error_models._base import Residuals
 #: Finite-difference step in standard deviations: log density changes by 0.03, far above rounding
 #: and solver noise.
 STEP = 0.25
+# Finite-difference step, in coordinates of about unit spread.
+_SCALE = 0.2
+# Tolerance of the maximum; a walker need not start exactly there.
+_GAIN, _ITERATIONS = 1e-3, 40
+# Longest step, and largest distance from the first guess; beyond it a share is practically 0 or 1.
+_RADIUS, _REACH = 3.0, 12.0
+# Least curvature that a step divides by.
+_FLAT = 1e-2
+# Rows of one block of a tall matrix.
+_BLOCK = 1024
+#: Singular values below this part of the largest count as zero. Rounding of derivatives reaches
+#: 1e-13 of a column where they are differences; certified data sets need values down to 1e-9.
+RANK = 1e-11
+# Share of an unknown, with its column of unit length, in undetermined directions, above which it
+# counts as undetermined. Directions are known to the rounding of derivatives over the least
+# singular value that counts.
+_TAKES_PART = 1e-3
 
 
 def derivatives(
@@ -56,16 +73,6 @@ def derivatives(
             mixed = (sum_of_two - 2 * centre - diagonal[i] - diagonal[j]) / (2 * h**2)
             hessian[i, j] = hessian[j, i] = mixed
     return float(centre), gradient, hessian
-
-
-# Finite-difference step, in coordinates of about unit spread.
-_SCALE = 0.2
-# Tolerance of the maximum; a walker need not start exactly there.
-_GAIN, _ITERATIONS = 1e-3, 40
-# Longest step, and largest distance from the first guess; beyond it a share is practically 0 or 1.
-_RADIUS, _REACH = 3.0, 12.0
-# Least curvature that a step divides by.
-_FLAT = 1e-2
 
 
 def climb(height: Callable[[Array], Array], guesses: Sequence[Array]) -> Array:
@@ -115,17 +122,6 @@ def _uphill(gradient: Array, hessian: Array, flat: float) -> Array:
     """Newton's step with all curvatures made negative, so that it leads away from saddles."""
     curvature, axes = np.linalg.eigh(hessian)
     return axes @ ((axes.T @ gradient) / np.maximum(np.abs(curvature), flat))
-
-
-# Rows of one block of a tall matrix.
-_BLOCK = 1024
-#: Singular values below this part of the largest count as zero. Rounding of derivatives reaches
-#: 1e-13 of a column where they are differences; certified data sets need values down to 1e-9.
-RANK = 1e-11
-# Share of an unknown, with its column of unit length, in undetermined directions, above which it
-# counts as undetermined. Directions are known to the rounding of derivatives over the least
-# singular value that counts.
-_TAKES_PART = 1e-3
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,12 @@ from bayesoleo.model._priors import LogNormal
 #: Starting coordinates of a share in the search for its most likely value: a fifth, a half, and
 #: nine tenths.
 _SHARES = (-0.85, 0.0, 1.3)
+#: Prior spread of the logarithms of variances between runs: 0.3 within a factor of e for one
+#: standard deviation, from equal runs to noise that differs threefold.
+_SPREAD_PRIOR = LogNormal(0.3, 1.0)
+_LOG_2_PI = float(np.log(2 * np.pi))
+# A model that reproduces its data exactly has no residual variance; its logarithm must stay finite.
+_SMALLEST_VARIANCE = 1e-150
 
 
 class ByOutput(ErrorModel):
@@ -167,14 +173,6 @@ class ByOutput(ErrorModel):
         s, sd = len(self.frame.outputs), super().scales()
         sd[s : 2 * s], sd[2 * s :] = self._SHARE_SD, self._LENGTH_SD
         return sd
-
-
-#: Prior spread of the logarithms of variances between runs: 0.3 within a factor of e for one
-#: standard deviation, from equal runs to noise that differs threefold.
-_SPREAD_PRIOR = LogNormal(0.3, 1.0)
-_LOG_2_PI = float(np.log(2 * np.pi))
-# A model that reproduces its data exactly has no residual variance; its logarithm must stay finite.
-_SMALLEST_VARIANCE = 1e-150
 
 
 def sums_of_squares(evaluation: Residuals) -> Array:

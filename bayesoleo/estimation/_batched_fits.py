@@ -35,7 +35,7 @@ from bayesoleo.solvers._orbit import Status
 # Largest condition number of scaled normal equations that are solved as such; the rest goes to the
 # estimator that factorises the sensitivities instead.
 _LARGEST_CONDITION = 1e10
-# Of the way to a limit, the part that a step may go here.
+# Part of the distance to a bound that one step may take.
 _PART = 0.9
 # Rounding of the merit function, by sample: a step that is worse by less is not worse.
 _ROUNDING = 1e-13
@@ -53,7 +53,7 @@ class Lanes:
     done: Flags
 
     def keep(self, lane: int, point: PointEstimate) -> None:
-        """Take over what the careful estimator found."""
+        """Take over the result of the estimator for single data sets."""
         self.theta[lane], self.variance[lane] = point.theta, point.variance
         fixed = point.method == "be"
         self.covariance[lane] = point.covariance if fixed else point.covariance_likelihood
@@ -128,7 +128,7 @@ class BatchedFit:
         return staged_variance(sums, counts, unknowns, bias_corrected=self.bias_corrected)
 
     def _merit(self, theta: Array, sums: Array, variance: Array) -> Array:
-        """Objective with ``v`` held, up to what does not depend on theta, shape (L,)."""
+        """Objective with ``v`` held, up to terms that do not depend on theta, shape (L,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             merit = -0.5 * (sums / variance).sum(axis=1)
         if self.step.fixed_prior:

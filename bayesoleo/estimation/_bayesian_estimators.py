@@ -31,6 +31,18 @@ from bayesoleo.error_models._fitting import RANK
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import WhitenedEquations
 
+# Relative tolerance on the radius, which saves iterations of the secular equation.
+_SLACK = 0.1
+_MAX_SECULAR = 20
+# Least radius: a shorter step changes nothing.
+_SMALLEST = 1e-100
+# Ratios of actual to predicted gain below which the radius shrinks, and from which it grows.
+_POOR, _GOOD = 0.25, 0.75
+# Factors on the radius after a refused step, and after one with little gain.
+_SHRINK, _HALF = 0.25, 0.5
+# Accepted spellings of the names.
+_SHORT = {"lm": "levenberg-marquardt", "gn": "gauss-newton"}
+
 
 @dataclass(frozen=True)
 class Step[State]:
@@ -182,17 +194,6 @@ class NewtonStep(PriorStep):
         return np.zeros((0, jacobian.shape[1]))
 
 
-# Relative tolerance on the radius, which saves iterations of the secular equation.
-_SLACK = 0.1
-_MAX_SECULAR = 20
-# Least radius: a shorter step changes nothing.
-_SMALLEST = 1e-100
-# Ratios of actual to predicted gain below which the radius shrinks, and from which it grows.
-_POOR, _GOOD = 0.25, 0.75
-# Factors on the radius after a refused step, and after one with little gain.
-_SHRINK, _HALF = 0.25, 0.5
-
-
 @dataclass(frozen=True)
 class TrustRegion:
     """State of the step.
@@ -302,9 +303,6 @@ METHODS: dict[str, Step[Any]] = {
         NewtonStep(),
     )
 }
-
-# Accepted spellings of the names.
-_SHORT = {"lm": "levenberg-marquardt", "gn": "gauss-newton"}
 
 
 def method(name: str | Step[Any]) -> Step[Any]:

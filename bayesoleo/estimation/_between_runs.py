@@ -33,6 +33,8 @@ from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._per_run import check_definite, comparable
 
+_MIXED = "unit of each parameter"
+
 
 def generalised_mean(y: Array, S: Array, T: Array) -> tuple[Array, Array, Array]:
     """Mean (l,), its covariance (l, l) and the weights ``(S + T)^-1`` (N, l, l)."""
@@ -59,7 +61,7 @@ def restricted_maximum_likelihood(y: Array, S: Array) -> Array:
         slope = W.sum(axis=0) - Wr.T @ Wr - np.einsum("nij,jk,nkl->il", W, C, W)
         return 0.5 * float(value), (slope @ L)[rows, columns]
 
-    # From far too much spread and from little: none at all is a stationary point.
+    # Start from a large and from a small spread, because zero spread is a stationary point.
     starts = [factor * np.eye(n)[rows, columns] for factor in (1.0, 0.1)]
     found = [optimize.minimize(negative, x, jac=True, method="BFGS") for x in starts]
     return spread(min(found, key=lambda item: item.fun).x)[0]
@@ -85,12 +87,9 @@ def spread_interval(y: Array, variance: Array, level: float) -> tuple[tuple[floa
     return (crossing(low), crossing(high)), float(stats.chi2.sf(q(0.0), freedom))
 
 
-_MIXED = "unit of each parameter"
-
-
 @dataclass(frozen=True)
 class Hierarchy:
-    """Runs, their common mean, and how they scatter about it.
+    """Runs, their common mean, and their scatter about it.
 
     Parameters
     ----------
@@ -108,7 +107,7 @@ class Hierarchy:
     spread_interval : ndarray, shape (l, 2)
         Of each spread by itself (Q-profile): exact for normal estimates.
     p_value : ndarray, shape (l,)
-        Probability of so much scatter if the parameter were the same in all runs (Cochran's Q).
+        Probability of at least this scatter if the parameter were equal in all runs (Cochran's Q).
     shrunken, shrunken_sd : ndarray, shape (N, l)
         Each run's parameters given all runs.
     level : float
@@ -138,7 +137,7 @@ class Hierarchy:
 
     @property
     def new_run_sd(self) -> Array:
-        """Standard deviation of the parameters of a run yet to be made, shape (l,)."""
+        """Standard deviation of the parameters of a future run, shape (l,)."""
         return np.sqrt(self.spread**2 + np.diag(self.mean_covariance))
 
     def to_dataset(self) -> xr.Dataset:
@@ -193,9 +192,9 @@ def between_runs(each: xr.Dataset, *, level: float = 0.95) -> Hierarchy:
     ----------
     each : xarray.Dataset
         From :func:`~bayesoleo.estimation.estimate_each`, estimated by a method that ends in the
-        maximum-likelihood point: a prior that every run has counted already would be counted once
-        a run. Left out, and named, are runs that did not converge, parameters that no more than
-        half of the runs determine, and runs that do not determine one of the others. An estimate on
+        maximum-likelihood point: a prior would otherwise be counted once for
+        each run. Runs that did not converge, parameters that at most half of the runs determine,
+        and runs that do not determine one of the others are left out and listed. An estimate on
         a limit of its prior's support (``on_limit``) is taken as if it were free.
     level : float, optional
         Of the intervals.
@@ -270,13 +269,13 @@ def pooled(
     for run, covariance in zip(runs, S, strict=True):
         check_definite(run, covariance, names)
     diagonal = np.diagonal(S, axis1=1, axis2=2)
-    # In units of the estimates' own size of scatter and error, in which no parameter is special.
+    # In units of each parameter's own scatter and error, so that all are of order one.
     unit = np.sqrt(np.var(y, axis=0, ddof=1) + np.mean(diagonal, axis=0))
     y, S = y / unit, S / np.outer(unit, unit)
     T = restricted_maximum_likelihood(y, S)
     mean, C, W = generalised_mean(y, S, T)
     r, (N, n) = y - mean, y.shape
-    # Refined by the scatter that is left: one in expectation.
+    # Refined by the standardised scatter, whose expectation is one.
     C_refined = C * np.einsum("ni,nij,nj->", r, W, r) / (n * (N - 1))
     quantile = stats.t.ppf(0.5 + 0.5 * level, N - 1)
     half = quantile * np.sqrt(np.diag(C_refined))

@@ -40,6 +40,10 @@ from bayesoleo.solvers._orbit import added
 # Residuals below this part of the largest sample are rounding errors of a sum of hundreds of terms,
 # or of samples that were written with thirteen digits.
 _ROUNDING = 1e-13
+Progress = Callable[[Iteration], None]
+Method = str | Step[Any]
+#: MBE needs a prior that scales its steps; Levenberg-Marquardt converges without one.
+DEFAULT_METHODS: tuple[Method, ...] = ("mbe", "levenberg-marquardt")
 
 
 def summarise(
@@ -152,13 +156,6 @@ def _covariances(
     if not objective.prior:
         return likelihood, likelihood
     return units * inverse_gram(np.vstack((rows, scale.root))), likelihood
-
-
-Progress = Callable[[Iteration], None]
-Method = str | Step[Any]
-
-#: MBE needs a prior that scales its steps; Levenberg-Marquardt converges without one.
-DEFAULT_METHODS: tuple[Method, ...] = ("mbe", "levenberg-marquardt")
 
 
 def estimate(

@@ -24,6 +24,18 @@ from bayesoleo.solvers._orbit import Status
 
 # A sum in another order rounds differently; a function that broadcasts wrongly is off by far more.
 _SAME = 1e-9
+# Sixth-order central difference, and the fourth order below it. At a relative step of 1e-3 rounding
+# costs about 1e-13 of a derivative, and truncation stays below 1e-8 even where the function changes
+# e-fold within 1 % of a parameter.
+_OFFSETS = np.array([1.0, 2.0, 3.0])
+_WEIGHTS = np.array([[45.0, -9.0, 1.0], [40.0, -5.0, 0.0]]) / 60
+_RELATIVE_STEP = 1e-3
+# Where the fourth order differs from the sixth by more than this part of the largest derivative,
+# the step is longer than the function is smooth - the prior may be far wider than it - and is
+# shortened.
+_ROUGH, _FINER, _REFINEMENTS = 1e-8, 10.0, 4
+# Numbers of one batch of predictions: about what stays in a core's cache.
+_BATCH = 2**17
 
 
 class Broadcast:
@@ -90,20 +102,6 @@ class Broadcast:
         scale = np.nanmax(np.abs(apart), initial=0.0)
         close = np.allclose(together, apart, rtol=_SAME, atol=_SAME * scale, equal_nan=True)
         return bool(np.isfinite(scale) and close)
-
-
-# Sixth-order central difference, and the fourth order below it. At a relative step of 1e-3 rounding
-# costs about 1e-13 of a derivative, and truncation stays below 1e-8 even where the function changes
-# e-fold within 1 % of a parameter.
-_OFFSETS = np.array([1.0, 2.0, 3.0])
-_WEIGHTS = np.array([[45.0, -9.0, 1.0], [40.0, -5.0, 0.0]]) / 60
-_RELATIVE_STEP = 1e-3
-# Where the fourth order differs from the sixth by more than this part of the largest derivative,
-# the step is longer than the function is smooth - the prior may be far wider than it - and is
-# shortened.
-_ROUGH, _FINER, _REFINEMENTS = 1e-8, 10.0, 4
-# Numbers of one batch of predictions: about what stays in a core's cache.
-_BATCH = 2**17
 
 
 class FunctionProblem:

@@ -31,6 +31,8 @@ Scale = Literal["prior", "value"]
 _WORTH_SAYING = 0.1
 # Information below that of the prior: the data have not moved the unknown.
 _UNDETERMINED = 1.0
+#: Ratio above which the data count as silent: the posterior is within 5 % as wide as the prior.
+SILENT = 0.95
 
 
 def principal_axes(
@@ -151,10 +153,6 @@ def axes_text(data: xr.Dataset) -> str:
         rows.append([str(k + 1), shown, f"{information:.3g}", text])
     width = max(len(row[3]) for row in rows)
     return columns(head, [[*row[:3], row[3].ljust(width)] for row in rows])
-
-
-#: Ratio above which the data count as silent: the posterior is within 5 % as wide as the prior.
-SILENT = 0.95
 
 
 def data_against_prior(

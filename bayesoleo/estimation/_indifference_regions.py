@@ -42,6 +42,11 @@ _GROW = 1.6
 _ITERATIONS = 40
 # Relative to the level; contours are looked at, or compared with intervals of two digits.
 _TOLERANCE = 1e-3
+# Least curvature, as part of the prior's: ellipses stay finite without information from data.
+_LEAST_CURVATURE = 1e-4
+# How far an open region is drawn, in standard deviations of the prior.
+_OPEN_REACH = 4.0
+CONDITIONAL, PROFILED = "conditional", "profiled"
 
 
 def first_crossing(function: Callable[[Array, Integers], Array], rays: int, level: float) -> Array:
@@ -98,12 +103,6 @@ def _next(low: float, high: float, radius: float, root: float, root_low: float) 
     margin = 0.02 * (high - low)
     inside = low + margin < aim < high - margin
     return float(aim if inside else 0.5 * (low + high))
-
-
-# Least curvature, as part of the prior's: an ellipse stays finite where the data say nothing.
-_LEAST_CURVATURE = 1e-4
-# How far an open region is drawn, in standard deviations of the prior.
-_OPEN_REACH = 4.0
 
 
 @dataclass(frozen=True)
@@ -212,7 +211,7 @@ class Plane:
         return np.concatenate((upper, lower[::-1]))
 
     def _reach(self, line: ProfileLine) -> tuple[float, float, tuple[bool, bool]]:
-        """Ends of the region in the first parameter, or of what is drawn; whether it goes on."""
+        """Ends of the region, or of its drawn part, in the first parameter; whether it goes on."""
         centre, most = self.centre[0], _OPEN_REACH * self.spread[0]
         ends, is_open = [], []
         support = self.drop.problem.priors[self.pair[0]].support
@@ -266,12 +265,9 @@ class Plane:
 
 
 def _foresight(drop: LogLikelihoodRatio, matrix: Array) -> Array:
-    """Inverse curvature with the prior's, by which steps are foreseen where the data are silent."""
+    """Inverse curvature including the prior, which predicts steps without data."""
     precision = np.array([prior.sd**-2 for prior in drop.problem.priors])
     return inverse_scaled(matrix + np.diag(precision))
-
-
-CONDITIONAL, PROFILED = "conditional", "profiled"
 
 
 def indifference(

@@ -33,6 +33,10 @@ from bayesoleo.estimation._parametric_bootstrap import NoiseBlock
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.estimation._problem import EstimationProblem, measured_of
 
+Form = Literal["posterior", "propagated"]
+Distribution = Literal["t", "normal"]
+_MIXED = "unit of each parameter"
+
 
 def cramer_rao(blocks: Sequence[NoiseBlock]) -> Array:
     """Least covariance that an unbiased estimator can have, shape (l, l); NaN where singular.
@@ -169,11 +173,6 @@ def _block_inverse(covariance: Array, cross: Array, diagonal: Array) -> Array:
     gain = covariance @ cross
     upper = covariance + gain @ lower @ gain.T
     return np.block([[upper, -gain @ lower], [-lower @ gain.T, lower]])
-
-
-Form = Literal["posterior", "propagated"]
-Distribution = Literal["t", "normal"]
-_MIXED = "unit of each parameter"
 
 
 def linearised_covariance(

@@ -31,10 +31,43 @@ from bayesoleo.estimation._objectives import Objective, log_prior, newton_equati
 from bayesoleo.estimation._problem import EstimationProblem, Evaluation
 from bayesoleo.solvers._orbit import Status
 
+# A step that reverses more than this part of the last one overshoots. Equations that lack the
+# residual's second derivatives can do so in every step, each lowering the merit a little.
+_OVERSHOOT = 0.3
+# Below one standard deviation the equations are nearly linear, so that a smaller part suffices;
+# steps that reverse less than this gain a digit in each iteration anyway.
+_OVERSHOOT_NEAR = 0.1
+# After this number of successive steps along one line, each longer than this part of the one
+# before, steps are lengthened, up to this factor: the same equations can also undershoot.
+_STEADY = 4
+_LONGEST = 10.0
+# Cosine from which two steps count as one line; otherwise the overshoot is unknown.
+_ON_ONE_LINE = 0.9
+# 2**-30 of a step is negligible.
+_MAX_HALVINGS = 30
+# Rounding of the merit function for each sample: smaller increases are ignored.
+_ROUNDING = 1e-13
+# Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
+# this means nothing in statistics (0.0014 sd), but may lie below the noise of a solver's tolerance.
+_NEGLIGIBLE_GAIN = 1e-6
+_MANY_HALVINGS = 4
+# Distance to the fixed point, in standard deviations, up to which a small step means convergence.
+_NEAR = 0.1
+# This number of successive idle iterations - slow, and with no gain left - means convergence.
+_IDLE = 3
+# Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
+# asks for certified digits gets them, if slowly.
+_IDLE_STEPS = 1e3
+# A logarithm of which the data leave more than this part of the prior's sd may have no optimum: the
+# likelihood levels off on the way to zero or infinity, and an estimator that follows it never ends.
+# What then lies nearer to the level than _NEAR is on it.
+_FLAT = 0.9
+_LEVEL = 0.5 * _NEAR**2
+
 
 @dataclass(frozen=True)
 class Iteration:
-    """Where one iteration ended.
+    """State at the end of one iteration.
 
     Parameters
     ----------
@@ -58,7 +91,7 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How the loop ended: the last point, its evaluation and the way there.
+    """Outcome of the loop: the last point, its evaluation and the history.
 
     Parameters
     ----------
@@ -71,7 +104,7 @@ class Outcome:
     distance : float
         To the method's fixed point by the last linearisation, in standard deviations.
     failures : mapping of str to int
-        Evaluations that came to nothing, by the lower-case name of their status.
+        Failed evaluations, by the lower-case name of their status.
     """
 
     theta: Float[Array, " unknowns"]
@@ -83,43 +116,30 @@ class Outcome:
     failures: Mapping[str, int] = field(default_factory=dict)
 
 
-# A step that turns back by more than this part of the last one overshoots: linear equations that
-# lack the residual's second derivatives can do so for ever, each step lowering the merit a little.
-_OVERSHOOT = 0.3
-# Among steps below a standard deviation equations are close to linear, so that less tells as much;
-# what turns back by less than this gains a digit an iteration as it is.
-_OVERSHOOT_NEAR = 0.1
-# After so many steps in a row along one line, each longer than that part of the one before, steps
-# are lengthened, at most so far: the same equations can also fall short for ever.
-_STEADY = 4
-_LONGEST = 10.0
-# Cosine from which two steps lie on one line; off it nothing is known of the overshoot.
-_ON_ONE_LINE = 0.9
-
-
 @dataclass(frozen=True)
 class Pace:
-    """How a step compares with the one before it, by which it is shortened or lengthened.
+    """Comparison of a step with the one before, by which it is shortened or lengthened.
 
     Near the fixed point the error along one line shrinks from ``e`` to ``(1 - s k) e``, where ``s``
-    is the part of the proposed step that was taken and ``k`` how far a whole one goes. Two
-    proposals on that line tell ``k``, and the part ``1/k`` goes all the way (Aitken's process,
-    1926): at once where steps turn back, with care where they creep.
+    is the part of the proposed step that was taken and ``k`` the part of the error that a whole one
+    removes. Two proposals on that line determine ``k``, and the part ``1/k`` removes all of it
+    (Aitken's process, 1926). It is used at once where steps reverse, and with limits where they
+    undershoot.
 
     Parameters
     ----------
     taken : ndarray, shape (l,)
         The last step, in scaled unknowns.
     part : float
-        Of the proposal that was taken.
+        Part of the proposal that was taken.
     idle : int
         Iterations in a row that were slow and gained nothing.
     slow : bool
         The present proposal is not much shorter than the last step.
     steady : int
-        Steps in a row that crept along one line.
+        Successive steps that undershot along one line.
     wanted : float
-        Part of the present proposal to take; one where nothing says otherwise.
+        Part of the present proposal to take, by default one.
     """
 
     taken: Array | None = None
@@ -152,30 +172,8 @@ class Pace:
         return replace(self, slow=ratio > _OVERSHOOT, steady=steady, wanted=wanted)
 
     def after(self, taken: Array, part: float, idle: bool) -> Pace:
-        """Pace after a step that was a part of its proposal and gained nothing, or something."""
+        """Pace after a step of this part of its proposal, which gained or did not."""
         return Pace(taken, part, self.idle + 1 if idle and self.slow else 0, steady=self.steady)
-
-
-# 2**-30 of a step moves nothing that another thirty iterations could use.
-_MAX_HALVINGS = 30
-# Rounding of the merit function, by sample: a step that is worse by less is not worse.
-_ROUNDING = 1e-13
-# Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
-# this means nothing in statistics (0.0014 sd), but may lie below the noise of a solver's tolerance.
-_NEGLIGIBLE_GAIN = 1e-6
-_MANY_HALVINGS = 4
-# Distance to the fixed point, in standard deviations, up to which a small step means convergence.
-_NEAR = 0.1
-# So many idle iterations in a row - slow, and with nothing left to gain - mean convergence.
-_IDLE = 3
-# Nothing is left where the optimum is nearer than so many tolerances, in standard deviations: who
-# asks for certified digits gets them, if slowly.
-_IDLE_STEPS = 1e3
-# A logarithm of which the data leave more than this part of the prior's sd may have no optimum: the
-# likelihood levels off on the way to zero or infinity, and an estimator that follows it never ends.
-# What then lies nearer to the level than _NEAR is on it.
-_FLAT = 0.9
-_LEVEL = 0.5 * _NEAR**2
 
 
 def iterate(
@@ -200,7 +198,7 @@ def iterate(
     start : ndarray, shape (l,)
         Inside the priors' support.
     objective : Objective
-        What is maximised.
+        Objective to maximise.
     tolerance : float
         Converged when every unknown's step is below this part of its value, or of its linearised
         standard deviation where that is larger.
@@ -333,11 +331,11 @@ class _Loop:
         return Status.NO_CONVERGENCE
 
     def part_of(self, proposal: Array, pace: Pace, equations: WhitenedEquations) -> float:
-        """How much of a proposal to take: more than all of it only well inside the support."""
+        """Part of a proposal to take; above one only well inside the support."""
         if pace.wanted <= 1:
             return pace.wanted
         if self.step.locks or is_cut(pace.wanted * proposal, equations.room):
-            return 1.0  # steps of an estimator that locks up creep by design
+            return 1.0  # an estimator that locks up takes ever shorter steps by design
         return pace.wanted
 
     def shorten(
@@ -356,7 +354,7 @@ class _Loop:
             if trial.status.ok and self.merit(trial, variance) >= merit:
                 return trial, halvings, proposal
             if np.linalg.norm(equations.jacobian @ proposal) < resolution:
-                break  # where a law has a jump no step helps, however short
+                break  # at a jump of the model no step helps, however short
             softer = self.step.refuse(self.state, proposal)
             if softer is None:
                 proposal = proposal / 2
@@ -367,7 +365,7 @@ class _Loop:
 
     @property
     def pulls(self) -> bool:
-        """Whether the prior stays where it was declared and counts in the objective."""
+        """Whether the prior keeps its declared centre and counts in the objective."""
         return self.step.fixed_prior and self.objective.prior
 
     def variance(self) -> Array:
@@ -417,7 +415,7 @@ class _Loop:
             return False
         if not self.step.locks and equations.distance() <= resolution:
             return True
-        if self.step.limits_length:  # a short step then means caution as often as arrival
+        if self.step.limits_length:  # a short step is then no sign of convergence
             own = equations.solve(equations.root)
             proposal = np.where(np.abs(own) > np.abs(proposal), own, proposal)
         unit = self.scale.unit(self.point.theta)
@@ -425,11 +423,11 @@ class _Loop:
         return bool(np.all(np.abs(unit * proposal) <= tolerance * least))
 
     def is_idle(self, won: float, equations: WhitenedEquations, tolerance: float) -> bool:
-        """Whether an iteration won nothing, and nothing is left to win by the linearisation."""
+        """Whether an iteration gained nothing, and the linearisation predicts no further gain."""
         nothing = min(_NEGLIGIBLE_GAIN, 0.5 * (_IDLE_STEPS * tolerance) ** 2)
         rows = equations.root
         if not self.step.fixed_prior:
-            # A prior that only scales the steps must not hide how far the optimum is, if any.
+            # A prior that only scales the steps must not hide the distance to the optimum.
             flat = self.scale.logarithmic & (equations.sd() > _FLAT)
             rows = rows[flat]
             nothing = _LEVEL if flat.any() else nothing

@@ -33,6 +33,18 @@ from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.model._correlated_priors import Correlated, log_density_of, scaled_root
 from bayesoleo.model._priors import LogNormal, Normal, Prior
 
+# A centred difference over this fraction of the prior's sd is exact for a quadratic log density and
+# good to about 1e-8 for the others.
+_SLOPE_STEP = 1e-4
+# Room for one step of a logarithm, of which at most the part 0.9 is taken: a factor of six. Where
+# an unknown sets a scale, as in atan(slope * velocity), the sensitivity to its logarithm changes by
+# about the factor of the unknown itself, so further away the linear equations know nothing.
+_FARTHEST = 2.0
+# A step goes at most this part of the way to a limit, so that a limit is approached, not hit.
+_PART = 0.9
+# Nearer than this, in prior standard deviations, an unknown counts as lying on the limit.
+_ON_LIMIT = 1e-8
+
 
 @dataclass(frozen=True)
 class BatchNormalEquations:
@@ -81,15 +93,6 @@ def reduce_rows(residual: Array, sensitivity: Array) -> tuple[Array, Array, Arra
     turned = np.swapaxes(sensitivity, 1, 2)
     slope = (turned @ residual[..., None])[..., 0]
     return turned @ sensitivity, slope, np.einsum("ln,ln->l", residual, residual)
-
-
-# A centred difference over this fraction of the prior's sd is exact for a quadratic log density and
-# good to about 1e-8 for the others.
-_SLOPE_STEP = 1e-4
-# Room for one step of a logarithm, of which at most the part 0.9 is taken: a factor of six. Where
-# an unknown sets a scale, as in atan(slope * velocity), the sensitivity to its logarithm changes by
-# about the factor of the unknown itself, so further away the linear equations know nothing.
-_FARTHEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -198,12 +201,6 @@ class PriorScale:
         with np.errstate(divide="ignore", invalid="ignore"):
             rise = prior.log_density(value + step) - prior.log_density(value - step)
             return np.where(step > 0, rise * sd / (2 * step), 0.0)
-
-
-# A step goes at most this part of the way to a limit, so that a limit is approached, not hit.
-_PART = 0.9
-# Nearer than this, in prior standard deviations, an unknown counts as lying on the limit.
-_ON_LIMIT = 1e-8
 
 
 def bounded_step(

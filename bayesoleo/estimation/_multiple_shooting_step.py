@@ -23,6 +23,10 @@ from bayesoleo.prediction._predictor import Layout
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._segments import LinearRun, SegmentedNormalEquations, SegmentedRun
 
+#: What the prior does: it is centred anew on every iterate and thus only limits the steps; it stays
+#: where it is and pulls; nothing.
+PRIORS = ("mbe", "be", "gauss-newton")
+
 
 @dataclass(frozen=True, eq=False)
 class ShootingProblem:
@@ -144,11 +148,6 @@ class ShootingProblem:
             for name, sd in zip(run.outputs, run.noise(), strict=True):
                 found[name].append(sd**2)
         return np.array([np.mean(found[name]) for name in self.outputs])
-
-
-#: What the prior does: it is centred anew on every iterate and thus only limits the steps; it stays
-#: where it is and pulls; nothing.
-PRIORS = ("mbe", "be", "gauss-newton")
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,11 +39,18 @@ from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Condition, Parameter
 from bayesoleo.prediction._records import Record
 
+#: The words that choose them.
+KINDS = ("conditions", "offset", "gain")
+#: An accuracy is two standard deviations.
+ACCURACY = 2.0
+# Offsets and gains have no shape parameters, for which alone an effect asks sizes of the motion.
+_NO_SCALES = Scales({}, {}, {}, 1.0, 1.0)
+
 
 def without_measured(
     problem: EstimationProblem, theta: Array, measured: Flags
 ) -> EstimationProblem:
-    """The same problem in the other unknowns.
+    """Copy of a problem without its nuisance parameters.
 
     Parameters
     ----------
@@ -140,24 +147,16 @@ def _shift(
         return None
     unit = np.array([problem.priors[k].sd for k in range(len(theta))])
     rows = LinearisedResidual.of(evaluation, unit).whitened(variance)[0]
-    # As in the covariance, the prior bounds what the data leave open.
+    # As in the covariance, the prior bounds undetermined directions.
     prior = scaled_root([problem.priors[k] for k in own], unit[own])
     weighted = np.vstack((rows[:, own], prior))
     target = np.vstack((rows[:, held], np.zeros((len(own), len(held)))))
     return cast(Array, -unit[own, None] * least_squares(weighted, target) / unit[held])
 
 
-#: The words that choose them.
-KINDS = ("conditions", "offset", "gain")
-#: An accuracy is two standard deviations.
-ACCURACY = 2.0
-# Offsets and gains have no shape parameters, for which alone an effect asks sizes of the motion.
-_NO_SCALES = Scales({}, {}, {}, 1.0, 1.0)
-
-
 @dataclass(frozen=True)
 class Nuisance:
-    """What is uncertain beside the parameters, with its standard deviations.
+    """Uncertain quantities beside the parameters, with their standard deviations.
 
     Parameters
     ----------
@@ -177,7 +176,7 @@ class Nuisance:
         return bool(self.conditions or self.offset or self.gain)
 
     def extend(self, model: Model) -> Model:
-        """The model with nuisance parameters, at their null: it predicts what the old one does.
+        """Model with nuisance parameters, whose null values leave its predictions unchanged.
 
         Parameters
         ----------
@@ -329,7 +328,7 @@ def _uncertain_condition(model: Model, name: str) -> Model:
     declared = model.conditions[name]
     extended = replace(
         model,
-        # Zero where a run does not say: whoever simulates with the model then has no error.
+        # Zero where a run does not give one, so that simulations have no error.
         conditions={**model.conditions, sd: Condition(declared.unit, 0.0, f"sd of {name}")},
         parameters={
             **model.parameters,

@@ -47,6 +47,14 @@ OBJECTIVES = {
 _KNOWN = ("given", "weighted")
 # Error models of the others, where they are not independent.
 _ERRORS = {"full": "full", "determinant": "full", "unweighted": "common"}
+# A step of this part of a conditional standard deviation: the third derivative costs its square,
+# and a solver's tolerance of 1e-10 is divided by it once.
+_STEP = 0.02
+_PRIOR_STEP = 1e-3
+# Of the prior's standard deviation, for its own curvature.
+_NEWTON_PRIOR_STEP = 1e-4
+# Smallest eigenvalue that is kept, as a part of the largest, after scaling to a unit diagonal.
+_FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -148,12 +156,6 @@ def log_posterior(
     float
     """
     return log_likelihood(sums, variance, counts) + log_prior(priors, theta)
-
-
-# A step of this part of a conditional standard deviation: the third derivative costs its square,
-# and a solver's tolerance of 1e-10 is divided by it once.
-_STEP = 0.02
-_PRIOR_STEP = 1e-3
 
 
 def curvature(
@@ -299,12 +301,6 @@ def _precision(prior: Prior, value: float) -> float:
     if not np.isfinite(ends).all():  # next to a limit nothing is known of the other side
         return 0.0
     return float(max(-(ends[0] - 2 * ends[1] + ends[2]) / step**2, 0.0))
-
-
-# Of the prior's standard deviation, for its own curvature.
-_NEWTON_PRIOR_STEP = 1e-4
-# Smallest eigenvalue that is kept, as a part of the largest, after scaling to a unit diagonal.
-_FLOOR = 1e-12
 
 
 def newton_equations(

@@ -26,6 +26,11 @@ from bayesoleo.estimation._problem import EstimationProblem
 
 Residuals = tuple[Array, ...]
 _MIXED = "unit of each parameter"
+#: A run does not determine a parameter if its data alone leave a standard deviation a thousand
+#: times that of the prior: its weight in a mean over runs would be a millionth.
+UNDETERMINED = 1e-6
+#: Smallest eigenvalue of a matrix of correlations, a parameter, that rounding can be told from.
+SINGULAR = 10 * float(np.finfo(float).eps)
 
 
 def estimate_each(
@@ -149,7 +154,7 @@ def by_run_dataset(
 
 
 def _alike(points: Mapping[str, PointEstimate]) -> PointEstimate:
-    """The first of the estimates, all of which must be of the same unknowns."""
+    """First of the estimates, all of which must have the same unknowns."""
     if not points:
         raise InputError("no run to estimate from", hint="give one problem a run")
     first = next(iter(points.values()))
@@ -189,16 +194,9 @@ def _residual_variables(residuals: Sequence[Residuals]) -> dict[str, tuple[Any, 
     }
 
 
-#: A run says nothing of a parameter where its data alone leave the standard deviation a thousand
-#: times larger than the prior does: in a mean over runs its weight would be a millionth.
-UNDETERMINED = 1e-6
-#: Smallest eigenvalue of a matrix of correlations, a parameter, that rounding can be told from.
-SINGULAR = 10 * float(np.finfo(float).eps)
-
-
 @dataclass(frozen=True)
 class Comparable:
-    """What of some per-run estimates can be compared.
+    """Parameters and runs of per-run estimates that can be compared.
 
     Parameters
     ----------
@@ -226,7 +224,7 @@ def comparable(each: xr.Dataset) -> Comparable:
     runs = each[schema.RUN].values.astype(str)
     covariances = each["covariance_likelihood"].values
     determined = _determined(each)
-    # A run whose covariance is lost as a whole tells no parameter from another.
+    # A run without a finite covariance determines no parameter separately.
     regular = good & np.isfinite(np.diagonal(covariances, axis1=1, axis2=2)).any(axis=1)
     kept = 2 * determined[regular].sum(axis=0) > regular.sum()
     usable = regular & determined[:, kept].all(axis=1)
@@ -237,7 +235,7 @@ def comparable(each: xr.Dataset) -> Comparable:
 
 
 def _determined(each: xr.Dataset) -> Flags:
-    """Which parameters a run's data determine beside the prior, shape (N, l)."""
+    """Whether each run's data determine each parameter, shape (N, l)."""
     alone, with_prior = (
         np.diagonal(each[name].values, axis1=1, axis2=2)
         for name in ("covariance_likelihood", schema.COVARIANCE)
@@ -249,7 +247,7 @@ def _determined(each: xr.Dataset) -> Flags:
 
 
 def check_definite(run: str, covariance: Array, names: Sequence[str]) -> None:
-    """Raise where a covariance is singular, with the parameters that are to blame."""
+    """Raise where a covariance is singular, naming the parameters responsible."""
     if _is_definite(covariance):
         return
     variance = np.diag(covariance)
@@ -281,7 +279,7 @@ def _left_out(
     usable: Flags,
     held: Sequence[str],
 ) -> tuple[str, ...]:
-    """What is not compared, and why, a clause each."""
+    """Parameters and runs that are not compared, with the reason for each."""
     said = []
     for k in np.flatnonzero(~kept) if regular.any() else ():
         if names[k] in held:

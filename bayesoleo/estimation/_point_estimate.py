@@ -28,6 +28,7 @@ FROM_PRIOR = ": what is known beyond is the prior's"
 KNOWN = "held at the declared value, known to a tolerance that the covariance carries: {}"
 NO_SD = ": there is no standard deviation"
 _MOST_NAMES = 8
+_MIXED = "unit of each parameter"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,9 +176,6 @@ def _listed(names: tuple[str, ...]) -> str:
     """Names in a sentence; only the first ones of many."""
     rest = len(names) - _MOST_NAMES
     return ", ".join(names[:_MOST_NAMES]) + (f" and {rest} more" if rest > 0 else "")
-
-
-_MIXED = "unit of each parameter"
 
 
 def to_dataset(

@@ -31,6 +31,14 @@ from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.estimation._problem import EstimationProblem, Held, measured_of
 
 Kind = Literal["likelihood", "posterior"]
+# A profile that has not reached the limit after this many linearised standard deviations is open.
+_FARTHEST = 50.0
+# Steps of the signed root of the fall; and how far beyond the limit the profile is followed.
+_PART, _BEYOND = 0.34, 1.15
+_MOST_POINTS = 40
+# Part of the way to a limit of the support: a density may be zero on it.
+_TO_THE_END = 0.999
+Stop = tuple[float, float, Array]
 
 
 class LogLikelihoodRatio:
@@ -118,9 +126,9 @@ class LogLikelihoodRatio:
         section = Held(self.problem, theta, held)
         method = "be" if self.kind == "posterior" else "mbe"
         found = estimate(section, method, tolerance=1e-5)
-        if not found.status.ok:  # the start was foreseen badly; the estimate itself is another
+        if not found.status.ok:  # the predicted start was poor; try the estimate itself
             again = estimate(section, method, tolerance=1e-5, start=self.point.theta[section.free])
-            # A loop that stopped short is still a point of the section: it bounds the least fall.
+            # An unconverged point still lies in the section and bounds the least fall.
             objectives = np.nan_to_num([found.objective, again.objective], nan=-np.inf)
             found = again if objectives[1] > objectives[0] or again.status.ok else found
         whole = section.full(found.theta)
@@ -129,7 +137,7 @@ class LogLikelihoodRatio:
         return float(self._fresh(whole)), whole
 
     def _fresh(self, theta: Array) -> float:
-        """Fall at one vector, solved from where the solver stands."""
+        """Fall at one vector, solved from the solver's present state."""
         evaluation = self.problem.evaluate(theta)
         if not evaluation.status.ok:
             return np.inf
@@ -138,15 +146,6 @@ class LogLikelihoodRatio:
         if self.kind == "posterior":
             height += log_prior(self.problem.priors, theta)
         return self.top - height
-
-
-# A profile that has not fallen enough after so many linearised standard deviations is open.
-_FARTHEST = 50.0
-# Steps of the signed root of the fall; and how far beyond the limit the profile is followed.
-_PART, _BEYOND = 0.34, 1.15
-_MOST_POINTS = 40
-# Part of the way to a limit of the support: a density may be zero on it.
-_TO_THE_END = 0.999
 
 
 def profile(
@@ -263,13 +262,10 @@ class ProfileLine:
         )
 
 
-Stop = tuple[float, float, Array]
-
-
 def _side(
     drop: LogLikelihoodRatio, index: int, sign: float, limit: float, covariance: Array
 ) -> list[Stop]:
-    """Follow a profile to one side, in equal steps of the root of its fall as far as foreseen."""
+    """Follow a profile to one side, in about equal steps of the root of its fall."""
     theta = drop.point.theta.copy()
     variance = covariance[index, index]
     sd = float(np.sqrt(variance)) if variance > 0 else float(drop.problem.priors[index].sd)
@@ -306,7 +302,7 @@ def _side(
 def _refined(
     drop: LogLikelihoodRatio, index: int, here: Stop, stops: list[Stop], limit: float
 ) -> list[Stop]:
-    """The same side with one more stop, where the limit is foreseen by interpolation."""
+    """Add one stop to a side, at the limit interpolated from the others."""
     place = _crossing([here, *stops], limit, np.nan)
     if np.isnan(place):
         return stops

@@ -28,6 +28,10 @@ from bayesoleo.model._priors import LogNormal, Normal, Prior, TruncatedNormal, U
 Feature = Callable[[Mapping[str, Array]], float]
 #: Vectors predicted together; more would fill the memory with samples.
 _BLOCK = 64
+Per = Literal["prior", "percent"]
+# Central differences over this part of the step that is reported.
+_STEP = 0.02
+_DRAWS = 2**17
 
 
 @dataclass(frozen=True)
@@ -103,12 +107,6 @@ def _mean_of(name: str) -> Feature:
 
 def _rms_of(name: str) -> Feature:
     return lambda outputs: float(np.std(outputs[name]))
-
-
-Per = Literal["prior", "percent"]
-# Central differences over this part of the step that is reported.
-_STEP = 0.02
-_DRAWS = 2**17
 
 
 def local_sensitivity(
@@ -276,7 +274,7 @@ def sobol(
     f_mixed = np.array([function(block) for block in mixed])
     good = np.isfinite(f_first) & np.isfinite(f_second) & np.isfinite(f_mixed).all(axis=0)
     rows = np.flatnonzero(good.all(axis=1))
-    # The routine wants a power of two, whatever was left out.
+    # The routine needs a power of two, also after failures were left out.
     kept = 1 << (int(rows.size).bit_length() - 1) if rows.size else 0
     if kept < max(8, samples // 4):
         raise InputError(

@@ -8,6 +8,8 @@ from typing import cast
 import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
 
+_CALLS = {name: name for name in ("exp", "log", "sin", "cos", "tan", "tanh")} | {"atan": "arctan"}
+
 
 class _Printer(PythonCodePrinter):  # type: ignore[misc] # SymPy has no types
     """Prints NumPy functions, which Numba compiles for scalars, and small powers as products."""
@@ -123,7 +125,6 @@ class _Statements(_Printer):
         return "*".join(self._print(item) for item in expr.args)
 
 
-_CALLS = {name: name for name in ("exp", "log", "sin", "cos", "tan", "tanh")} | {"atan": "arctan"}
 for _name, _target in _CALLS.items():
 
     def _print_function(self: _Printer, expr: sp.Expr, target: str = _target) -> str:

@@ -22,6 +22,8 @@ from bayesoleo.model._expressions import TIME, derivative_symbol, partial, split
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Condition
 
+_SWITCHES = (sp.Abs, sp.sign, sp.Heaviside, sp.Min, sp.Max)
+
 
 @dataclass(frozen=True)
 class Derived:
@@ -127,9 +129,6 @@ def derive(model: Model, active: Sequence[str] | None = None) -> Derived:
         output=output,
         admissible=admissible,
     )
-
-
-_SWITCHES = (sp.Abs, sp.sign, sp.Heaviside, sp.Min, sp.Max)
 
 
 @dataclass(frozen=True)

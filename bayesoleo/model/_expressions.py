@@ -18,6 +18,16 @@ from sympy.printing.str import StrPrinter
 
 from bayesoleo.errors import ModelError
 
+#: Seconds since the first sample; for outputs and for transients, a periodic state cannot depend
+#: on it.
+TIME = sp.Symbol("time", real=True)
+_DERIVATIVE = re.compile(r"^(d+)ot\((.+)\)$")
+#: Between the names of two channels: the first one's measured signal at the second one's harmonics.
+WITHIN = "_within_"
+#: First parts of the names of inputs that turn with a channel: the cosine and the sine of the phase
+#: of its first harmonic. Polynomials in both are the harmonics of the drive.
+COSINE, SINE = "drive_cosine", "drive_sine"
+
 
 class bspline(sp.Function):  # type: ignore[misc] # noqa: N801 - its name in expressions
     r"""The cardinal cubic B-spline: a bump on -2 to 2, twice continuously differentiable.
@@ -93,21 +103,11 @@ FUNCTIONS: dict[str, object] = {
     "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
 }
 
-#: Seconds since the first sample; for outputs and for transients, a periodic state cannot depend
-#: on it.
-TIME = sp.Symbol("time", real=True)
-
-_DERIVATIVE = re.compile(r"^(d+)ot\((.+)\)$")
-
 
 @cache
 def symbol(name: str) -> sp.Symbol:
     """The symbol of a declared name; every quantity is real."""
     return sp.Symbol(name, real=True)
-
-
-#: Between the names of two channels: the first one's measured signal at the second one's harmonics.
-WITHIN = "_within_"
 
 
 def within(channel: str, other: str) -> str:
@@ -117,11 +117,6 @@ def within(channel: str, other: str) -> str:
     cut off alike in both.
     """
     return f"{channel}{WITHIN}{other}"
-
-
-#: First parts of the names of inputs that turn with a channel: the cosine and the sine of the phase
-#: of its first harmonic. Polynomials in both are the harmonics of the drive.
-COSINE, SINE = "drive_cosine", "drive_sine"
 
 
 def derivative_symbol(name: str, order: int) -> sp.Symbol:

@@ -29,6 +29,8 @@ REASONS = tuple(status.name.lower() for status in Status if not status.ok)
 Phase = Literal["start", "warm-up", "kept"]
 #: ``numpy.random.RandomState.get_state()``
 RandomState = tuple[str, NDArray[np.uint32], int, int, float]
+_COUNTERS = ("failures", "proposed", "accepted")
+_FOREIGN = "this folder holds draws of another problem, seed or setting"
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,6 @@ class Segment:
     def draws(self) -> int:
         """Number of draws of each walker."""
         return len(self.coords)
-
-
-_COUNTERS = ("failures", "proposed", "accepted")
-_FOREIGN = "this folder holds draws of another problem, seed or setting"
 
 
 class Store:

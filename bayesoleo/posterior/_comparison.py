@@ -33,12 +33,19 @@ from bayesoleo._types import Array, Integers
 from bayesoleo.errors import ResultsError
 from bayesoleo.posterior._diagnostics import Samples
 
-#: With what the posterior is compared.
+#: References with which the posterior is compared.
 LINEARISED, MONTE_CARLO, REGION = "linearised", "monte carlo", "indifference"
+#: A larger sensitivity deserves attention (Kallioinen et al. 2024, section 2.4).
+THRESHOLD = 0.05
+_WEAK = "strong prior or weak data"
+#: Draws that a truth is ranked among: ranks 0 to 99.
+DRAWS = 99
+# Simulated sets of ranks from which the band's level is found.
+_SETS = 4000
 
 
 def compare(groups: Mapping[str, xr.Dataset] | xr.DataTree) -> xr.Dataset:
-    """Hold the posterior against the estimate and whatever says how uncertain it is.
+    """Compare the posterior with the estimate and its measures of uncertainty.
 
     Parameters
     ----------
@@ -187,13 +194,9 @@ def _extremes(covariance: Array, reference: Array) -> tuple[float, float]:
         return np.nan, np.nan
     try:
         values = linalg.eigh(covariance, reference, eigvals_only=True)
-    except linalg.LinAlgError:  # a reference that is not positive definite says nothing
+    except linalg.LinAlgError:  # a reference that is not positive definite is useless
         return np.nan, np.nan
     return float(values[0]), float(values[-1])
-
-
-#: Above this a sensitivity is worth a look (Kallioinen et al. 2024, section 2.4).
-THRESHOLD = 0.05
 
 
 def prior_sensitivity(tree: xr.DataTree) -> xr.Dataset:
@@ -248,15 +251,6 @@ def prior_sensitivity(tree: xr.DataTree) -> xr.Dataset:
         {**data, "diagnosis": (schema.QUANTITY, np.where(leans, words, ""))},
         coords={schema.QUANTITY: names},
     )
-
-
-_WEAK = "strong prior or weak data"
-
-
-#: Draws that a truth is ranked among: ranks 0 to 99.
-DRAWS = 99
-# Simulated sets of ranks from which the band's level is found.
-_SETS = 4000
 
 
 def rank_of(samples: Samples, truth: ArrayLike, rng: np.random.Generator) -> Integers:

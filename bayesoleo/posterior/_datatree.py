@@ -47,11 +47,13 @@ STRETCHES = 8
 #: Part of a cycle by which sampled phases differ from block to block: no two blocks of a run then
 #: show the same phase (Weyl's sequence).
 _GOLDEN = 0.5 * (5**0.5 - 1)
+#: Chains and draws of the prior's group.
+PRIOR_CHAINS, PRIOR_DRAWS = 4, 500
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """How the samples of one run are cut.
+    """Division of the samples of one run into blocks.
 
     Parameters
     ----------
@@ -190,7 +192,7 @@ def _constant(
     inputs: Callable[[int, Integers], Mapping[str, Array]] | None,
     units: Mapping[str, str],
 ) -> xr.Dataset:
-    """What was known at the samples that are shown: when they were taken, and the inputs."""
+    """Times and inputs at the samples that are shown."""
     pairs = list(zip(samples, blocks, strict=True))
     columns: dict[str, list[Array]] = {
         schema.TIME: [run.time[part.shown] - run.time[0] for run, part in pairs],
@@ -256,11 +258,11 @@ def choose_draws(
     samples : Samples
         Draws of the posterior.
     size : int
-        How many; all of them if there are fewer.
+        Number of draws; all of them if there are fewer.
     seed : int
         Seeds the choice.
     run : str, optional
-        Whose variances to take where the errors have one of each run's own.
+        Run whose variances are taken where the error model has them by run.
 
     Returns
     -------
@@ -275,7 +277,7 @@ def choose_draws(
 
 
 def choose_all(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]:
-    """The draws of :func:`choose_draws`, with all that the error model says of them.
+    """Draws as in :func:`choose_draws`, with the quantities of the error model.
 
     Parameters
     ----------
@@ -324,10 +326,6 @@ def sd_of_averages(errors: Array, phase: Array, bins: int) -> Array:
     _, first, count = np.unique(index[order], return_index=True, return_counts=True)
     means = np.add.reduceat(errors[:, :, order], first, axis=2) / count
     return np.asarray(np.sqrt(np.mean(means**2, axis=2)))
-
-
-#: Chains and draws of the prior's group.
-PRIOR_CHAINS, PRIOR_DRAWS = 4, 500
 
 
 def to_datasets(

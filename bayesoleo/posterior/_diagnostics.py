@@ -54,8 +54,8 @@ def autocorrelation_time(draws: Array) -> Array:
 def _window(sums: Array) -> int:
     """First lag that is five times as long as the sum up to it.
 
-    ``emcee.autocorr.auto_window`` answers zero where there is none, and so calls a walker that
-    never leaves its mode independent; here it is half the chain, and the time as long as that.
+    ``emcee.autocorr.auto_window`` returns zero where there is none, and so treats a walker that
+    never leaves its mode as independent. Here it is half the chain, and so is the time.
     """
     long_enough = np.flatnonzero(np.arange(len(sums)) >= 5 * sums)
     return int(long_enough[0]) if long_enough.size else len(sums) // 2
@@ -90,7 +90,7 @@ def effective_size(draws: Array) -> Array:
             float(az.ess(draws[:, :, a], chain_axis=0, draw_axis=1, method=method, prob=prob))
             for method, prob in (("bulk", None), ("tail", (0.05, 0.95)))
         ]
-        # Anticorrelated draws are not credited: the estimate of a time below one is mostly noise.
+        # Times below one are not used: estimates of anticorrelation are mostly noise.
         out[a] = np.nan_to_num(min(*ranked, size / max(times[a], 1.0)), nan=0.0)
     return out
 
@@ -127,7 +127,7 @@ def nested_rhat(draws: Array, ensemble: Integers) -> Array:
 
 
 def rhat_limit(ensembles: int, size: float) -> float:
-    """Largest nested R-hat that ensembles in agreement reach with so many effective draws.
+    """Largest nested R-hat of agreeing ensembles with this number of effective draws.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def compare_with_point(theta: Array, point: Array, sd: Array) -> Comparison:
 
 @dataclass(frozen=True)
 class Samples:
-    """Draws of the posterior and how good they are.
+    """Draws of the posterior with their diagnostics.
 
     Parameters
     ----------
@@ -224,9 +224,9 @@ class Samples:
     failures : dict of str to int
         Rows of density zero by reason.
     reached : bool
-        Whether the effective size asked for was reached and the ensembles agree.
+        Whether the requested effective size was reached and the ensembles agree.
     warning : str
-        What was not reached; empty otherwise.
+        Criteria that were not met; empty otherwise.
     failed : ndarray of int, shape (draws, reasons)
         Proposals of density zero on the way to each kept draw, by
         :data:`bayesoleo.posterior._checkpoints.REASONS`.

@@ -33,10 +33,13 @@ from bayesoleo.posterior._mixture import Mixture
 if TYPE_CHECKING:
     from distributed import Client
 
+#: Largest number of redraws of walkers whose log density is not finite.
+REDRAWS = 50
+
 
 @dataclass(frozen=True)
 class _Rows:
-    """What a worker does: some rows, and what became of them."""
+    """Rows evaluated by a worker, with their results and counters."""
 
     log_density: Density
 
@@ -49,7 +52,7 @@ class _Rows:
 
 
 class DistributedDensity:
-    """Sends rows to workers and puts together what they return.
+    """Log density that sends rows to workers and collects the results.
 
     Parameters
     ----------
@@ -94,10 +97,6 @@ class DistributedDensity:
         )
 
 
-#: Redraws of walkers whose log density is not finite before the start is given up.
-REDRAWS = 50
-
-
 @dataclass(frozen=True)
 class MoveWeights:
     """How often each kind of move is chosen.
@@ -116,9 +115,9 @@ class MoveWeights:
     def tuned(cls, acceptance: float) -> MoveWeights:
         """Weights for an acceptance of the independence move.
 
-        An accepted independence move is worth a hundred of the others. Where some are refused they
-        are not refused alike everywhere: a walker in a tail that the mixture misses, the tip of a
-        bent ridge, refuses nearly all, and only the others bring it back.
+        An accepted independence move is worth a hundred of the others. Rejections are not uniform:
+        a walker in a tail that the mixture misses, such as the tip of a bent ridge, rejects nearly
+        all of them, and only the other moves bring it back.
         """
         share = float(np.clip(2 * acceptance - 0.9, 0.3, 0.9))
         return cls(share, 0.75 * (1 - share), 0.25 * (1 - share))
@@ -131,7 +130,7 @@ def default_walkers(dimension: int) -> int:
 
 @dataclass(frozen=True)
 class Ensembles:
-    """What advances the walkers of several ensembles.
+    """Sampler that advances the walkers of several ensembles.
 
     Parameters
     ----------
@@ -182,7 +181,7 @@ class Ensembles:
         Parameters
         ----------
         mixture : Mixture
-            Where to draw from.
+            Mixture to draw from.
         seed : int
             Seeds the generator of the whole run.
 
@@ -232,7 +231,7 @@ class Ensembles:
         Parameters
         ----------
         last : Segment
-            Its last draw, generator and mixture are where this one begins.
+            The new segment continues from its last draw, generator and mixture.
         steps : int
             Draws of each walker.
         phase : {"warm-up", "kept"}

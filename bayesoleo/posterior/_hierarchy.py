@@ -66,7 +66,7 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Population:
-    """One parameter's values in the runs, and what they vary about.
+    """One parameter's values in the runs, and their common distribution.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Population:
     prior : Prior
         Of the mean, in the parameter's unit.
     centres, sds : ndarray, shape (N,)
-        What each run says of its value by itself, in coordinates without bounds.
+        Estimate of each run's value from that run alone, in unbounded coordinates.
     slopes : ndarray, shape (N, k)
         How the centres move with the coordinates of the ``k`` shared unknowns ...
     common : ndarray, shape (k,)
@@ -113,7 +113,7 @@ class Population:
 
     @cached_property
     def typical(self) -> float:
-        """The spread that the runs' own words suggest, or how small a one they could tell."""
+        """Spread suggested by the runs' own estimates, or the smallest that they can resolve."""
         noise = float(np.mean(self.sds**2))
         seen = float(np.var(self.centres, ddof=1)) - noise
         # A variance from N values has a relative error of sqrt(2 / N).
@@ -121,7 +121,7 @@ class Population:
 
     def spread_of(self, w: Array) -> tuple[Array, Array]:
         """Spread, shape (W,), and logarithm of its derivative, from its coordinate."""
-        # From the nearer end, so that neither tail is lost to rounding.
+        # Computed from the nearer end, so that neither tail is lost to rounding.
         angle = 0.5 * np.pi * ndtr(-np.abs(w))
         tangent = np.tan(angle)
         ratio = np.where(w < 0, tangent, 1.0 / tangent)
@@ -204,7 +204,7 @@ class Population:
 class HierarchicalUnknowns(Unknowns):
     """Unknowns of which some scatter between runs.
 
-    There are the problem's ``l`` unknowns, then mean and spread of each population.
+    They are the problem's ``l`` unknowns, then mean and spread of each population.
 
     Parameters
     ----------
@@ -362,7 +362,7 @@ def hierarchical(
     theta: Array | None = None,
     errors: ErrorModel | str = "independent",
 ) -> HierarchicalUnknowns:
-    """Let parameters that vary by run scatter about a mean that is estimated.
+    """Unknowns of a problem whose by-run parameters scatter about an estimated mean.
 
     Parameters
     ----------
@@ -372,9 +372,9 @@ def hierarchical(
     names : sequence of str
         Parameters that scatter.
     theta : ndarray, shape (l,), optional
-        An estimate with a value of each run's own, from which it is learnt what the runs say by
-        themselves. The posterior does not depend on it, only how many evaluations it takes. By
-        default the problem's start.
+        An estimate with a value for each run, which gives the centres of the coordinates. The
+        posterior does not depend on it, only the number of evaluations. By default the problem's
+        start.
     errors : ErrorModel or str, optional
         Says how much the data are worth there.
 
@@ -395,7 +395,7 @@ def hierarchical(
     eta = model.start(residuals_at(problem, model, theta))
     units = plain.transforms.derivative(plain.start(theta)[None])[0]
     information = information_at(problem, model, theta, eta) * np.outer(units, units)
-    # A run that says nothing of a value leaves it to the prior.
+    # A run without information on a value leaves it to the prior.
     widths = np.array([prior.sd for prior in plain.priors]) / np.abs(units)
     information += np.diag(widths**-2.0)
     centres = plain.start(theta)

@@ -30,6 +30,8 @@ RADIUS = 3.0
 #: Most Newton steps: where correlated errors take over from independent ones the mode lies tens of
 #: standard deviations away, along a valley that bends.
 ITERATIONS = 200
+#: Largest shape of the weights' tail (Vehtari et al. 2024, section 3.2.4).
+LARGEST_SHAPE = 0.7
 
 
 @dataclass(frozen=True)
@@ -293,10 +295,6 @@ def mixture_of(modes: list[Mode], *, degrees: float = DEGREES_OF_FREEDOM) -> Mix
 def _distance(one: Mode, other: Mode) -> float:
     away = one.centre - other.centre
     return float(np.sqrt(away @ np.linalg.solve(other.covariance, away)))
-
-
-#: Largest shape of the weights' tail (Vehtari et al. 2024, section 3.2.4).
-LARGEST_SHAPE = 0.7
 
 
 @dataclass(frozen=True)

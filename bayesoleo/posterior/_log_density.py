@@ -18,6 +18,11 @@ from bayesoleo.model._priors import Transforms
 from bayesoleo.posterior._unknowns import PlainUnknowns, Unknowns
 from bayesoleo.solvers._orbit import Status
 
+#: Prefix of the coordinate names of error variances.
+LOG_VARIANCE = schema.log_variance("")
+#: Parameter vectors whose residuals are held at once, so that they stay in the cache.
+LANES = 8
+
 
 def residuals_at(problem: EstimationProblem, errors: ErrorModel, theta: Array) -> list[Array]:
     """Residuals (s, n) of every run; equivalent columns where sums of squares suffice.
@@ -76,12 +81,6 @@ def information_at(
         columns = zip(evaluation.sensitivity, first, last, strict=True)
         total += errors.products(run, [j[a:b].T for j, a, b in columns], eta)
     return total
-
-
-#: Prefix of the coordinate names of error variances.
-LOG_VARIANCE = schema.log_variance("")
-#: Parameter vectors whose residuals are held at once, so that they stay in the cache.
-LANES = 8
 
 
 class Density(Protocol):

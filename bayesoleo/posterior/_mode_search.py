@@ -58,7 +58,7 @@ LOW = -40.0
 MOST_MODES, NEWTON_STEPS, NEWTON_END = 8, 12, 0.05
 #: Places between two modes where the density is looked for a dip, and how deep that is.
 PLACES, DIP = 15, 0.5
-#: Least and largest share of the proposals that go to what was found.
+#: Least and largest share of the proposals for the modes that were found.
 LEAST_SHARE, LARGEST_SHARE = 0.05, 0.95
 
 
@@ -85,7 +85,7 @@ class _Counted:
 def with_other_modes(
     log_density: Density, start: Mixture, climbs: int, rng: np.random.Generator
 ) -> tuple[Mixture, int]:
-    """Look for modes beside those of a mixture, and add those that are found.
+    """Search for modes beside those of a mixture, and add them to it.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def with_other_modes(
     evaluations : int
         Rows of the log density that it took.
     """
-    # What overflows far away is no height, and is left out as such.
+    # Points where the density overflows are left out.
     with np.errstate(over="ignore", invalid="ignore"):
         return _search(log_density, start, climbs, rng)
 
@@ -337,7 +337,7 @@ def _polished(height: _Counted, y: Array) -> Mode | None:
 
 
 def _joined(start: Mixture, known: list[Mode], found: list[Mode]) -> Mixture:
-    """The mixture with what was found beside it, by the Laplace integrals of all."""
+    """Mixture including the modes found, weighted by their Laplace integrals."""
     before = np.logaddexp.reduce([mode.log_weight for mode in known])
     heavy = [mode for mode in found if mode.log_weight > before + LIGHT]
     if not heavy:

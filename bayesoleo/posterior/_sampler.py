@@ -32,6 +32,14 @@ from bayesoleo.posterior._log_density import Density
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
 
+#: Starting points of the mode search, in full and in quick runs.
+CLIMBS, QUICK_CLIMBS = 32, 16
+#: Fraction of the evaluations that the mode search may take.
+SEARCHING = 0.25
+#: Evaluations of the log density at which a quick run ends, converged or not, but not before this
+#: number of steps of each walker: minutes, where a motion takes milliseconds.
+QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -102,15 +110,6 @@ class Quality:
                 f"the ensembles disagree: nested R-hat {self.rhat.max():.3f} above {limit:.3f}"
             )
         return short
-
-
-#: Starting points of the mode search, in full and in quick runs.
-CLIMBS, QUICK_CLIMBS = 32, 16
-#: Fraction of the evaluations that the mode search may take.
-SEARCHING = 0.25
-#: Evaluations of the log density at which a quick run ends, converged or not, but not before this
-#: number of steps of each walker: minutes, where a motion takes milliseconds.
-QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
 
 
 def sample(

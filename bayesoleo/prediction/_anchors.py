@@ -36,6 +36,8 @@ LONGEST, SHORTEST = 0.25, 1 / 512
 #: Two solutions of the same equations are one if they differ by less of the swing: Newton's method
 #: leaves far less, other branches far more.
 SAME = 1e-3
+#: A start needs no more than the first; where that is too coarse for shooting to close, the second.
+TOLERANCES = (1e-6, 1e-8)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Anchor:
 
     @cached_property
     def extrapolation(self) -> Extrapolation:
-        """What solutions at other parameters start from."""
+        """Extrapolation from which solutions at other parameters start."""
         return Extrapolation(self.x, self.x_p)
 
     @cached_property
@@ -133,10 +135,6 @@ class Anchor:
             here, slope = trial.x[0], (trial.x[0] - here) / length
             place, step = place + length, min(2 * length, LONGEST)
         return here
-
-
-#: A start needs no more than the first; where that is too coarse for shooting to close, the second.
-TOLERANCES = (1e-6, 1e-8)
 
 
 def solve_from_shot(

@@ -48,6 +48,18 @@ from bayesoleo.prediction._spectrum import Spectrum, segment_length, spectrum_of
 
 #: Process noise over measurement noise, per sample: logarithms to base ten that are tried.
 ROUGHNESS = np.linspace(-16.0, 6.0, 23)
+#: Highest derivative that a curve of its own is kept for; of a higher one it is the same.
+DERIVATIVES = 2
+#: Part of a channel's power above the frequency that a mesh has to follow: a thousandth of its
+#: size.
+_UNRESOLVED = 1e-6
+#: Points of the grid in a period of the highest frequency: quintic pieces between eight miss it by
+#: 5e-6.
+_FINE = 8.0
+#: Noise over a signal's deviation at which few samples still show a smooth signal.
+_MOST_NOISE = 0.3
+#: Standard errors by which the coherence of two channels has to exceed chance, and its least size.
+_SURE, _COHERENT = 5.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,20 +226,6 @@ def exact_signal(values: Array, step: float) -> Smoothed:
     time = step * np.arange(values.size)
     spline = make_interp_spline(time, values, k=5)
     return Smoothed(step, np.stack([spline(time, nu=k) for k in range(3)], axis=1))
-
-
-#: Highest derivative that a curve of its own is kept for; of a higher one it is the same.
-DERIVATIVES = 2
-#: Part of a channel's power above the frequency that a mesh has to follow: a thousandth of its
-#: size.
-_UNRESOLVED = 1e-6
-#: Points of the grid in a period of the highest frequency: quintic pieces between eight miss it by
-#: 5e-6.
-_FINE = 8.0
-#: Noise over a signal's deviation at which few samples still show a smooth signal.
-_MOST_NOISE = 0.3
-#: Standard errors by which the coherence of two channels has to exceed chance, and its least size.
-_SURE, _COHERENT = 5.0, 0.02
 
 
 def band_limited(

@@ -27,11 +27,13 @@ from bayesoleo.solvers._periodic import Boundary, solve_from_guess
 from bayesoleo.solvers._schemes import DEFAULT_SCHEME, scheme
 from bayesoleo.solvers._state_space import StateSpace
 
-#: What a branch can be followed along besides a parameter.
+#: Quantities, besides a parameter, along which a branch can be followed.
 FREQUENCY, AMPLITUDE = "frequency", "amplitude"
 UNITS = {FREQUENCY: "Hz", AMPLITUDE: ""}
 #: Steps of the longest kind after which a branch that does not leave its span is given up.
 MOST = 40
+#: Of the motion towards a limit cycle, which only has to start Newton's method.
+RELATIVE_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,10 +272,6 @@ def _scaled(item: Harmonics, amount: float) -> Harmonics:
     """A motion about the same mean, its harmonics scaled."""
     factor = np.where(item.orders == 0, 1.0, amount)
     return replace(item, coefficients=item.coefficients * factor)
-
-
-#: Of the motion towards a limit cycle, which only has to start Newton's method.
-RELATIVE_TOLERANCE = 1e-8
 
 
 def limit_cycle(

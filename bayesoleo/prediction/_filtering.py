@@ -36,6 +36,12 @@ from bayesoleo.solvers._elimination import eliminate
 
 #: Variance of the state before the first sample, over that of a sample's noise.
 DIFFUSE = 1e9
+#: Periods of the highest frequency that the spline at an end is fitted to, half of which it is
+#: joined over, and by which a record is continued.
+_END, _BEYOND = 8.0, 8.0
+#: Roughness of a spline that goes through its samples, to 3e-5; more would compete with the start,
+#: of which nothing is known.
+_EXACT = 1e7
 
 
 def process_noise() -> Array:
@@ -192,14 +198,6 @@ def _quintic(left: Array, right: Array) -> Array:
         ],
         axis=1,
     )
-
-
-#: Periods of the highest frequency that the spline at an end is fitted to, half of which it is
-#: joined over, and by which a record is continued.
-_END, _BEYOND = 8.0, 8.0
-#: Roughness of a spline that goes through its samples, to 3e-5; more would compete with the start,
-#: of which nothing is known.
-_EXACT = 1e7
 
 
 @dataclass(frozen=True)

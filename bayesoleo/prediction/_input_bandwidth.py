@@ -41,6 +41,12 @@ _MATTERS, _NONE = 1e-4, 1e-6
 _FADE = 0.15
 #: Part of what was invented that may be left by the cut.
 _LEFT = 0.1
+#: Part of what an input holds, as root mean squares, that is worth a word.
+_PART = 0.05
+#: Noise levels that a straight line has to miss the signal by.
+_MISSED = 3.0
+#: Windows of a masked stretch's length that are looked at elsewhere.
+_WINDOWS = 64
 
 
 @dataclass(frozen=True)
@@ -216,14 +222,6 @@ def _by_band(values: Array, record: Record) -> tuple[Array, Array]:
     edges[0] = 0.0
     place = np.clip(np.searchsorted(edges, frequency) - 1, 0, edges.size - 2)
     return edges, np.bincount(place, power, edges.size - 1)
-
-
-#: Part of what an input holds, as root mean squares, that is worth a word.
-_PART = 0.05
-#: Noise levels that a straight line has to miss the signal by.
-_MISSED = 3.0
-#: Windows of a masked stretch's length that are looked at elsewhere.
-_WINDOWS = 64
 
 
 @dataclass(frozen=True)

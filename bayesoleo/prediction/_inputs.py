@@ -17,6 +17,10 @@ from bayesoleo.prediction._records import Harmonics, Record, Signal
 from bayesoleo.solvers._initial_value import Dynamics
 from bayesoleo.solvers._switching import InputSignal, periodic_signal
 
+#: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
+#: of the same run share them.
+RowCache = dict[tuple[str, str, int, int], Array]
+
 
 def harmonics_of(record: Record, channel: str) -> Harmonics:
     """A channel's periodic representation.
@@ -107,11 +111,6 @@ def _turning(item: Harmonics, part: str) -> Harmonics | None:
     quarter = 1.0 if part == COSINE else -1j
     size = np.abs(c)
     return Harmonics(item.orders[first], quarter * c / size, variance / size**2)
-
-
-#: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
-#: of the same run share them.
-RowCache = dict[tuple[str, str, int, int], Array]
 
 
 def input_rows(

@@ -24,6 +24,9 @@ from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
+#: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
+BLOCK = 32
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -90,10 +93,6 @@ class Layout:
     def start(self, model: Model) -> Array:
         """Nominal values of the unknowns, shape (l,)."""
         return np.array([model.parameters[name].value for name in self.parameters])
-
-
-#: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
-BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ class Predictor:
         return other
 
     def __getstate__(self) -> dict[str, Any]:
-        """What another process needs to make the same predictor: compiled code stays here."""
+        """State from which another process makes the same predictor, without compiled code."""
         names = ("model", "records", "steps", "scheme", "solver", "backend", "jobs")
         return {name: getattr(self, name) for name in names} | {
             "found": [run.found() for run in self.runs]

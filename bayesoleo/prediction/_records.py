@@ -18,6 +18,8 @@ from bayesoleo.errors import CampaignError
 from bayesoleo.prediction._band_limited import Smoothed, band_limited_channels, sample_noise
 
 PERIODIC, TRANSIENT = "periodic", "transient"
+#: A smoother needs that many samples.
+FEWEST_SAMPLES = 8
 
 
 class Signal(Protocol):
@@ -183,10 +185,6 @@ class Record:
     def position(self) -> Array:
         """Every sample's place in spans since the first one, shape (N,): the phase, if periodic."""
         return cast(Array, self.rate * (self.time - self.time[0]))
-
-
-#: A smoother needs that many samples.
-FEWEST_SAMPLES = 8
 
 
 def transient_record(

@@ -37,6 +37,10 @@ from bayesoleo.solvers._switching import evaluate
 
 #: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
 DRAWS = 16
+#: Error over the swing below which nothing more is resolved: what no channel shows.
+TOLERANCE = 1e-6
+#: Points of a run at which its equations are looked at: every run of every fit is.
+LOOKS = 16_384
 
 
 def input_columns(run: RunPredictor, p: Array) -> Array:
@@ -140,12 +144,6 @@ def _drawn_changes(run: RunPredictor, position: Array) -> Array:
                         block[k, j] = draw.evaluate(position, record.rate, derivative)
             blocks.append(block / np.sqrt(DRAWS))
     return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, position.size))
-
-
-#: Error over the swing below which nothing more is resolved: what no channel shows.
-TOLERANCE = 1e-6
-#: Points of a run at which its equations are looked at: every run of every fit is.
-LOOKS = 16_384
 
 
 def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:

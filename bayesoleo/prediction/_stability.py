@@ -34,6 +34,28 @@ MARGIN = 1e-6
 ROUNDING = 1e-13
 #: Real multipliers below this are called close to a doubling of the period.
 NEAR = -0.9
+#: Findings, with a place for the runs and the multiplier of each.
+DOUBLED = (
+    "the periodic solution of {} is unstable and its period doubles (multiplier below -1): a rig"
+    " answers in twice the period; if the record does, declare half its frequency for the run"
+)
+NEARLY_DOUBLED = (
+    "the periodic solution of {} is close to where its period doubles (multiplier -1): an estimate"
+    " may have settled there because the record repeats in twice the period only"
+)
+SECOND_FREQUENCY = (
+    "the periodic solution of {} is unstable: a rig answers with a second frequency beside the"
+    " input's"
+)
+ELSEWHERE = (
+    "the periodic solution of {} is unstable (multiplier above 1): a rig leaves it for another"
+    " answer to the same input"
+)
+JUMPED = (
+    "branch jumps: the periodic solution of {} went to another branch, or changed its stability,"
+    " between neighbouring parameters (how often in brackets): the model has several answers to"
+    " this input, and a fit may follow the wrong one"
+)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -139,11 +161,11 @@ class Stability:
         return int(self.jumps.sum())
 
     def with_jumps(self, jumps: Integers) -> Stability:
-        """The same solutions after so many jumps."""
+        """Copy with a given number of jumps."""
         return replace(self, jumps=jumps)
 
     def as_plain(self) -> dict[str, dict[str, Any]]:
-        """By run, in what JSON knows: multipliers as real and imaginary part; None if unknown."""
+        """Values by run for JSON: multipliers as real and imaginary part; None if unknown."""
         return {
             run: {
                 "multipliers": [[float(m.real), float(m.imag)] for m in row] if count >= 0 else [],
@@ -167,7 +189,7 @@ class Stability:
         )
 
     def notes(self) -> list[str]:
-        """What a reader should know, a sentence each; nothing where all runs are stable."""
+        """Notes for a reader, one sentence each; empty where all runs are stable."""
         found: dict[str, list[str]] = {}
         for run, row, count in zip(self.runs, self.multipliers, self.unstable, strict=True):
             what = _finding(row, int(count))
@@ -181,30 +203,6 @@ class Stability:
         return notes
 
 
-#: Findings, with a place for the runs and the multiplier of each.
-DOUBLED = (
-    "the periodic solution of {} is unstable and its period doubles (multiplier below -1): a rig"
-    " answers in twice the period; if the record does, declare half its frequency for the run"
-)
-NEARLY_DOUBLED = (
-    "the periodic solution of {} is close to where its period doubles (multiplier -1): an estimate"
-    " may have settled there because the record repeats in twice the period only"
-)
-SECOND_FREQUENCY = (
-    "the periodic solution of {} is unstable: a rig answers with a second frequency beside the"
-    " input's"
-)
-ELSEWHERE = (
-    "the periodic solution of {} is unstable (multiplier above 1): a rig leaves it for another"
-    " answer to the same input"
-)
-JUMPED = (
-    "branch jumps: the periodic solution of {} went to another branch, or changed its stability,"
-    " between neighbouring parameters (how often in brackets): the model has several answers to"
-    " this input, and a fit may follow the wrong one"
-)
-
-
 def _telling(multipliers: ComplexArray) -> complex:
     """The least of the real ones where that is the nearest to -1, else the largest."""
     least = multipliers[np.argmin(multipliers.real)]
@@ -213,7 +211,7 @@ def _telling(multipliers: ComplexArray) -> complex:
 
 
 def _finding(multipliers: ComplexArray, unstable: int) -> str:
-    """What a rig would do, where it would not stay on the solution or hardly so."""
+    """Behaviour of a rig where the solution is unstable or nearly so."""
     if unstable < 0:
         return ""
     value = _telling(multipliers)

@@ -38,6 +38,9 @@ from bayesoleo.solvers._orbit import Status
 Motion = Callable[[Array], Array]
 #: Rows of channels at fixed phases, by channel and derivative: they depend on no parameter.
 KnownRows = dict[tuple[str, int], Array]
+MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
+#: A Newton step this small, over the state's size, leaves round-off only.
+SMALL_STEP = 1e-12
 
 
 def guess_rows(
@@ -110,11 +113,6 @@ def _compiled(expression: sp.Expr) -> tuple[Callable[..., Array], tuple[sp.Symbo
     """A guess as a function of its symbols: the same for every run, and slow to make."""
     items = tuple(sorted(expression.free_symbols, key=str))
     return sp.lambdify(items, expression, "numpy"), items
-
-
-MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
-#: A Newton step this small, over the state's size, leaves round-off only.
-SMALL_STEP = 1e-12
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,15 @@ SHORTEST, LONGEST = 1.0 / 4.0, 4.0
 GROWTH = 1.0
 #: Steps between two kinks.
 LEAST_STEPS = 2
+#: Equal steps tried in turn where no mesh is given.
+FIRST_STEPS = (64, 256, 1024)
+MAXIMUM_PASSES = 25
+#: How much softer each trial is until one succeeds, and how many there are.
+SOFTER, TRIALS = 0.01, 8
+#: Factor of the first step, and the largest and smallest one.
+FIRST_STEP, LARGEST_STEP, SMALLEST_STEP = 1.2, 100.0, 1.001
+#: Error on the way.
+ROUGH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,11 +143,6 @@ def _graded(phase: Array, wanted: Array) -> Array:
     ahead = np.minimum.accumulate(around - rise) + rise
     behind = np.minimum.accumulate((around + rise)[::-1])[::-1] - rise
     return np.minimum(ahead, behind)[wanted.size : 2 * wanted.size]
-
-
-#: Equal steps tried in turn where no mesh is given.
-FIRST_STEPS = (64, 256, 1024)
-MAXIMUM_PASSES = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,14 +381,6 @@ def compare(coarse: Level, fine: Level) -> MeshError:
     if coarse.kinks is not None and fine.kinks is not None and fine.kinks.phases.size:
         late = float(np.abs(fine.kinks.phases - coarse.kinks.phases).max())
     return MeshError(own, max(float(np.abs(change).max()), late))
-
-
-#: How much softer each trial is until one succeeds, and how many there are.
-SOFTER, TRIALS = 0.01, 8
-#: Factor of the first step, and the largest and smallest one.
-FIRST_STEP, LARGEST_STEP, SMALLEST_STEP = 1.2, 100.0, 1.001
-#: Error on the way.
-ROUGH = 1e-3
 
 
 def solve_stiffening(

@@ -40,6 +40,16 @@ DIFFERENCE = 6e-6
 LAST_STEP = 1e-8
 
 _LANE = np.zeros(1, dtype=np.int64)
+#: A step with more iterations than these is followed by a shorter one, with fewer by a longer.
+MANY_ITERATIONS, FEW_ITERATIONS = 6, 4
+#: Least cosine between tangents of neighbouring points: a larger turn may be another branch.
+LEAST_COSINE = 0.9
+#: A step may shrink to this part of the longest before the branch is given up.
+SMALLEST_STEP = 1e-4
+#: Special orbits in what is printed of a branch.
+MOST_SHOWN = 20
+#: Where along a step a special orbit lies, over its length.
+PLACE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,18 +217,6 @@ def _solve(matrix: Array, right: Array) -> Array | None:
 def _one_step(problem: Boundary) -> Collocation:
     assert isinstance(problem.scheme, Collocation)  # its state closes a period; differences' do not
     return problem.scheme
-
-
-#: A step with more iterations than these is followed by a shorter one, with fewer by a longer.
-MANY_ITERATIONS, FEW_ITERATIONS = 6, 4
-#: Least cosine between tangents of neighbouring points: a larger turn may be another branch.
-LEAST_COSINE = 0.9
-#: A step may shrink to this part of the longest before the branch is given up.
-SMALLEST_STEP = 1e-4
-#: Special orbits in what is printed of a branch.
-MOST_SHOWN = 20
-#: Where along a step a special orbit lies, over its length.
-PLACE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)

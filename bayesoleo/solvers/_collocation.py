@@ -23,6 +23,9 @@ from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrol
 from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together
 from bayesoleo.solvers._mesh import Mesh, Tableau
 
+#: Steps of the mesh whose stages are eliminated together, innermost in memory.
+BLOCK = 32
+
 
 @jit
 def sample(
@@ -158,10 +161,6 @@ def _integrals(
     for m in range(n):
         once[m] *= h[m]
         twice[m] *= h[m] * h[m]
-
-
-#: Steps of the mesh whose stages are eliminated together, innermost in memory.
-BLOCK = 32
 
 
 @jit

@@ -28,6 +28,21 @@ from bayesoleo._compiled import jit
 from bayesoleo._types import Array
 from bayesoleo.solvers._mesh import Tableau
 
+#: Part of its digits that a pivot may lose, to cancellation or beside a large multiple of another
+#: row, before the elimination that exchanges rows is asked for.
+SMALL_PIVOT = 1e-4
+#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of
+#: what cancels.
+ROUND_OFF = 1e-12
+#: Growth of the recursion over a period beyond which half of the digits are lost.
+LARGEST_GROWTH = 1e8
+#: Two suffice for units alone; loops of several states take a few more.
+_SWEEPS = 20
+#: Weights by how many nodes they lie behind.
+Stencil = dict[int, float]
+#: A pivot this small against its row's largest entry is round-off of zero.
+SMALLEST_PIVOT = 1e-13
+
 
 @jit
 def eliminate(matrix: Array, right: Array, least: float) -> bool:
@@ -77,11 +92,6 @@ def eliminate(matrix: Array, right: Array, least: float) -> bool:
                 total -= matrix[i, other] * right[other, j]
             right[i, j] = total * inverse
     return True
-
-
-#: Part of its digits that a pivot may lose, to cancellation or beside a large multiple of another
-#: row, before the elimination that exchanges rows is asked for.
-SMALL_PIVOT = 1e-4
 
 
 @jit
@@ -140,15 +150,6 @@ def eliminate_each(work: Array, count: int, m: int) -> bool:
             for j in range(m, width):
                 work[i, j, t] = right[i, j - m]
     return True
-
-
-#: What cancellation in the product of a period's steps leaves of an exact zero, over the size of
-#: what cancels.
-ROUND_OFF = 1e-12
-#: Growth of the recursion over a period beyond which half of the digits are lost.
-LARGEST_GROWTH = 1e8
-#: Two suffice for units alone; loops of several states take a few more.
-_SWEEPS = 20
 
 
 @jit
@@ -261,13 +262,6 @@ def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: b
                     total += transfer[i, other, m] * states[other, j, m]
                 states[i, j, m + 1] = total
     return True
-
-
-#: Weights by how many nodes they lie behind.
-Stencil = dict[int, float]
-
-#: A pivot this small against its row's largest entry is round-off of zero.
-SMALLEST_PIVOT = 1e-13
 
 
 def needs_factorisation(ok: bool, monodromy: Array) -> bool:

@@ -40,6 +40,18 @@ GRADING = 1.5
 FEWEST_STEPS = 64
 #: Evaluations of the right-hand side after which an integration has failed.
 MOST_EVALUATIONS = 200_000
+#: A Newton step this small, over the derivative's size, leaves round-off only.
+SMALL_STEP = 1e-12
+#: Part of an input's range by which a step may miss it between the points where it is seen.
+INPUT_TOLERANCE = 1e-3
+INTEGRATORS = ("LSODA", "Radau", "BDF", "DOP853")
+#: Periods that the motion settles first: a stable one attracts from further than Newton's method.
+SETTLING = 10
+#: Local error while it does.
+LOOSE = 1e-6
+MAXIMUM_PASSES = 12
+#: A correction is final when it is below this many tolerances, over the sizes of the states.
+FINAL = 30.0
 
 
 @dataclass(frozen=True)
@@ -131,10 +143,6 @@ def _radau(
         np.linalg.LinAlgError,
     ):  # SciPy raises where a Jacobian is NaN
         return None
-
-
-#: A Newton step this small, over the derivative's size, leaves round-off only.
-SMALL_STEP = 1e-12
 
 
 def _right_side(space: StateSpace, p: Array) -> Callable[[float, Array], Array]:
@@ -247,10 +255,6 @@ def halved(mesh: Mesh, times: int = 1) -> Mesh:
     return Mesh(edges)
 
 
-#: Part of an input's range by which a step may miss it between the points where it is seen.
-INPUT_TOLERANCE = 1e-3
-
-
 def resolving(
     mesh: Mesh,
     inputs: Callable[[Array], Array],
@@ -289,16 +293,6 @@ def resolving(
         middle = 0.5 * (edges[:-1] + edges[1:])[cut]
         mesh = Mesh(np.sort(np.concatenate([edges, middle])))
     return mesh
-
-
-INTEGRATORS = ("LSODA", "Radau", "BDF", "DOP853")
-#: Periods that the motion settles first: a stable one attracts from further than Newton's method.
-SETTLING = 10
-#: Local error while it does.
-LOOSE = 1e-6
-MAXIMUM_PASSES = 12
-#: A correction is final when it is below this many tolerances, over the sizes of the states.
-FINAL = 30.0
 
 
 @dataclass(frozen=True, eq=False)

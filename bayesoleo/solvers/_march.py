@@ -39,6 +39,17 @@ from bayesoleo.solvers._switching import (
     step_to_switch,
 )
 
+#: How a step ended, and a march with it.
+FINISHED, LOST, OUTSIDE, NOT_A_NUMBER, DEGENERATE = range(5)
+#: On given steps the error may exceed the tolerance this many times before they are chosen anew.
+GENEROSITY = 8.0
+#: Entries of ``Front.pace``: length to be tried, that of the polynomial known (zero for none),
+#: length and error of the last step accepted, and whether this one was rejected before.
+LENGTH, KNOWN, LAST_LENGTH, LAST_ERROR, REJECTED = range(5)
+#: More ways for a march to end than a step's. ``COARSE``: given steps miss the tolerance; ``FULL``:
+#: out of memory given.
+CHATTERS, COARSE, FULL = 5, 6, 7
+
 
 @inner
 def rate_at_start(state: Array, top: Array, t: float, system: System, work: Workspace) -> bool:
@@ -143,15 +154,6 @@ def first_sizes(state: Array, rate: Array, scale: Array, orders: Integers, h: fl
             change = h * (abs(state[last]) + change)
             scale[first] = max(scale[first], change)
         first += orders[j]
-
-
-#: How a step ended, and a march with it.
-FINISHED, LOST, OUTSIDE, NOT_A_NUMBER, DEGENERATE = range(5)
-#: On given steps the error may exceed the tolerance this many times before they are chosen anew.
-GENEROSITY = 8.0
-#: Entries of ``Front.pace``: length to be tried, that of the polynomial known (zero for none),
-#: length and error of the last step accepted, and whether this one was rejected before.
-LENGTH, KNOWN, LAST_LENGTH, LAST_ERROR, REJECTED = range(5)
 
 
 class Front(NamedTuple):
@@ -321,11 +323,6 @@ def exchange(
             system.active,
         )  # fmt: skip
     return True
-
-
-#: More ways for a march to end than a step's. ``COARSE``: given steps miss the tolerance; ``FULL``:
-#: out of memory given.
-CHATTERS, COARSE, FULL = 5, 6, 7
 
 
 class MarchTask(NamedTuple):

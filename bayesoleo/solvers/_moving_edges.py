@@ -19,6 +19,17 @@ from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, solve_from_guess, solve_periodic
 from bayesoleo.solvers._switched import Crossings, Level, PeriodicProblem, PhaseFunction, state_rows
 
+#: Part of a stretch between kinks that remains at least.
+LEAST = 0.1
+MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 40, 12
+#: Newton's error after a step is about its square: a relative step of 1e-6 that still contracts
+#: leaves 1e-12. Where round-off stops it before, a step this small is taken as converged.
+LAST_STEP, SMALL_STEP = 1e-6, 1e-8
+#: By how much a stretch between two kinks may shrink or grow in a step.
+SHRINK, GROW = 0.6, 1.5
+#: For differences: part of the step beside it by which an edge is moved.
+PART = 1e-4
+
 
 @dataclass(frozen=True, eq=False)
 class Warp:
@@ -45,9 +56,6 @@ class Warp:
         """A mesh whose steps move along."""
         return Mesh(self.forward(mesh.edges))
 
-
-#: Part of a stretch between kinks that remains at least.
-LEAST = 0.1
 
 SAME = Warp(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 
@@ -145,16 +153,6 @@ def unknowns(boundary: Boundary, mesh: Mesh, start: PhaseFunction) -> Array:
     """The scheme's unknowns, shape (n, w), that represent a motion."""
     nodes, points = start(mesh.edges[:-1]), start(boundary.scheme.phases(mesh.steps))
     return cast(Array, boundary.scheme.from_motion(nodes[None], points[None])[0])
-
-
-MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 40, 12
-#: Newton's error after a step is about its square: a relative step of 1e-6 that still contracts
-#: leaves 1e-12. Where round-off stops it before, a step this small is taken as converged.
-LAST_STEP, SMALL_STEP = 1e-6, 1e-8
-#: By how much a stretch between two kinks may shrink or grow in a step.
-SHRINK, GROW = 0.6, 1.5
-#: For differences: part of the step beside it by which an edge is moved.
-PART = 1e-4
 
 
 def solve_with_edges(problem: PeriodicProblem, p: Array, level: Level) -> Level:

@@ -41,6 +41,11 @@ from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._collocation import Collocation, SamplePlan
 
 _gbtrf, _gbtrs = get_lapack_funcs(("gbtrf", "gbtrs"), (np.zeros(1),))
+#: Newton iterations for one step of an integration, and the relative change of the stages at which
+#: they end: its square, which is what the last one leaves, is round-off.
+INTEGRATION_ITERATIONS = 12
+INTEGRATION_STEP = 1e-8
+_LANE = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -177,14 +182,6 @@ def _band(hessian: Array, transition: Array, slack: Array) -> Array:
     put(multipliers, states[1:], 1.0)
     put(states[1:], multipliers, 1.0)
     return band
-
-
-#: Newton iterations for one step of an integration, and the relative change of the stages at which
-#: they end: its square, which is what the last one leaves, is round-off.
-INTEGRATION_ITERATIONS = 12
-INTEGRATION_STEP = 1e-8
-
-_LANE = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True)

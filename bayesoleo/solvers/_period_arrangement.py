@@ -24,6 +24,15 @@ from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.solvers._unrolled_collocation import COLUMNS, REACH, WIDTH
 from bayesoleo.solvers._unrolled_program import Program, chunks
 
+#: Motion about a level that is smaller than this part of it is measured by the level: the digits of
+#: a step are lost against it.
+LEAST_MOTION = 1e-6
+#: Fewer steps than that leave chunks empty.
+LEAST_STEPS = WIDTH
+#: Numbers in a cache line.
+LINE = 8
+_kept = threading.local()
+
 
 @jit
 def total(row: Array) -> float:
@@ -72,11 +81,6 @@ def positive(a: Array, lanes: Integers, inside: Flags, defined: Flags) -> None:
                 odd += a[lane, k, i] != a[lane, k, i]
         inside[lane] = outside == 0
         defined[lane] = odd == 0
-
-
-#: Motion about a level that is smaller than this part of it is measured by the level: the digits of
-#: a step are lost against it.
-LEAST_MOTION = 1e-6
 
 
 @jit
@@ -131,10 +135,6 @@ def keep(source: Array, lanes: Integers, target: Array) -> None:
         for m in range(n):
             for j in range(w):
                 target[lane, m, j] = source[lane, m, j]
-
-
-#: Fewer steps than that leave chunks empty.
-LEAST_STEPS = WIDTH
 
 
 class Sizes(NamedTuple):
@@ -244,10 +244,6 @@ class Work(NamedTuple):
     constants: Any
 
 
-#: Numbers in a cache line.
-LINE = 8
-
-
 def work_space(sizes: Sizes, sweep: Sweep) -> Work:
     """Arrays for lanes of given sizes; a thread keeps those it used last."""
     key = sizes, sweep.source.size, sweep.inputs.shape[0], sweep.order.tobytes()
@@ -255,9 +251,6 @@ def work_space(sizes: Sizes, sweep: Sweep) -> Work:
         _kept.key, _kept.work = key, _allocate(*key[:3], sweep.order)
     work: Work = _kept.work
     return work
-
-
-_kept = threading.local()
 
 
 def _allocate(sizes: Sizes, positions: int, blocks: int, order: Integers) -> Work:

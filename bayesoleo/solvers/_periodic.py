@@ -24,6 +24,15 @@ from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic_newton import NEEDS_EXCHANGE, Extrapolation
 from bayesoleo.solvers._schemes import Scheme
 
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14.
+LAST_STEP = 1e-7
+#: Without quadratic contraction (at a kink) a step this small is taken as converged.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+FIRST_STEP = 0.25
+SMALLEST_STEP = 1.0 / 512
+
 
 class Trial:
     """Unknowns, and the equations with their derivatives at these; arrays are allocated once.
@@ -154,14 +163,6 @@ class Solution:
     x: Float[Array, "vectors steps width"]
     status: Int[Integers, " vectors"]
     iterations: Int[Integers, " vectors"]
-
-
-#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
-#: contracting leaves 1e-14.
-LAST_STEP = 1e-7
-#: Without quadratic contraction (at a kink) a step this small is taken as converged.
-SMALL_STEP = 1e-11
-MAXIMUM_HALVINGS = 12
 
 
 def solve_periodic(
@@ -399,10 +400,6 @@ def sensitivities(problem: Boundary, p: Array, solution: Solution) -> tuple[Solu
     status = solution.status.copy()
     status[lanes[~ok[lanes]]] = Status.SINGULAR.value
     return replace(solution, status=status), x_theta, monodromy
-
-
-FIRST_STEP = 0.25
-SMALLEST_STEP = 1.0 / 512
 
 
 def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:

@@ -51,6 +51,23 @@ _call_eliminate = caller(SIGNATURES["eliminate"])
 _call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
 _call_product, _call_begin = caller(SIGNATURES["product"]), caller(SIGNATURES["begin"])
 _call_update = caller(SIGNATURES["update"])
+NO_CONVERGENCE = Status.NO_CONVERGENCE.value
+#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
+#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step
+#: from the last two is safe.
+LAST_STEP = 1e-7
+#: The same without quadratic contraction (at a kink), where a small step is all there is to see.
+SMALL_STEP = 1e-11
+MAXIMUM_HALVINGS = 12
+#: Relative step from which on steps can be taken for those of a contraction.
+CHORD_FROM = 0.1
+#: Steps with old derivatives, half as expensive, before there are new ones.
+MOST_CHORDS = 2
+#: Contraction that is none.
+SLOW_CHORD = 0.1
+#: What the steps that are not taken would add up to.
+CHORD_LEFT = 1e-14
+WITHOUT_SIGN = np.int64(2**63 - 1)
 
 
 @jit
@@ -238,26 +255,6 @@ def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
             dx[k, i] = dx[k, sweep.again[i]]
         for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
             dx[k, i] = dx[k, sweep.again[i]]
-
-
-NO_CONVERGENCE = Status.NO_CONVERGENCE.value
-
-#: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
-#: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step
-#: from the last two is safe.
-LAST_STEP = 1e-7
-#: The same without quadratic contraction (at a kink), where a small step is all there is to see.
-SMALL_STEP = 1e-11
-MAXIMUM_HALVINGS = 12
-#: Relative step from which on steps can be taken for those of a contraction.
-CHORD_FROM = 0.1
-#: Steps with old derivatives, half as expensive, before there are new ones.
-MOST_CHORDS = 2
-#: Contraction that is none.
-SLOW_CHORD = 0.1
-#: What the steps that are not taken would add up to.
-CHORD_LEFT = 1e-14
-WITHOUT_SIGN = np.int64(2**63 - 1)
 
 
 @jit

@@ -26,6 +26,11 @@ from bayesoleo.solvers._mesh import tableau
 
 #: Options that Numba has and its annotations lack.
 _NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+#: Outcomes of the stages' iteration.
+SOLVED, DIVERGED, SINGULAR, UNDEFINED = 0, 1, 2, 3
+MAXIMUM_ITERATIONS = 8
+#: Changes of stages over the sizes of the states that round-off can make.
+ROUND_OFF = 1e-10
 
 
 def inner[F: Callable[..., Any]](function: F) -> F:
@@ -178,13 +183,6 @@ def assemble(g: Array, h: float, method: Method, orders: Integers, matrix: Array
                         total += middle if orders[j] == 1 else g[row + 2, i]
                     matrix[line, k * d + j] = total
                 row += orders[j] + 1
-
-
-#: Outcomes of the stages' iteration.
-SOLVED, DIVERGED, SINGULAR, UNDEFINED = 0, 1, 2, 3
-MAXIMUM_ITERATIONS = 8
-#: Changes of stages over the sizes of the states that round-off can make.
-ROUND_OFF = 1e-10
 
 
 @inner

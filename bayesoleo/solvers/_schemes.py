@@ -37,9 +37,35 @@ from bayesoleo.solvers._elimination import (
 from bayesoleo.solvers._mesh import Mesh, tableau
 from bayesoleo.solvers._unrolled_program import Program
 
+FIRST = np.array([1.5, -2.0, 0.5, 0.0])
+SECOND = np.array([2.0, -5.0, 4.0, -1.0])
+#: Nodes whose equations are solved together, innermost in memory.
+BLOCK = 32
+# Weights of the first derivative times the step, of the second times its square.
+CENTRAL_FIRST: Stencil = {-1: 0.5, 1: -0.5}
+CENTRAL_SECOND: Stencil = {-1: 1.0, 0: -2.0, 1: 1.0}
+EULER_FIRST: Stencil = {0: 1.0, 1: -1.0}
+BACKWARD_FIRST: Stencil = {0: 1.5, 1: -2.0, 2: 0.5}
+BACKWARD_SECOND: Stencil = {0: 2.0, 1: -5.0, 2: 4.0, 3: -1.0}
+#: Velocity and acceleration by the name of the scheme.
+COMBINATIONS: dict[str, tuple[Stencil, Stencil]] = {
+    "central": (CENTRAL_FIRST, CENTRAL_SECOND),
+    "central-velocity": (CENTRAL_FIRST, BACKWARD_SECOND),
+    "central-acceleration": (BACKWARD_FIRST, CENTRAL_SECOND),
+    "central-euler": (EULER_FIRST, CENTRAL_SECOND),
+}
+#: Three-stage Radau IIA: order five, and stiff components (steep friction) decay instead of
+#: ringing.
+DEFAULT_SCHEME = "radau3"
+#: Solvers of periodic motions: all unknowns of a period at once on equal steps, the same on a mesh
+#: with error control, shooting, shooting with derivatives on a mesh of its steps, and shooting with
+#: SciPy's LSODA.
+COLLOCATION = "collocation"
+SOLVERS = (COLLOCATION, "adaptive", "shooting", "hybrid", "library")
+
 
 class Scheme(Protocol):
-    """A discretisation of a period as linear maps (see ``solvers.schemes.collocation``)."""
+    """A discretisation of a period as linear maps (see ``_collocation.py``)."""
 
     @property
     def orders(self) -> tuple[int, ...]: ...
@@ -65,10 +91,6 @@ class Scheme(Protocol):
         *,
         initial: bool = False,
     ) -> tuple[Array, Array, Flags]: ...
-
-
-FIRST = np.array([1.5, -2.0, 0.5, 0.0])
-SECOND = np.array([2.0, -5.0, 4.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -218,10 +240,6 @@ def _rows(
             row += orders[j] + 1
 
 
-#: Nodes whose equations are solved together, innermost in memory.
-BLOCK = 32
-
-
 @jit
 def _linear(
     gz: Array, right: Array, lanes: Integers, h: float, orders: Integers, first: Array,
@@ -282,22 +300,6 @@ def _assemble(
         for column in range(k):
             for t in range(count):
                 work[e, 4 * d + column, t] = -right[e, column, begin + t]
-
-
-# Weights of the first derivative times the step, of the second times its square.
-CENTRAL_FIRST: Stencil = {-1: 0.5, 1: -0.5}
-CENTRAL_SECOND: Stencil = {-1: 1.0, 0: -2.0, 1: 1.0}
-EULER_FIRST: Stencil = {0: 1.0, 1: -1.0}
-BACKWARD_FIRST: Stencil = {0: 1.5, 1: -2.0, 2: 0.5}
-BACKWARD_SECOND: Stencil = {0: 2.0, 1: -5.0, 2: 4.0, 3: -1.0}
-
-#: Velocity and acceleration by the name of the scheme.
-COMBINATIONS: dict[str, tuple[Stencil, Stencil]] = {
-    "central": (CENTRAL_FIRST, CENTRAL_SECOND),
-    "central-velocity": (CENTRAL_FIRST, BACKWARD_SECOND),
-    "central-acceleration": (BACKWARD_FIRST, CENTRAL_SECOND),
-    "central-euler": (EULER_FIRST, CENTRAL_SECOND),
-}
 
 
 @dataclass(frozen=True)
@@ -370,16 +372,6 @@ class Differences(_EqualSteps):
             if found is not None:
                 dx[lane] = found
         return dx, np.full((count, self.state_size, self.state_size), np.nan), ok
-
-
-#: Three-stage Radau IIA: order five, and stiff components (steep friction) decay instead of
-#: ringing.
-DEFAULT_SCHEME = "radau3"
-#: Solvers of periodic motions: all unknowns of a period at once on equal steps, the same on a mesh
-#: with error control, shooting, shooting with derivatives on a mesh of its steps, and shooting with
-#: SciPy's LSODA.
-COLLOCATION = "collocation"
-SOLVERS = (COLLOCATION, "adaptive", "shooting", "hybrid", "library")
 
 
 def scheme(name: str, orders: tuple[int, ...], mesh: Mesh | None = None) -> Scheme:

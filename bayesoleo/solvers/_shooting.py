@@ -47,6 +47,7 @@ MAXIMUM_HALVINGS = 12
 SETTLINGS, PERIODS = 3, 10
 #: Closures with a smaller reciprocal condition number are singular but for round-off.
 SINGULAR = 1e-13
+_LANE = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,9 +347,6 @@ def _moved(path: DenseTrajectory, step: Array) -> DenseTrajectory:
     D = step.size
     tops = path.tops + (path.tops_by[:, :, :D] @ step).reshape(path.tops.shape)
     return replace(path, states=path.states + path.by[:, :, :D] @ step, tops=tops)
-
-
-_LANE = np.zeros(1, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)

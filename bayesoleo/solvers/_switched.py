@@ -28,6 +28,8 @@ POSITIONS = np.arange(6) / 6.0
 LEAST = 1e-13
 #: Crossings this close, in cycles, are one.
 APART = 1e-14
+#: Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,).
+PhaseFunction = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +121,6 @@ def _root(values: Callable[[Array], Array], k: int, low: float, high: float) -> 
         return float(ends[np.argmin(np.abs(at))]) % 1.0
     result = find_root(lambda phase: values(phase)[k], (ends[:1], ends[1:]))
     return float(result.x[0]) % 1.0
-
-
-#: Values and derivatives of all dofs, shape (nz, N), at phases in cycles, shape (N,).
-PhaseFunction = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)

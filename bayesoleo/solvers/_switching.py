@@ -29,6 +29,10 @@ from bayesoleo.solvers._radau_step import (
     stretch,
 )
 
+#: A switching function beyond zero by less than this, over its largest value, has not switched:
+#: with analytic pieces the difference is of that size.
+SLACK = 1e-13
+
 
 class InputSignal(NamedTuple):
     """Rows of inputs, each with its derivatives as rows of their own.
@@ -121,11 +125,6 @@ def _add_piece(signal: InputSignal, t: float, u: Array, i: int) -> None:
     for row in range(u.shape[0]):
         b = signal.pieces[m, row]
         u[row, i] += b[0] + x * (b[1] + x * (b[2] + x * b[3]))
-
-
-#: A switching function beyond zero by less than this, over its largest value, has not switched:
-#: with analytic pieces the difference is of that size.
-SLACK = 1e-13
 
 
 @inner

@@ -38,6 +38,24 @@ from bayesoleo.solvers._unrolled_collocation import (
     solve_again,
 )
 
+#: Systems up to this size are solved by straight-line code; its length grows as the cube.
+LARGEST = 6
+_P, _I = types.CPointer(types.float64), types.intp
+#: Of the pieces, see :class:`Program`.
+SIGNATURES = {
+    "rows": types.void(_P, _P, _P, _I),
+    "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
+    "chain": types.void(_P, _P, _I, _I),
+    "substitute": types.void(_P, _P, _P, _P, _I),
+    "follow": types.void(_P, _P, _I, _I),
+    "product": types.void(_P, _P, _I, _I, _I),
+    "begin": types.void(_P, _P, _P, _I, _I, _I),
+    "update": types.void(_P, _P, _P, _P, _I, _I),
+}
+#: An address does not keep what stands there.
+_ALIVE: list[Any] = []
+_PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
+
 
 def past_nodes(orders: Sequence[int]) -> list[tuple[int, int]]:
     """How many nodes back, and which dof: three for one of second order, two for one of first."""
@@ -154,23 +172,6 @@ def update(orders: Sequence[int]) -> str:
     return "\n".join(source.lines)
 
 
-#: Systems up to this size are solved by straight-line code; its length grows as the cube.
-LARGEST = 6
-
-_P, _I = types.CPointer(types.float64), types.intp
-#: Of the pieces, see :class:`Program`.
-SIGNATURES = {
-    "rows": types.void(_P, _P, _P, _I),
-    "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
-    "chain": types.void(_P, _P, _I, _I),
-    "substitute": types.void(_P, _P, _P, _P, _I),
-    "follow": types.void(_P, _P, _I, _I),
-    "product": types.void(_P, _P, _I, _I, _I),
-    "begin": types.void(_P, _P, _P, _I, _I, _I),
-    "update": types.void(_P, _P, _P, _P, _I, _I),
-}
-
-
 @dataclass(frozen=True)
 class Program:
     """Compiled pieces of a Newton step, for one block of steps each, by their addresses.
@@ -244,10 +245,6 @@ def _compile(parts: Sequence[str]) -> dict[str, int]:
     return addresses
 
 
-#: An address does not keep what stands there.
-_ALIVE: list[Any] = []
-
-
 def differences(
     orders: tuple[int, ...], first: tuple[float, ...], second: tuple[float, ...]
 ) -> Program | None:
@@ -258,9 +255,6 @@ def differences(
 def collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
     """Code for a collocation method, or None where it would be too long."""
     return _known((method.name, orders), lambda: _collocation(method, orders))
-
-
-_PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
 
 
 def _known(key: tuple[str, tuple[int, ...]], make: Callable[[], Program | None]) -> Program | None:
