@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bayesoleo import _schema as schema
-from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._cli import options, shell
 from bayesoleo._workflow.settings import Settings, words
 
 if TYPE_CHECKING:
@@ -78,12 +78,16 @@ def assess(
     drawn = _drawn(series, figure, run)
     found = test_residuals(series)
     if as_json:
-        numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
-        shell.print_json(tables.plain(numbers.to_dict()))
+        shell.print_json(_numbers(found.data).to_dict())
     else:
-        shell.console().print(str(found), markup=False, soft_wrap=True)
+        shell.say(found)
     if figure is not None:
         _draw(found.data, drawn, figure)
+
+
+def _numbers(data: xr.Dataset) -> xr.Dataset:
+    """The variables with one number for each output and run."""
+    return data[[name for name, item in data.items() if item.ndim == 2]]
 
 
 def _drawn(series: list[Series], figure: Path | None, run: str | None) -> list[Series]:
@@ -170,10 +174,9 @@ def predict(
         jobs=chosen.jobs,
     )
     if as_json:
-        numbers = found.data[[name for name, v in found.data.items() if v.ndim == 2]]
-        shell.print_json(tables.plain(numbers.drop_vars(schema.TIME).to_dict()))
+        shell.print_json(_numbers(found.data).drop_vars(schema.TIME).to_dict())
     else:
-        shell.console().print(str(found), markup=False, soft_wrap=True)
+        shell.say(found)
     if figure is not None:
         for output in found.data[schema.OUTPUT].values:
             path = figure.with_stem(f"{figure.stem}-{output}")
@@ -211,10 +214,7 @@ def replicate(
       bayesoleo replicate shaker --model f16n2d2 --runs d -n 1000 --out scatter
       bayesoleo replicate shaker --model f16n2d2 --out scatter --scheduler tcp://10.0.0.1:8786
     """
-    import xarray as xr
-
     from bayesoleo import _workflow as workflow
-    from bayesoleo._storage.result_files import provenance, write_tree
     from bayesoleo._workflow.model_files import load_model
     from bayesoleo.discovery._fit import fit_model
     from bayesoleo.errors import CampaignError
@@ -243,10 +243,9 @@ def replicate(
             scheduler=chosen.scheduler,
             progress=shell.progress_shown(quiet),
         )
-    console = shell.console()
-    console.print(str(found), markup=False, soft_wrap=True)
+    shell.say(found)
     if out is not None:
-        tree = xr.DataTree.from_dict({schema.SAMPLING_DISTRIBUTION: found.data})
-        tree.attrs.update(provenance(chosen.seed, command=chosen.command, model=fit.model.name))
-        write_tree(tree, out / REPLICATIONS)
-        console.print(f"result    {out / REPLICATIONS}", markup=False, soft_wrap=True)
+        groups = {schema.SAMPLING_DISTRIBUTION: found.data}
+        about = {schema.COMMAND: chosen.command, schema.MODEL: fit.model.name}
+        shell.write_groups(groups, out / REPLICATIONS, chosen.seed, **about)
+        shell.say(f"result    {out / REPLICATIONS}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bayesoleo import _schema as schema
-from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._cli import options, shell
 from bayesoleo._workflow.settings import Settings, words
 from bayesoleo.errors import InputError, UnfinishedError
 
@@ -94,7 +94,7 @@ def propose(
             raise InputError("there is no run to draw", key="--figure", value=figure)
         plots.proposal(tree).savefig(figure, dpi=150)
     if as_json:
-        shell.print_json(tables.plain({"proposals": entries}))
+        shell.print_json({"proposals": entries})
     else:
         _print_proposals(entries, summary.get("titles", {}))
 
@@ -111,7 +111,7 @@ def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -
         content = proposal_table(entry, titles)
         if content is not None:
             console.print()
-            console.print(tables.table(content.head, content.rows, content.words))
+            console.print(shell.table(content.head, content.rows, content.words))
 
 
 def _limit(text: str) -> tuple[str, tuple[float, float]]:
@@ -302,12 +302,12 @@ def check(
 
     plan = workflow.check(campaign, load_model(model), chosen)
     if as_json:
-        shell.print_json(tables.plain(plan))
+        shell.print_json(plan)
         return
     console = shell.console()
     sentences = plan.pop("data_warnings")
     plan.pop("start")
-    tables.print_mapping(plan, console)
+    shell.print_mapping(plan, console)
     for sentence in sentences:
         console.print(sentence, style="dim", markup=False, soft_wrap=True)
 

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._cli import options, shell
 
 PANEL = "What is built in"
 #: How parts of LaTeX read in a terminal; longer ones first, since some begin alike.
@@ -85,20 +85,20 @@ def systems(
     if name is not None:
         one = facts(name)
         if as_json:
-            shell.print_json(tables.plain(one))
+            shell.print_json(one)
         else:
             _print_system(one, shell.console())
         return
     # By the name it is asked for, which need not be the one it has in reports.
     found = {text: facts(text) for text in names()}
     if as_json:
-        shell.print_json(tables.plain(found))
+        shell.print_json(found)
         return
     rows = [
         [text, ", ".join(item["inputs"]) or "–", ", ".join(item["outputs"]), item["description"]]
         for text, item in found.items()
     ]
-    shell.console().print(tables.table(["system", "inputs", "outputs", "what it is"], rows, 4))
+    shell.console().print(shell.table(["system", "inputs", "outputs", "what it is"], rows, 4))
 
 
 def _print_system(item: Mapping[str, Any], console: Console) -> None:
@@ -132,7 +132,7 @@ def _print_system(item: Mapping[str, Any], console: Console) -> None:
 
 def _left(head: list[str], rows: list[list[Any]], numbers: set[int]) -> Any:
     """A table with words in every column but those."""
-    made = tables.table(head, rows, words=len(head))
+    made = shell.table(head, rows, words=len(head))
     for column in numbers:
         made.columns[column].justify = "right"
     return made
@@ -178,19 +178,19 @@ def effects(
     if identifier is not None:
         one = describe(find_effect(identifier))
         if as_json:
-            shell.print_json(tables.plain(one))
+            shell.print_json(one)
         else:
             _print_effect(one, shell.console())
         return
     found = [describe(effect) for effect in catalogue()]
     if as_json:
-        shell.print_json(tables.plain(found))
+        shell.print_json(found)
         return
     rows = [
         [item["id"], item["family"], readable(item["formula"]), _units(item["parameters"])]
         for item in found
     ]
-    shell.console().print(tables.table(["effect", "family", "formula", "amplitude in"], rows, 4))
+    shell.console().print(shell.table(["effect", "family", "formula", "amplitude in"], rows, 4))
 
 
 def _units(parameters: Mapping[str, Any]) -> str:
@@ -221,7 +221,7 @@ def _print_effect(item: Mapping[str, Any], console: Console) -> None:
         for name, entry in item["parameters"].items()
     ]
     head = ["parameter", "unit", "kind", "sign", "null or scan", "what it is"]
-    console.print(tables.table(head, rows, 6))
+    console.print(shell.table(head, rows, 6))
 
 
 def readable(latex: str) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bayesoleo import _schema as schema
-from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._cli import options, shell
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.errors import InputError
 
@@ -69,7 +69,7 @@ def reduce(
         units = found.campaign.units
         facts = {"campaign": found.campaign.name, "units": units, "runs": _runs(found)}
         facts["data_warnings"] = data_warnings(found.records, units)
-        shell.print_json(tables.plain(facts))
+        shell.print_json(facts)
     else:
         _print_records(found, shell.console())
         told = frequency_warnings(found.records)
@@ -125,11 +125,11 @@ def _print_records(reduced: ReducedCampaign, console: Console) -> None:
         ]
         for run in runs
     ]
-    console.print(tables.table(head, cells, words=2))
+    console.print(shell.table(head, cells, words=2))
     head, cells = _channels(reduced, runs)
     console.print()
     console.print("noise of a single sample; in brackets, harmonics above it", style="bold")
-    console.print(tables.table(head, cells, words=1))
+    console.print(shell.table(head, cells, words=1))
 
 
 def _channels(
@@ -157,20 +157,15 @@ def _three_digits(value: float) -> str:
 
 
 def _write_records(reduced: ReducedCampaign, out: Path) -> None:
-    import xarray as xr
-
-    from bayesoleo._storage.result_files import provenance, write_tree
     from bayesoleo.discovery._result_tree import records_tree
 
     campaign = reduced.campaign
-    tree = xr.DataTree.from_dict(records_tree(list(reduced.records), campaign))
     about = {
         schema.CAMPAIGN: campaign.name,
         schema.CAMPAIGN_DESCRIPTION: campaign.description,
         schema.CAMPAIGN_SHA256: campaign.sha256,
     }
-    tree.attrs.update(provenance(None, **about))
-    write_tree(tree, out)
+    shell.write_groups(records_tree(list(reduced.records), campaign), out, None, **about)
 
 
 RESULTS_PANEL = "From results and models"
@@ -214,7 +209,7 @@ def report(
     shell.check_writable(page.parent)
     page.parent.mkdir(parents=True, exist_ok=True)
     write_report(tree, page)
-    shell.console().print(f"report    {page}", markup=False, soft_wrap=True)
+    shell.say(f"report    {page}")
 
 
 @options.of_settings("seed", "jobs", *options.SOLVED)
@@ -300,7 +295,7 @@ def simulate(
     folder = workflow.simulate(
         made_from, like, chosen, out=out, values=changed, draws=draws, **more
     )
-    shell.console().print(f"campaign  {folder}", markup=False, soft_wrap=True)
+    shell.say(f"campaign  {folder}")
 
 
 def pairs(texts: list[str], option: str) -> dict[str, float]:

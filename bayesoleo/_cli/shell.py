@@ -271,6 +271,11 @@ def console() -> Console:
     return Console(width=wide, highlight=False, soft_wrap=False)
 
 
+def say(text: object) -> None:
+    """Print a text as it is."""
+    console().print(str(text), markup=False, soft_wrap=True)
+
+
 def progress_shown(quiet: bool) -> bool:
     """Whether progress bars make sense: somebody looks at them."""
     return not quiet and sys.stderr.isatty()
@@ -368,8 +373,29 @@ def check_writable(folder: Path) -> Path:
     return check_writable(folder)
 
 
+def write_groups(groups: Mapping[str, Any], path: Path, seed: int | None, **about: str) -> None:
+    """Write Datasets by name as one tree with its provenance.
+
+    Parameters
+    ----------
+    groups : mapping of str to Dataset
+    path : Path
+        The file.
+    seed : int or None
+    **about : str
+        Further attributes of the tree.
+    """
+    import xarray as xr
+
+    from bayesoleo._storage.result_files import provenance, write_tree
+
+    tree = xr.DataTree.from_dict(dict(groups))
+    tree.attrs.update(provenance(seed, **about))
+    write_tree(tree, path)
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON, for programs."""
     import json
 
-    typer.echo(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False))
+    typer.echo(json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False))

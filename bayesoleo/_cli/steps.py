@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from bayesoleo import _schema as schema
-from bayesoleo._cli import options, shell, shell as tables
+from bayesoleo._cli import options, shell
 from bayesoleo._cli.records import RECORDS_PANEL
 from bayesoleo._workflow.settings import Settings
 
@@ -38,10 +38,7 @@ def estimate_each(
     campaign: Path, model: Model, chosen: Settings, out: Path | None, quiet: bool, as_json: bool
 ) -> None:
     """Estimate, print, and write ``each.nc`` where a folder is given."""
-    import xarray as xr
-
     from bayesoleo import _workflow as workflow
-    from bayesoleo._storage.result_files import provenance, write_tree
     from bayesoleo.errors import InputError
     from bayesoleo.estimation._between_runs import between_runs
 
@@ -53,21 +50,20 @@ def estimate_each(
         reason = str(error)
     if out is not None:
         groups = {"each": found} | ({} if view is None else {"between_runs": view.to_dataset()})
-        tree = xr.DataTree.from_dict(groups)
-        tree.attrs.update(provenance(None, command=chosen.command, model=model.name))
-        write_tree(tree, out / FILE)
+        about = {schema.COMMAND: chosen.command, schema.MODEL: model.name}
+        shell.write_groups(groups, out / FILE, None, **about)
     if as_json:
         facts = {"each": found.to_dict()}
         facts |= {} if view is None else {"between_runs": view.to_dataset().to_dict()}
-        shell.print_json(tables.plain(facts))
+        shell.print_json(facts)
         return
     console = shell.console()
-    console.print(tables.table(*_rows(found)))
+    console.print(shell.table(*_rows(found)))
     console.print()
     said = f"runs not compared: {reason}" if view is None else str(view)
     console.print(said, markup=False, highlight=False, soft_wrap=True)
     if out is not None:
-        console.print(f"result    {out / FILE}", markup=False, soft_wrap=True)
+        shell.say(f"result    {out / FILE}")
 
 
 def _rows(found: xr.Dataset) -> tuple[list[str], list[list[str]]]:
@@ -138,15 +134,15 @@ def estimate(
     if as_json:
         facts = {"parameters": _point(tree), "status": _status(tree)}
         facts |= {"error_model": quantities} if quantities else {}
-        shell.print_json(tables.plain(facts))
+        shell.print_json(facts)
         return
     console = shell.console()
     names = ("unit", "start", "mbe", "estimate", "sd")
     rows = [[name, *(row[key] for key in names)] for name, row in _point(tree).items()]
-    console.print(tables.table(["parameter", *names], rows, words=2))
+    console.print(shell.table(["parameter", *names], rows, words=2))
     if quantities:
         rows = [[name, row["estimate"], row["sd"]] for name, row in quantities.items()]
-        console.print(tables.table(["of the errors and runs", "mode", "sd"], rows, words=1))
+        console.print(shell.table(["of the errors and runs", "mode", "sd"], rows, words=1))
     for line in _how_it_went(_status(tree)):
         console.print(line, style="dim", markup=False, highlight=False)
     _print_written(out, console)
@@ -240,7 +236,7 @@ def sample(
         )
     console = shell.console()
     summary = Posterior(tree).summary()
-    console.print(str(summary), markup=False, soft_wrap=True)
+    shell.say(summary)
     if summary.data.attrs["warning"]:
         shell.complain(f"warning: {summary.data.attrs['warning']}")
     _print_written(folder, console)
@@ -285,7 +281,7 @@ def trace(
     first = summary["rounds"][0]
     if first["candidates"]:
         ranking = candidates(first, summary.get("titles"))
-        console.print(tables.table(ranking.head, ranking.rows[:SHOWN], words=ranking.words))
+        console.print(shell.table(ranking.head, ranking.rows[:SHOWN], words=ranking.words))
         if len(ranking.rows) > SHOWN:
             console.print(f"and {len(ranking.rows) - SHOWN} more", style="dim")
     print_summary({**summary, "files": {}}, console)
@@ -296,4 +292,4 @@ def _print_written(out: Path | None, console: Console) -> None:
     """Say where the result is."""
     if out is not None and (out / shell.RESULTS).exists():
         console.print()
-        console.print(f"result    {out / shell.RESULTS}", markup=False, soft_wrap=True)
+        shell.say(f"result    {out / shell.RESULTS}")
