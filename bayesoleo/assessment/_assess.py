@@ -38,6 +38,33 @@ ACROSS = {
 }
 _TINY = np.finfo(float).tiny
 
+#: Outliers listed of each series, the farthest.
+LISTED = 5
+#: Lags of a correlogram over one period, and periods that it spans.
+LAGS, CYCLES = 40, 2
+#: A test is marked where its probability, times the number of series, is below this.
+MARKED = 0.01
+_MOST_ROUNDS = 20
+_NUMBERS = {
+    "rms": "root mean square",
+    "mean": "mean",
+    "runs_z": "test on runs of signs",
+    "runs_p": "its probability",
+    "skewness": "skewness",
+    "kurtosis": "excess kurtosis",
+    "normality": "test of normality, chi-square with two degrees of freedom",
+    "normality_p": "its probability",
+    "autocorrelation_time": "samples that hold the information of one, of what does not repeat",
+    "intraclass_correlation": "correlation of the same phase in different periods",
+    "lack_of_fit": "mean square that repeats over that of its noise",
+    "lack_of_fit_p": "its probability",
+    "ratio_to_noise": "root of the lack of fit",
+    "ratio_to_expected": "repeating error over what noise and the parameters' posterior let expect",
+    "outliers": "number of outliers",
+    "outlier_limit": "robust standard deviations beyond which a sample is one",
+}
+_IN_UNIT = ("rms", "mean")
+
 
 def between_means(chosen: Sequence[Series]) -> dict[str, float]:
     """Shares of the variance that differ between runs and groups, with their probabilities.
@@ -99,35 +126,6 @@ def _groups_differ(means: Array, members: Sequence[Array]) -> tuple[float, float
     between, free = len(members) - 1, means.size - len(members)
     ratio = (total - inside) / between / max(inside / free, _TINY)
     return 1 - inside / max(total, _TINY), float(stats.f.sf(ratio, between, free))
-
-
-#: Outliers listed of each series, the farthest.
-LISTED = 5
-#: Lags of a correlogram over one period, and periods that it spans.
-LAGS, CYCLES = 40, 2
-#: A test is marked where its probability, times the number of series, is below this.
-MARKED = 0.01
-_MOST_ROUNDS = 20
-
-_NUMBERS = {
-    "rms": "root mean square",
-    "mean": "mean",
-    "runs_z": "test on runs of signs",
-    "runs_p": "its probability",
-    "skewness": "skewness",
-    "kurtosis": "excess kurtosis",
-    "normality": "test of normality, chi-square with two degrees of freedom",
-    "normality_p": "its probability",
-    "autocorrelation_time": "samples that hold the information of one, of what does not repeat",
-    "intraclass_correlation": "correlation of the same phase in different periods",
-    "lack_of_fit": "mean square that repeats over that of its noise",
-    "lack_of_fit_p": "its probability",
-    "ratio_to_noise": "root of the lack of fit",
-    "ratio_to_expected": "repeating error over what noise and the parameters' posterior let expect",
-    "outliers": "number of outliers",
-    "outlier_limit": "robust standard deviations beyond which a sample is one",
-}
-_IN_UNIT = ("rms", "mean")
 
 
 def assess(

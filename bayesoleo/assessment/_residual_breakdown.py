@@ -34,6 +34,13 @@ _JUDGED = (
     schema.CHANCE,
 )
 
+#: Harmonics told one by one; what lies above counts together, under the order after the last.
+ORDERS = 12
+#: Bins of a coordinate, each with as many points.
+BINS = 24
+#: Coordinates that a run's mean is, and the mean of all runs of a group.
+RUN, GROUP, SIGN = "run", "group", "direction"
+
 
 @dataclass(frozen=True)
 class Series:
@@ -303,14 +310,6 @@ def _of_tree(one: Mapping[str, xr.Dataset], run: str, output: str, stage: str) -
     # The stored noise holds that of the inputs already.
     more = max(float(residual[name]) ** 2 - average.noise**2, 0.0)
     return replace(series, input_noise=float(np.sqrt(more)))
-
-
-#: Harmonics told one by one; what lies above counts together, under the order after the last.
-ORDERS = 12
-#: Bins of a coordinate, each with as many points.
-BINS = 24
-#: Coordinates that a run's mean is, and the mean of all runs of a group.
-RUN, GROUP, SIGN = "run", "group", "direction"
 
 
 def residual_breakdown(tree: xr.DataTree) -> xr.Dataset:

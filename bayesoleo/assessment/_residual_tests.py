@@ -23,6 +23,9 @@ from bayesoleo._types import Array, Float
 from bayesoleo.data._fourier import lagged_products
 from bayesoleo.errors import InputError
 
+#: Bins of a variable at most.
+BINS = 24
+
 
 @dataclass(frozen=True)
 class PredictiveScore:
@@ -143,8 +146,6 @@ class ResidualTest:
     p_value: float
 
 
-#: Bins of a variable at most.
-BINS = 24
 NOTHING = ResidualTest(float("nan"), float("nan"))
 
 

@@ -28,6 +28,13 @@ from bayesoleo.data._registry import dataset_folder
 from bayesoleo.data._sample_quality import Stretches, bridged, impossible_sample, masked
 from bayesoleo.errors import CampaignError
 
+# Names of a time column in seconds that need not be declared.
+_TIME_COLUMNS = tuple(
+    word + unit
+    for word in ("time", "Time", "TIME", "t")
+    for unit in ("", "_s", " s", " [s]", "[s]", " (s)", "(s)", "/s")
+)
+
 
 def uniform_time(time: Array, column: str, before: int = 0) -> Array:
     """Replace written time stamps by the equidistant times they were rounded from.
@@ -155,14 +162,6 @@ def window(time: Array, start: float | None, stop: float | None) -> slice:
             hint=f"the file runs from {np.nanmin(time):.6g} to {np.nanmax(time):.6g} s",
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
-
-
-# Names of a time column in seconds that need not be declared.
-_TIME_COLUMNS = tuple(
-    word + unit
-    for word in ("time", "Time", "TIME", "t")
-    for unit in ("", "_s", " s", " [s]", "[s]", " (s)", "(s)", "/s")
-)
 
 
 @dataclass(frozen=True)

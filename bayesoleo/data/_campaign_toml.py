@@ -24,6 +24,21 @@ from bayesoleo.errors import CampaignError
 
 FILE = "campaign.toml"
 
+_PARTS = ("low", "high", "unit")
+_EXAMPLE = 'write { low = 1, high = 50, unit = "mm" }, or one of low and high'
+#: Sizes of a change: the zero of their unit is zero.
+_CHANGES = ("amplitude", "rate")
+KINDS = ("periodic", "transient")
+ROLES = ("fit", "hold-out")
+_RUN = (
+    *("label", "file", "kind", "frequency", "group", "role", "time", "sample_rate"),
+    *("start", "stop", "mask", "delimiter", "header_delimiter", "conditions"),
+)
+_CONDITION = ("value", "unit", "sd")
+FORMAT = 1
+_TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
+_CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
+
 
 def choose(wrong: str, allowed: Sequence[str] | Mapping[str, Any]) -> str:
     """What to write instead of ``wrong``: the closest of ``allowed``, or all of them."""
@@ -112,12 +127,6 @@ def get_unit(name: str, text: str, key: str, run: str | None = None) -> Unit:
     return unit
 
 
-_PARTS = ("low", "high", "unit")
-_EXAMPLE = 'write { low = 1, high = 50, unit = "mm" }, or one of low and high'
-#: Sizes of a change: the zero of their unit is zero.
-_CHANGES = ("amplitude", "rate")
-
-
 def read_rig(table: Any, file: str) -> dict[str, tuple[float, float]]:
     """Limits by name, SI; infinite where one is left out.
 
@@ -187,16 +196,6 @@ def to_limit(
     shift = 0.0 if name in _CHANGES else read.shift
     a = -math.inf if low is None else low * read.factor + shift
     return a, math.inf if high is None else high * read.factor + shift
-
-
-KINDS = ("periodic", "transient")
-ROLES = ("fit", "hold-out")
-
-_RUN = (
-    *("label", "file", "kind", "frequency", "group", "role", "time", "sample_rate"),
-    *("start", "stop", "mask", "delimiter", "header_delimiter", "conditions"),
-)
-_CONDITION = ("value", "unit", "sd")
 
 
 @dataclass(frozen=True)
@@ -349,12 +348,6 @@ def _conditions(table: Mapping[str, Any], label: str) -> dict[str, dict[str, Any
         if sd is not None:
             sds[name] = sd * unit.factor
     return {"conditions": values, "condition_units": units, "condition_sd": sds}
-
-
-FORMAT = 1
-
-_TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
-_CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,18 @@ FALSE_ALARM = 1e-3
 LEAST_CHANGE = 0.2
 _BINS = 24
 
+#: A harmonic belongs to the motion if it exceeds both limits: a part of the total power, and a
+#: ratio to the power of the noise (twice its variance), which noise exceeds with probability 2e-9.
+STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
+#: A longer period is that of the motion if it leaves at most the part ``LEFT`` of the variance that
+#: does not repeat in the declared period; noise would leave all of it. The non-repeating part must
+#: also exceed the part ``LEAST`` of the channel's deviation: it is half of the motion where the
+#: declared frequency is double, but a per cent for an unsettled start and zero for the rounding of
+#: samples without noise.
+LEFT, LEAST = 0.25, 0.05
+#: Multiples of the declared period that are tried.
+LONGER = (2, 3)
+
 
 @dataclass(frozen=True)
 class Drift:
@@ -149,19 +161,6 @@ def _coloured_sd(weights: Array, noise: Array) -> float:
     if samples % 2 == 0:
         double[-1] = 1.0
     return float(np.sqrt(np.sum(double * transfer * smooth / np.maximum(used, 1.0)) / samples))
-
-
-#: A harmonic belongs to the motion if it exceeds both limits: a part of the total power, and a
-#: ratio to the power of the noise (twice its variance), which noise exceeds with probability 2e-9.
-STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
-#: A longer period is that of the motion if it leaves at most the part ``LEFT`` of the variance that
-#: does not repeat in the declared period; noise would leave all of it. The non-repeating part must
-#: also exceed the part ``LEAST`` of the channel's deviation: it is half of the motion where the
-#: declared frequency is double, but a per cent for an unsettled start and zero for the rounding of
-#: samples without noise.
-LEFT, LEAST = 0.25, 0.05
-#: Multiples of the declared period that are tried.
-LONGER = (2, 3)
 
 
 def motions_per_period(record: Record) -> int:

@@ -27,6 +27,8 @@ _NAMED = {"whitespace": WHITESPACE, " ": WHITESPACE, "tab": "\t", "comma": ",", 
 _SNIFFED = (",", ";", "\t", "|", WHITESPACE)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
 
+_SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
+
 
 def read_text(
     path: Path,
@@ -265,9 +267,6 @@ def _check_filled(path: Path, columns: dict[str, Array], separator: str) -> None
                 key="delimiter",
                 hint="set the delimiter of this run, or leave that column out",
             )
-
-
-_SPREADSHEETS = (".xlsx", ".xlsm", ".xls", ".ods")
 
 
 def read_columns(

@@ -38,6 +38,16 @@ NOISE_BINS = 48
 #: A floor of the harmonics this many times above what the periods scatter by repeats.
 REPEATING = 4.0
 
+#: Probability of naming a line in any channel of a run that has none.
+FALSE_ALARM = 1e-3
+#: Least amplitude, in standard deviations of a single sample, that is reported.
+LEAST_AMPLITUDE = 0.2
+#: And in ranges of the channel: what no converter resolves is rounding of a signal without noise.
+LEAST_SHARE = 2.0**-24
+#: Lines on either side from whose median the level of the noise is taken, and periods over the
+#: record below which a line may be drift.
+_BESIDE, _FEWEST = 50, 3
+
 
 def significant_harmonics(
     basis: HarmonicBasis,
@@ -191,17 +201,6 @@ def _cumulative_between(power: Array, periods: float) -> tuple[Array, Array]:
     total = np.concatenate([[0.0], np.cumsum(np.where(off, power, 0.0))])
     used = np.concatenate([[0.0], np.cumsum(off.astype(float))])
     return total, used
-
-
-#: Probability of naming a line in any channel of a run that has none.
-FALSE_ALARM = 1e-3
-#: Least amplitude, in standard deviations of a single sample, that is worth a word.
-LEAST_AMPLITUDE = 0.2
-#: And in ranges of the channel: what no converter resolves is rounding of a signal without noise.
-LEAST_SHARE = 2.0**-24
-#: Lines on either side from whose median the level of the noise is taken, and periods over the
-#: record below which a line may be drift.
-_BESIDE, _FEWEST = 50, 3
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,15 @@ from bayesoleo.errors import InputError
 #: sensible sampling.
 HIGHEST_DIFFERENCE = 8
 
+#: Averages of a run, and samples in one at least.
+MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
+#: Lines that are averaged lie within this many periods' worth of lines, or this part of the
+#: frequency, whichever is wider: one harmonic on either side where noise may be steep.
+HARMONICS, PART = 1.0, 0.25
+#: The same for the mean. Slow noise is largest there and decreases on either side, so that lines of
+#: a whole harmonic would give half of it; elsewhere steep noise is rather overestimated.
+AT_MEAN = 0.5
+
 
 def innovation_noise(values: Array) -> float:
     """Standard deviation of white noise on a smooth signal (variate differences, Tintner 1940).
@@ -95,7 +104,7 @@ class PeriodicAverage:
 
     @property
     def ratio(self) -> float:
-        """``repeating / noise``: about one where nothing repeats but noise."""
+        """``repeating / noise``: about one where only noise repeats."""
         return self.repeating / self.noise
 
     def on_phase(self, points: int) -> Array:
@@ -198,10 +207,6 @@ def check_length(samples: int, step: float) -> None:
         )
 
 
-#: Averages of a run, and samples in one at least.
-MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
-
-
 @dataclass(frozen=True)
 class LocalAverage:
     """Averages over blocks of neighbouring samples, in the terms of a periodic average.
@@ -229,7 +234,7 @@ class LocalAverage:
 
     @property
     def ratio(self) -> float:
-        """``repeating / noise``: about one where nothing is left but noise."""
+        """``repeating / noise``: about one where only noise remains."""
         return self.repeating / self.noise
 
     @property
@@ -297,14 +302,6 @@ def _blocks(samples: int) -> NDArray[np.int64]:
     size = max(FEWEST_SAMPLES, samples // MOST_AVERAGES)
     number = max(samples // size, 1)
     return np.minimum(np.arange(samples) // size, number - 1)
-
-
-#: Lines that are averaged lie within this many periods' worth of lines, or this part of the
-#: frequency, whichever is wider: one harmonic on either side where noise may be steep.
-HARMONICS, PART = 1.0, 0.25
-#: The same of the mean. Slow noise is largest there and falls on either side alike, so that lines
-#: of a whole harmonic would say half of it; elsewhere what is steep is rather said too large.
-AT_MEAN = 0.5
 
 
 @dataclass(frozen=True)

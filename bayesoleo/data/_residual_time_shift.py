@@ -37,6 +37,10 @@ LEAST_CORRELATION = 0.5
 #: of order k sees is k times narrower.
 LADDER = (3, 12, 48, np.inf)
 
+#: Part of a period to either side of it that the zoom shows, and shifts at most in a curve.
+ZOOM, MOST_SHIFTS = 0.01, 4000
+_FEWEST = 5
+
 
 @dataclass(frozen=True)
 class Frequency:
@@ -322,11 +326,6 @@ def _coloured_power(slope: Array, residual: Array, share: float, bins: int = 24)
         double[-1] = 1.0
     # Bins on harmonics are empty in the residual; the smoothed spectrum is lower by their share.
     return cast(Array, np.sum(double * transfer * smooth, axis=1) / samples / (1.0 - share))
-
-
-#: Part of a period to either side of it that the zoom shows, and shifts at most in a curve.
-ZOOM, MOST_SHIFTS = 0.01, 4000
-_FEWEST = 5
 
 
 @dataclass(frozen=True)

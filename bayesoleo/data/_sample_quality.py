@@ -38,6 +38,32 @@ LARGEST = 1e100
 #: Part of the samples that may stand alone.
 FEW = 0.005
 
+Stretches = tuple[tuple[float, float], ...]
+#: Smallest part of a record that must remain.
+LEAST_PART = 0.5
+# Each iteration reduces the error of the bridged samples by the number of periods, two at least.
+_ITERATIONS = 40
+#: Chance of dropping the first period of a settled channel whose noise is stationary.
+FALSE_ALARM = 1e-4
+#: Least excess of a first period's mean square over the noise's. Less than this, 0.7 standard
+#: deviations of the noise, costs less than the period is worth.
+LEAST_EXCESS = 0.5
+#: A step is reported if it is larger than this times the noise of a sample: below, rounding adds at
+#: most a sixth of that noise's variance.
+COARSE = 1.4
+#: A grid has at least so many values, and all but a few samples lie on it to this part of a step.
+_VALUES, _ON, _MOST_OFF = 6, 0.02, 0.01
+#: A record is cut off where so many samples in a row have its extreme value, so many times as many
+#: in all as have any other within a tenth of the range of it: of a sinusoid that is rounded, at
+#: most 2.4 times as many samples have the extreme value as the next.
+_IN_A_ROW, _TIMES = 4, 5.0
+#: A signal that jumps to its extreme value by more than this part of its range, and by so many
+#: times what it changed by just before, is switched there and not cut off: steps, random binary
+#: signals.
+_JUMP, _SWITCHED = 0.1, 3.0
+#: Phases at which the rate of a signal is evaluated.
+_PHASES = 512
+
 
 def impossible_sample(values: Array) -> tuple[int | None, str]:
     """The first sample that stands far beyond all but a few.
@@ -66,14 +92,6 @@ def impossible_sample(values: Array) -> tuple[int | None, str]:
         return None, ""
     last = alone[-1]
     return int(np.flatnonzero(away >= largest[last])[0]), f"{steps[last]:.2g} times"
-
-
-Stretches = tuple[tuple[float, float], ...]
-
-#: Part of a record that has to be left.
-LEAST_PART = 0.5
-# Each iteration brings what is bridged nearer by the number of periods, two at least.
-_ITERATIONS = 40
 
 
 def read_stretches(value: Any, run: str, file: str) -> Stretches:
@@ -165,14 +183,6 @@ def bridged(values: Array, inside: NDArray[np.bool_], step: float | None = None)
     for _ in range(_ITERATIONS):
         filled[:, inside] = basis.fit(filled)[:, inside]
     return filled
-
-
-#: Chance of dropping the first period of a settled channel whose noise is stationary.
-FALSE_ALARM = 1e-4
-
-#: Least excess of a first period's mean square over the noise's. Less than this, 0.7 standard
-#: deviations of the noise, costs less than the period is worth.
-LEAST_EXCESS = 0.5
 
 
 def whole_periods(samples: int, step: float) -> int:
@@ -273,23 +283,6 @@ def _samples_per_degree(rest: Array) -> float:
     # Chance correlations of white noise have variance 1/N; without them white noise keeps all its
     # samples.
     return 1.0 + 2.0 * float(np.sum(np.maximum(correlation**2 - 4.0 / rest.size, 0.0)))
-
-
-#: A step is worth a word if it is larger than this times the noise of a sample: below, rounding is
-#: a sixth of that noise's variance at most.
-COARSE = 1.4
-#: A grid has at least so many values, and all but a few samples lie on it to this part of a step.
-_VALUES, _ON, _MOST_OFF = 6, 0.02, 0.01
-#: A record is cut off where so many samples in a row have its extreme value, so many times as many
-#: in all as have any other within a tenth of the range of it: of a sinusoid that is rounded, at
-#: most 2.4 times as many samples have the extreme value as the next.
-_IN_A_ROW, _TIMES = 4, 5.0
-#: A signal that jumps to its extreme value by more than this part of its range, and by so many
-#: times what it changed by just before, is switched there and not cut off: steps, random binary
-#: signals.
-_JUMP, _SWITCHED = 0.1, 3.0
-#: Phases at which the rate of a signal is looked at.
-_PHASES = 512
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,9 @@ FEWEST_PERIODS_TO_SPLIT = 4
 #: What is added to the label of half a run.
 FIRST_HALF, SECOND_HALF = "first half", "second half"
 
+#: Added effects by name: (effect, target).
+Added = tuple[str, str]
+
 
 @dataclass(frozen=True)
 class RecordNoise:
@@ -166,10 +169,6 @@ def _part(record: Record, samples: slice, periods: int, name: str, role: str) ->
         kept=None if record.kept is None else record.kept[samples],
         harmonics=harmonics,
     )
-
-
-#: Added effects by name: (effect, target).
-Added = tuple[str, str]
 
 
 @dataclass(frozen=True)

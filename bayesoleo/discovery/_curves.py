@@ -38,6 +38,11 @@ from bayesoleo.solvers._orbit import Status
 #: Eigenvalues of unit diagonal matrices below this are round-off.
 ROUND_OFF = 1e-10
 
+#: Points at which a function of one quantity is shown, and of each of two.
+POINTS, POINTS_OF_TWO = 201, 31
+#: How one quantity is laid out beside another.
+POINT, QUANTITY = "point", "quantity"
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -223,12 +228,6 @@ def _along(motions: Motions, prediction: Prediction, k: int) -> Array:
     """A quantity along a held-out run."""
     constants = prediction.predictor.constants(prediction.vector[None], 0)[0]
     return motions.along(prediction.predictor.runs[0], constants, k, prediction.record.position)
-
-
-#: Points at which a function of one quantity is shown, and of each of two.
-POINTS, POINTS_OF_TWO = 201, 31
-#: How one quantity is laid out beside another.
-POINT, QUANTITY = "point", "quantity"
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import input_columns
 
+Noise = Mapping[tuple[str, str], RecordNoise]
+
 
 @dataclass(frozen=True)
 class RunError:
@@ -51,7 +53,7 @@ class RunError:
     Parameters
     ----------
     run, role, output : str
-        Where.
+        Run, its role, and output.
     rms : float
         Root mean square over the raw samples, SI.
     average : PeriodicAverage or LocalAverage
@@ -59,21 +61,20 @@ class RunError:
     input_noise : float
         Part of the noise that comes from the input, SI.
     spectrum : NoiseSpectrum or None
-        Of the noise that does not repeat; ``None`` for a transient.
+        Spectrum of the noise that does not repeat; ``None`` for a transient.
     rounding : float
         Part of the noise that comes from rounding to coarse steps and repeats in every period, SI.
     input_scale : float
-        Part of the noise that the input's records claim which the residual bears out, as a factor.
+        Factor by which the residual limits the propagated noise of the input.
     expected_error : float, optional
-        What noise and the unknowns' posterior let ``repeating`` be, SI; by default the noise.
+        Expected ``repeating`` by noise and the unknowns' posterior, SI; by default the noise.
     parameters : ndarray, shape (l, l)
-        What independent unit errors of the unknowns add to the squared ratio to the expected error:
-        a quadratic form. Empty for a run that was fitted.
+        Quadratic form: the squared ratio to the expected error that independent unit errors of the
+        unknowns add. Empty for a fitted run.
     own_share : float
         Part of the squared expected error that is noise.
     own_coefficients : float, optional
-        Equally noisy coefficients that this part scatters like; by default those of the output's
-        own noise.
+        Effective number of coefficients of this part; by default that of the output's own noise.
     """
 
     run: str
@@ -103,18 +104,18 @@ class RunError:
 
     @property
     def sigma(self) -> float:
-        """Noise of a single sample, with what repeats as large as many periods would average it."""
+        """Noise of a single sample, including repeated rounding as if averaged over the periods."""
         periods = self.average.samples / max(self.average.number, 1)
         return float(np.hypot(self.average.sigma, self.rounding * np.sqrt(periods)))
 
     @property
     def coefficients(self) -> float:
-        """Degrees of freedom of the averaged residual, were it noise."""
+        """Degrees of freedom of the averaged residual if it is noise."""
         return self.average.number if self.spectrum is None else self.spectrum.coefficients
 
     @property
     def free(self) -> float:
-        """Degrees of freedom that its noise was measured with."""
+        """Degrees of freedom of the measured noise."""
         if isinstance(self.average, LocalAverage):
             return self.average.free
         if self.spectrum is None:
@@ -123,21 +124,21 @@ class RunError:
 
     @property
     def ratio(self) -> float:
-        """``repeating / noise``: one where nothing is missing and every parameter is known."""
+        """``repeating / noise``: one where no effect is missing and every parameter is known."""
         return self.repeating / self.noise
 
     @property
     def expected(self) -> float:
-        """Root of the noise squared plus what the parameters' posterior does to this run, SI.
+        """Root of the squared noise plus the variance by the parameters' posterior, SI.
 
-        A run that was fitted has lent some of its noise to the estimates, and is expected to leave
-        a little less than its noise.
+        The estimates absorb some of the noise of a fitted run, whose expected error is therefore
+        slightly less than its noise.
         """
         return self.noise if self.expected_error is None else self.expected_error
 
     @property
     def ratio_to_expected(self) -> float:
-        """``repeating / expected``: one where nothing is missing."""
+        """``repeating / expected``: one where no effect is missing."""
         return self.repeating / self.expected
 
 
@@ -223,7 +224,7 @@ def error_table(
     jobs: int | None = None,
     policy: SearchPolicy = SearchPolicy(),
 ) -> ErrorTable:
-    """Compare predictions with what was measured.
+    """Compare predictions with measurements.
 
     Parameters
     ----------
@@ -257,15 +258,15 @@ def compared(
     prediction : Prediction
     roles : mapping of str to str
     measured : callable
-        The noise of an output in a run where it was measured before; it grows no more.
+        Earlier noise of an output in a run, which is an upper bound; None where there is none.
     policy : SearchPolicy
 
     Returns
     -------
     list of RunError
     ndarray, shape (ny, k, N)
-        Change of the outputs by one standard deviation of each input coefficient, as far as the
-        residual bears it out, SI.
+        Change of the outputs by one standard deviation of each input coefficient, limited by the
+        residual, SI.
     """
     record, predictor = prediction.record, prediction.predictor
     columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
@@ -276,7 +277,7 @@ def compared(
         before.append(measured(output, record.label))
         averages.append(_average(record, output, residual, before[-1], policy))
         spectra.append(_spectrum(record, residual, averages[-1]))
-        # Of a transient all samples: averages over neighbours show no fast noise, input's or not.
+        # All samples of a transient are used: averages over neighbours contain no fast noise.
         shown.append(averages[-1].values if record.periodic else residual)
     averaged = columns if record.periodic else local_means(columns)
     spread = np.sqrt(np.mean(np.sum(averaged**2, axis=1), axis=1))
@@ -300,8 +301,7 @@ def compared(
 
 
 def _factor(scale: float, spread: float, known: RecordNoise | None) -> float:
-    """Part of the input's noise that counts: no more than was measured before, whatever a changed
-    model would make of it."""
+    """Factor for the input's noise, limited to the noise that was found with earlier models."""
     if known is None or spread == 0:
         return scale
     return min(scale, known.input_noise / spread)
@@ -312,7 +312,7 @@ def _spectrum(
 ) -> NoiseSpectrum | None:
     if not record.periodic or not np.isfinite(residual).all():
         return None
-    # What was bridged does not scatter: as much as is missing has to be made up for.
+    # Bridged samples do not scatter, which the factor compensates.
     part = counted(record) / record.time.size
     return noise_spectrum((residual - average.values) / part, record.periods)
 
@@ -331,14 +331,11 @@ def _average(
     return of_those_counted(record, periodic_average(residual, step, record.frequency))
 
 
-Noise = Mapping[tuple[str, str], RecordNoise]
-
-
 def least_noise(one: Noise, other: Noise) -> dict[tuple[str, str], RecordNoise]:
-    """By run and output the smaller of two measurements.
+    """The smaller of two measurements of the noise, by run and output.
 
-    A residual is nowhere smaller than the noise in it, whichever model leaves it: the least that
-    was found is nearest. Where a run could not be solved nothing was measured.
+    A residual is not smaller than the noise in it, whatever the model, so that the smallest
+    measurement is the best. A run without a solution has no measurement.
     """
     found = {key: noise for key, noise in one.items() if _is_known(noise)}
     for key, noise in other.items():
@@ -356,7 +353,7 @@ def _is_known(noise: RecordNoise) -> bool:
 
 
 def with_same_noise(table: ErrorTable, noise: Noise) -> ErrorTable:
-    """Errors held against a noise that was found with another model."""
+    """The errors relative to a noise that was found with another model."""
     return ErrorTable(
         tuple(
             _with_noise(entry, noise[entry.run, entry.output])
@@ -379,7 +376,7 @@ def _with_noise(entry: RunError, noise: RecordNoise) -> RunError:
     quiet = replace(entry, average=average, input_noise=from_input, input_scale=scale)
     if entry.expected_error is None:
         return quiet
-    # What the parameters' posterior adds stays.
+    # The variance by the parameters' posterior is unchanged.
     square = entry.expected_error**2 - entry.noise**2 + quiet.noise**2
     square = max(square, entry.expected_error**2 * 1e-6)
     own = max(entry.own_share * entry.expected_error**2 - entry.noise**2 + quiet.noise**2, 0.0)
@@ -394,14 +391,14 @@ def _with_noise(entry: RunError, noise: RecordNoise) -> RunError:
 def limit(
     entries: Sequence[RunError], tests: int = 1, *, policy: SearchPolicy = SearchPolicy()
 ) -> float:
-    """Ratio to what is expected that chance hardly exceeds, at least the policy's ``floor_ratio``.
+    """Upper limit by chance of the ratio to the expected error, at least ``floor_ratio``.
 
     Parameters
     ----------
     entries : sequence of RunError
-        Over which the squared ratio is averaged.
+        Errors over which the squared ratio is averaged.
     tests : int
-        Ratios that are looked at together.
+        Number of ratios that are tested together.
     policy : SearchPolicy
     """
     level = policy.floor_false_alarm / tests
@@ -411,17 +408,17 @@ def limit(
 def lowest(
     entries: Sequence[RunError], tests: int = 1, *, policy: SearchPolicy = SearchPolicy()
 ) -> float:
-    """Ratio to what is expected that chance hardly falls below.
+    """Lower limit by chance of the ratio to the expected error.
 
-    The unknowns' errors may be nothing by chance, but noise is always there: the limit is that of
+    The unknowns' errors may be zero by chance, but noise is always present: the limit is that of
     the noise alone.
 
     Parameters
     ----------
     entries : sequence of RunError
-        Over which the squared ratio is averaged.
+        Errors over which the squared ratio is averaged.
     tests : int
-        Ratios that are looked at together.
+        Number of ratios that are tested together.
     policy : SearchPolicy
     """
     own = float(np.mean([entry.own_share for entry in entries]))
@@ -434,12 +431,12 @@ def lowest(
 
 
 def chance(entries: Sequence[RunError]) -> float:
-    """Probability that chance alone gives a squared ratio to what is expected as large.
+    """Probability by chance of a squared ratio to the expected error that is as large.
 
     Parameters
     ----------
     entries : sequence of RunError
-        Over which it is averaged; not a number where a run could not be solved.
+        Errors over which it is averaged; not a number where a run could not be solved.
     """
     square = float(np.mean([entry.ratio_to_expected**2 for entry in entries]))
     share, number, free = _variate(entries)
@@ -447,7 +444,7 @@ def chance(entries: Sequence[RunError]) -> float:
 
 
 def _quantile(entries: Sequence[RunError], above: float) -> float:
-    """Squared ratio that is exceeded with a probability."""
+    """Squared ratio that is exceeded with this probability."""
     share, number, free = _variate(entries)
     return 1.0 + share * (float(stats.f.isf(above, number, free)) - 1.0)
 
@@ -469,7 +466,7 @@ def _moments(entries: Sequence[RunError]) -> tuple[float, float]:
         own, count = entry.own_share, entry.own_coefficients or entry.coefficients
         gram = entry.parameters
         trace, square = float(np.trace(gram)), float(np.sum(gram * gram))
-        # Where the unknowns' errors lie in one coefficient of the noise it is more by its own.
+        # Mixed terms of the noise and the unknowns' errors.
         second += own**2 / count + 2.0 * own * trace / count
         third += own**3 / count**2 + 3.0 * (own**2 * trace / count**2 + own * square / count)
         if gram.size:
@@ -482,9 +479,8 @@ def _moments(entries: Sequence[RunError]) -> tuple[float, float]:
 
 
 def is_at_floor(table: ErrorTable, *, policy: SearchPolicy = SearchPolicy()) -> bool:
-    """Whether every output, pooled over each role and in each run, is down to what is expected.
-
-    A run that could not be solved is not.
+    """Whether the error of every output agrees with the expected one, pooled over each role and in
+    each run. A run that could not be solved does not agree.
     """
     entries = table.entries
     for role in {entry.role for entry in entries}:
@@ -498,9 +494,9 @@ def is_at_floor(table: ErrorTable, *, policy: SearchPolicy = SearchPolicy()) -> 
 
 
 def too_quiet(table: ErrorTable, *, policy: SearchPolicy = SearchPolicy()) -> tuple[str, ...]:
-    """Sentences on outputs that leave less than chance allows, pooled over the runs of a role.
+    """Sentences on outputs whose error is smaller than chance allows, pooled over a role.
 
-    A residual below the noise says that the noise is not what was measured, not that all is well.
+    Such a residual shows that the noise was overestimated, not that the model is good.
     """
     found = []
     for role in dict.fromkeys(entry.role for entry in table.entries):

@@ -41,6 +41,10 @@ from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
 
+#: Errors of one run by output, and the input's noise in them; see
+#: :func:`bayesoleo.discovery._error_table.compared`.
+Compared = tuple[list[RunError], Array]
+
 
 def curved(prediction: Prediction, root: Array, averaged: Array, policy: SearchPolicy) -> Array:
     """Mean square change over draws of the unknowns, over the linearised one, by output.
@@ -92,11 +96,6 @@ def _inside(prediction: Prediction, root: Array, count: int) -> Array:
         room = 1e-3 * prior.sd
         draws[:, k] = np.clip(draws[:, k], low + room, high - room)
     return cast(Array, draws)
-
-
-#: Errors of one run by output, and the input's noise in them; see
-#: :func:`bayesoleo.discovery._error_table.compared`.
-Compared = tuple[list[RunError], Array]
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,26 @@ from bayesoleo.prediction._stability import Stability
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
+#: What is said of a mesh that did not do, or of which nothing is known.
+TOO_COARSE = (
+    "the mesh is too coarse: {} steps leave an error that moves a parameter by {:.2g} of its"
+    " standard deviations, where at most {:g} are allowed; the motion's own estimated error is {}"
+    " of its swing. Estimates and intervals are not those of the equations: allow more steps"
+    " (--steps), or make the model less steep"
+)
+UNKNOWN_SHIFT = (
+    "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
+    " the estimates"
+)
+#: Error of a motion over its swing below which its estimate resolves nothing more.
+RESOLVED = 1e-3
+#: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
+#: iterations gain a digit each, and what is below no figure shows.
+RESOLUTION = 1e-3
+#: Steps for each harmonic of the inputs, and limits.
+STEPS_PER_HARMONIC = 4
+FEWEST_STEPS, MOST_STEPS = 128, 8192
+
 
 def weights(record: Record) -> Array:
     """One for every sample that counts, zero for the others, shape (N,)."""
@@ -153,27 +173,6 @@ def promising(problem: CampaignProblem, theta: Array, policy: SearchPolicy) -> l
     cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
     order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[: policy.prior_starts]
     return [draws[k] for k in order if np.isfinite(cost[k])]
-
-
-#: What is said of a mesh that did not do, or of which nothing is known.
-TOO_COARSE = (
-    "the mesh is too coarse: {} steps leave an error that moves a parameter by {:.2g} of its"
-    " standard deviations, where at most {:g} are allowed; the motion's own estimated error is {}"
-    " of its swing. Estimates and intervals are not those of the equations: allow more steps"
-    " (--steps), or make the model less steep"
-)
-UNKNOWN_SHIFT = (
-    "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
-    " the estimates"
-)
-#: Error of a motion over its swing below which its estimate resolves nothing more.
-RESOLVED = 1e-3
-#: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
-#: iterations gain a digit each, and what is below no figure shows.
-RESOLUTION = 1e-3
-#: Steps for each harmonic of the inputs, and limits.
-STEPS_PER_HARMONIC = 4
-FEWEST_STEPS, MOST_STEPS = 128, 8192
 
 
 @dataclass(frozen=True)

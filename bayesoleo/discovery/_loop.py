@@ -35,6 +35,13 @@ from bayesoleo.effects._nonparametric import FAMILY
 #: Families of effects that name no cause.
 NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
 
+#: Beginning of a note that lists parameters.
+ON_LIMIT = "at the limit of their prior's support"
+#: Beginning of the note on a declared model that was estimated from another start than its own.
+OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
+#: Beginning of the note on parameters whose sign is not the declared one.
+OTHER_SIGN = "opposite in sign to the declared value"
+
 
 def verdict_of(
     rounds: Sequence[Round], first: State, final: State, *, policy: SearchPolicy = SearchPolicy()
@@ -114,15 +121,6 @@ def excess(state: State) -> float:
     """Excess of the squared ratio to the expected error over one, of hold-out runs if any."""
     table = state.hold_errors if state.hold_errors.entries else state.fit_errors
     return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
-
-
-#: Beginning of a note that lists parameters.
-ON_LIMIT = "at the limit of their prior's support"
-#: Beginning of the note on a declared model that was estimated from another start than its own.
-OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
-
-#: Beginning of the note on parameters whose sign is not the declared one.
-OTHER_SIGN = "opposite in sign to the declared value"
 
 
 @dataclass(frozen=True)

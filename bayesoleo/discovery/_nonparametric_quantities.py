@@ -38,6 +38,14 @@ from bayesoleo.solvers._orbit import Status
 MOVES = 1e-6
 _PREFIX = "quantity_"
 
+#: Courses of a term in one run: at phases ``(N,)`` an array ``(K, N)``.
+Courses = Callable[[Array], Array]
+#: Terms that one model takes at a time.
+TOGETHER = 36
+#: Step in phase for derivatives of a course.
+NEARBY = 1e-6
+_AMPLITUDE, _INPUT = "nonparametric_amplitude_", "nonparametric_course_"
+
 
 @dataclass(frozen=True)
 class ModelQuantity:
@@ -215,16 +223,6 @@ def _row(run: RunPredictor, present: Array, item: sp.Symbol, phase: Array) -> Ar
     if name in constants:
         return np.asarray(present[constants.index(name)])
     return np.full(phase.size, np.nan)
-
-
-#: Courses of a term in one run: at phases ``(N,)`` an array ``(K, N)``.
-Courses = Callable[[Array], Array]
-
-#: Terms that one model takes at a time.
-TOGETHER = 36
-#: Step in phase for derivatives of a course.
-NEARBY = 1e-6
-_AMPLITUDE, _INPUT = "nonparametric_amplitude_", "nonparametric_course_"
 
 
 class _Course:

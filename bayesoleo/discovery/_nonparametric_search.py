@@ -33,6 +33,11 @@ from bayesoleo.effects._parts import Scales
 from bayesoleo.errors import ModelError
 from bayesoleo.solvers._orbit import Status
 
+#: Samples at which splines of one fineness are expressed in those of another.
+_DENSE = 400
+UNIT = Axis("", sp.Integer(0), "", 0.0, 1.0)
+Place = tuple[str, tuple[tuple[int, Axis], ...]]
+
 
 @dataclass(frozen=True)
 class CurveDirections:
@@ -120,11 +125,6 @@ def _weights(directions: Array, own: Array) -> tuple[Array, NDArray[np.int64]]:
     weights[chosen] = np.eye(chosen.size)
     weights[np.abs(weights) < 1e-12] = 0.0
     return weights, chosen
-
-
-#: Samples at which splines of one fineness are expressed in those of another.
-_DENSE = 400
-UNIT = Axis("", sp.Integer(0), "", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -300,9 +300,6 @@ def search(
     ]
     found += _all(base, motions, forced, pairs, base.policy.pieces_of_two, jobs)
     return CurveSearch(tuple(sorted(found, key=lambda item: item.log_p)), base.policy)
-
-
-Place = tuple[str, tuple[tuple[int, Axis], ...]]
 
 
 def _all(

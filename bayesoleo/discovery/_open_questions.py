@@ -30,6 +30,17 @@ from bayesoleo.discovery._round import Round
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.prediction._records import Record
 
+#: Reasons to distinguish effects.
+ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
+#: Runs that the summary lists.
+LISTED = 5
+#: Unit and meaning of what the group holds for each run.
+ABOUT = {
+    "information": ("bit", "least expected information about which rival is true"),
+    "sigma": ("1", "standard deviations that separate the least separated pair"),
+    "rank": ("1", "place among all runs, from 1"),
+}
+
 
 def standing(item: Round, *, policy: SearchPolicy = SearchPolicy()) -> tuple[Ranked, ...]:
     """Candidates of a round that remain possible, the best first.
@@ -122,10 +133,6 @@ def label(one: Ranked, among: Sequence[Ranked]) -> str:
     """The effect's id, with its target where another one has the same id."""
     several = sum(other.effect == one.effect for other in among) > 1
     return f"{one.effect} @ {one.target}" if several else one.effect
-
-
-#: Reasons to distinguish effects.
-ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
 
 
 @dataclass(frozen=True)
@@ -230,16 +237,6 @@ def _left(item: Round, best: Rival, numerics: Numerics) -> ErrorTable:
     predictions = predict_fitted(best.fit)
     roles = {prediction.record.label: "fit" for prediction in predictions}
     return error_table(predictions, roles, jobs=numerics.jobs, policy=numerics.policy)
-
-
-#: Runs that the summary lists.
-LISTED = 5
-#: Unit and meaning of what the group holds for each run.
-ABOUT = {
-    "information": ("bit", "least expected information about which rival is true"),
-    "sigma": ("1", "standard deviations that separate the least separated pair"),
-    "rank": ("1", "place among all runs, from 1"),
-}
 
 
 def proposals_entry(question: Question, unit: str) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class SearchPolicy:
         3.0,
         "Factor by which the shift due to the error between steps must exceed the shift by halving"
         " them in order to replace it.",
-        "both meshes then miss the same thing",
+        "both meshes then have the same error",
     )
     prior_draws: int = _value(
         256, "Vectors drawn from the priors when an estimate is repeated from other starts."
@@ -61,13 +61,13 @@ class SearchPolicy:
     )
     better_optimum_declared: float = _value(
         5.0,
-        "The same where the declared model leaves more than expected.",
+        "The same where the error of the declared model exceeds the expected one.",
         "a smaller rise may come from an estimate that stopped early",
     )
     opposite_sign: float = _value(
         3.0,
-        "Standard deviations from zero at which a parameter of the opposite sign than declared is"
-        " reported.",
+        "Standard deviations from zero at which a parameter opposite in sign to its declared value"
+        " is reported.",
     )
 
     # -- noise and expected errors ------------------------------------------------------
@@ -75,17 +75,17 @@ class SearchPolicy:
         8, "Frequency bands, of equal power, in which the input's noise is bounded by the residual."
     )
     noise_false_alarm: float = _value(
-        1e-3, "Probability that true input noise is taken for smaller than it is in any band."
+        1e-3, "Probability that the true input noise is underestimated in any band."
     )
     clearly_less_noise: float = _value(
         0.9,
-        "Ratio below which a later model lowers the noise of a transient's sample.",
-        "differences of neighbours know the noise to a few per cent",
+        "Ratio to the earlier noise of a transient's sample below which a later model lowers it.",
+        "differences of neighbours determine the noise to a few per cent",
     )
     least_expected: float = _value(
         0.1,
         "Least expected error of a run, as a part of its noise.",
-        "the share that estimates take up is known by linearisation only",
+        "the part of the noise that estimates absorb is known by linearisation only",
     )
     curvature_draws: int = _value(
         64,
@@ -103,15 +103,17 @@ class SearchPolicy:
         "a resonance that grows without bound shows only that the posterior is not normal",
     )
     floor_ratio: float = _value(
-        1.15, "Ratio to the expected error below which nothing is looked for, however significant."
+        1.15, "Ratio to the expected error below which no effect is sought, however significant."
     )
     least_ratio: float = _value(
         0.75,
-        "Ratio to the expected error below which the noise is at fault, unless chance explains it.",
-        "the noise was then measured too large by a third",
+        "Ratio to the expected error below which the noise is wrong, unless chance explains it.",
+        "the noise is then overestimated by a third",
     )
     floor_false_alarm: float = _value(
-        1e-3, "Probability that noise and parameter errors alone exceed the limit of that ratio."
+        1e-3,
+        "Probability that noise and parameter errors alone exceed the limit of the ratio to the"
+        " expected error.",
     )
 
     # -- scores -------------------------------------------------------------------------
@@ -120,17 +122,17 @@ class SearchPolicy:
     )
     excess_errors: float = _value(
         2.0,
-        "Standard errors of the excess that count as excess in shares.",
-        "noise alone exceeds them once in forty times, so that a large part of nearly nothing is"
-        " not a large share",
+        "Number of standard errors of the excess that is its least value in shares.",
+        "noise alone exceeds it once in forty times; a part of a negligible excess is then no large"
+        " share",
     )
     unsteady: float = _value(
-        0.05, "Probability of taking stationary noise for noise that comes and goes."
+        0.05, "Probability that stationary noise is taken for non-stationary noise."
     )
     aperiodic_power: float = _value(
         0.1,
-        "Part of a direction's power between the harmonics above which it does not repeat.",
-        "sampling that does not fit the period leaks less",
+        "Part of a direction's power between the harmonics above which it counts as non-repeating.",
+        "leakage by incommensurate sampling is smaller",
     )
     same_cosine: float = _value(
         0.95,
@@ -140,8 +142,8 @@ class SearchPolicy:
     )
     twin_cosine: float = _value(
         1.0 - 1e-6,
-        "Squared cosine above which two effects of one family and place are one.",
-        "the rest is the tolerance of a constant",
+        "Squared cosine above which two effects of one family and place are equivalent.",
+        "the remaining difference is the tolerance of a constant",
     )
     search_draws: int = _value(
         4000, "Draws of noise that give the effective number of independent tests."
@@ -156,36 +158,39 @@ class SearchPolicy:
     )
     refits: int = _value(6, "Effects estimated before one is chosen.")
     near_best: float = _value(
-        0.25, "Score, as a part of the best, from which on an effect is estimated with it."
+        0.25, "Score, as a part of the best, above which an effect is estimated as well."
     )
     hidden_refits: int = _value(
         2,
         "Effects estimated that would be significant in white noise only.",
-        "linearisation at the null describes some effects badly; only their estimate shows it",
+        "linearisation at the null is poor for some effects; only an estimate shows their size",
     )
     absorbing_refits: int = _value(3, "Effects of absorbing families that are estimated.")
     equal_share: float = _value(
         0.02, "Share of the excess within which effects are equal and the simplest is taken."
     )
     compared: int = _value(
-        4, "Effects compared on hold-out runs where the first leaves more than expected there."
+        4, "Effects compared on hold-out runs where the first exceeds the expected error there."
     )
     compared_worth: float = _value(
-        2.0, "How much less they may be worth, in units of what makes two effects equally likely."
+        2.0,
+        "Largest deficit of such an effect in Schwarz's criterion, in units of the difference"
+        " between equally likely effects.",
     )
     equal_odds: float = _value(
         20.0, "Ratio of likelihoods below which two effects are equally likely."
     )
     equal_remainder: float = _value(
         1.25,
-        "Ratio of remainders below which two alike effects that leave more than noise stay alike.",
-        "a wrong model's likelihood promises too much",
+        "Ratio of remainders below which two similar effects that leave more than noise are"
+        " indistinguishable.",
+        "the likelihood of a wrong model overstates the evidence",
     )
     not_taken_odds: float = _value(
         2.0,
-        "How much likelier an effect may be that was not taken and yet stays in the class, in the"
-        " same units.",
-        "hold-out runs did not confirm it, which is less than to exclude it",
+        "Largest advantage of an effect that was not added but stays in the class, in the same"
+        " units.",
+        "hold-out runs that do not confirm an effect do not exclude it",
     )
     prior_width: float = _value(
         10.0,
@@ -197,11 +202,11 @@ class SearchPolicy:
     )
 
     # -- confirmation -------------------------------------------------------------------
-    least_share: float = _value(0.05, "Least share of the excess that is worth another effect.")
+    least_share: float = _value(0.05, "Smallest share of the excess that justifies another effect.")
     fair_share: float = _value(
         0.125,
-        "The same of an effect that leaves more than noise.",
-        "of four missing effects the strongest explains about a quarter; half of that is asked for",
+        "The same for an effect that leaves more than noise.",
+        "of four missing effects the strongest explains about a quarter; half of that is required",
         "smaller shares usually mean that a similar effect is the true one",
     )
     excluded_null: float = _value(
@@ -209,11 +214,12 @@ class SearchPolicy:
     )
     excluded_price: float = _value(
         2.0,
-        "Fall of the sum of squares, in prices of the unknowns, that excludes the null anyway.",
+        "Fall of the sum of squares, in prices of the unknowns, that always excludes the null.",
         "far from the null the curvature understates the evidence (Hauck and Donner 1977)",
     )
     false_confirmation: float = _value(
-        0.025, "Probability that an effect is confirmed that does not lower the hold-out error."
+        0.025,
+        "Probability that an effect is confirmed although it does not lower the hold-out error.",
     )
     missed_confirmation: float = _value(
         0.025,
@@ -224,33 +230,35 @@ class SearchPolicy:
     plainly_needed: float = _value(
         200.0,
         "Wald statistic over the price of the unknowns above which an effect is kept untested.",
-        "the colour of the noise does not make up for such a factor",
+        "coloured noise does not explain such a factor",
         "saves fits; not measured beyond that",
     )
     review_rivals: int = _value(5, "Rivals of a final effect that are estimated in its place.")
     review_simpler: int = _value(
         3, "Rivals of a final effect that may make another effect superfluous."
     )
-    review_confirmed: int = _value(3, "Better rivals that hold-out runs are asked about.")
+    review_confirmed: int = _value(3, "Better rivals that are tested on hold-out runs.")
     shape_starts: tuple[float, ...] = _value(
         (0.25, 0.5, 0.75),
         "Places in the scan of a shape from which an estimate is repeated.",
         "where friction switches, the error has several minima along the shape",
     )
     restart_share: float = _value(
-        0.8, "Part of the best rival's fall from which on an estimate is repeated."
+        0.8, "Part of the best rival's fall above which an estimate is repeated."
     )
     restart_gap: float = _value(
-        4.0, "Squared standard deviations of the gap above which it is repeated."
+        4.0, "Gap to the best rival, in squared standard deviations, above which it is repeated."
     )
 
     # -- other first effects ------------------------------------------------------------
-    followed: int = _value(2, "Other first effects that are followed to their ends.")
+    followed: int = _value(2, "Other first effects from which a full search starts.")
     followed_behind_clear: float = _value(
-        0.02, "Part by which their worth may lie behind where causes led to the noise floor."
+        0.02, "Largest relative deficit of their worth where causes led to the noise floor."
     )
-    followed_behind: float = _value(0.1, "The same where they did not, or a curve did.")
-    seconds: int = _value(4, "Second effects that are estimated beside another first one.")
+    followed_behind: float = _value(
+        0.1, "The same where absorbing effects or a curve did, or none did."
+    )
+    seconds: int = _value(4, "Second effects that are estimated beside another first effect.")
 
     # -- nonparametric effects ----------------------------------------------------------
     decisive: float = _value(
@@ -268,7 +276,7 @@ class SearchPolicy:
         "the cubic spring of the Silverbox had given way to a spline in two coordinates",
     )
     finer_gain: float = _value(
-        0.25, "Part of a curve's deficit that finer pieces must make up to go on."
+        0.25, "Part of a curve's deficit that finer pieces must recover to be refined further."
     )
     finer: float = _value(0.01, "p-value below which finer pieces are significant.")
     curves_tried: int = _value(3, "Curves estimated before one is chosen.")
@@ -280,7 +288,9 @@ class SearchPolicy:
     pieces_of_two: tuple[int, ...] = _value((2, 4), "The same for each of two quantities.")
     paired: int = _value(1, "Best single quantities that are paired with every other.")
     own_direction: float = _value(
-        0.03, "Part of a direction that present parameters cannot do, above which it is a curve's."
+        0.03,
+        "Part of a direction independent of the present parameters above which it belongs to a"
+        " curve.",
     )
     resolved_spline: float = _value(
         0.03, "Effect of a spline on the outputs, over the strongest's, above which it is visible."
@@ -291,34 +301,37 @@ class SearchPolicy:
     equal_ranks: float = _value(
         0.9995,
         "Rank correlation above which two quantities are the same.",
-        "to a smooth function of either they are",
+        "smooth functions of either are then the same",
     )
     own_part: float = _value(
         0.1,
-        "Part of what is known of a parameter beside a curve below which it is shared with it.",
-        "its standard deviation would be three times what it seems",
+        "Part of a parameter's information left beside a curve below which the two are"
+        " inseparable.",
+        "its standard deviation would be three times as large",
     )
     beyond_curve: float = _value(
-        0.01, "Part of a run's samples beyond a curve's range above which the run is named."
+        0.01, "Part of a run's samples beyond a curve's range above which the run is reported."
     )
 
     # -- verdict and proposals ----------------------------------------------------------
     explained: float = _value(
         0.9,
         "Part of the excess that named physics must explain for the verdict *effect added*.",
-        "the remainder is then less than a third of what there was, in size",
+        "the remaining error is then less than a third of the original",
     )
     proposal_rivals: int = _value(
-        4, "Rivals compared when a run is proposed.", "each of them has to be estimated"
+        4, "Rivals compared when a run is proposed.", "each must be estimated"
     )
     separable: float = _value(
         1.0, "Standard deviations below which no run separates a pair of rivals."
     )
     equal_information: float = _value(
-        0.01, "Bits within which two runs are equal and their weakest pair decides."
+        0.01, "Difference in bits within which two runs are equal and their weakest pair decides."
     )
     enough_runs: int = _value(
-        3, "Runs from which on the scatter of a by-run parameter predicts that of a new run."
+        3,
+        "Smallest number of runs whose scatter of a by-run parameter predicts its value in a new"
+        " run.",
     )
 
     def changed(self) -> dict[str, Any]:
@@ -333,7 +346,7 @@ class SearchPolicy:
 
     @property
     def confirming_errors(self) -> float:
-        """Standard errors that a fall of the hold-out error must exceed."""
+        """Number of standard errors that a fall of the hold-out error must exceed."""
         return float(stats.norm.isf(self.false_confirmation))
 
 

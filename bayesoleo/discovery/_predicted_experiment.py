@@ -53,6 +53,12 @@ BEYOND = 0.1
 #: Names of the limits of the motion; any other name is an output.
 MOTION = ("amplitude", "frequency", "mean", "travel", "rate")
 
+#: Points of a period at which outputs are compared, and steps of the mesh; a choice between runs
+#: needs no higher accuracy.
+POINTS, STEPS = 128, 128
+#: Fixed-point iterations for a response that is also an input, and its highest order.
+PASSES, ORDERS = 4, 12
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -376,13 +382,6 @@ def _bhattacharyya(A: Array, B: Array, d: Array, log_a: float, log_b: float) -> 
     mean = (A + B) / 2
     between = float(np.linalg.slogdet(mean)[1]) - (log_a + log_b) / 2
     return max(float(d @ np.linalg.solve(mean, d)) / 8 + between / 2, 0.0)
-
-
-#: Points of a period at which outputs are compared, and steps of the mesh; a choice between runs
-#: needs no higher accuracy.
-POINTS, STEPS = 128, 128
-#: Fixed-point iterations for a response that is also an input, and its highest order.
-PASSES, ORDERS = 4, 12
 
 
 @dataclass(frozen=True)

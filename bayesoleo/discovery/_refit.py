@@ -38,9 +38,9 @@ def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[floa
 
     The estimate moves by ``a @ e`` with the noise ``e``; stretch ``g`` of the data pulls it by
     ``a_g @ r_g``, where the residual ``r = (I - H) e`` is smaller than the noise because the
-    estimate has followed it. Each squared pull is divided by the part of it that white noise would
-    have left, which makes the sum unbiased there; and the sum is known as well as a chi-square
-    variate of the same mean and variance (Satterthwaite 1946).
+    estimate absorbs a part of it. Each squared pull is divided by the part that remains of white
+    noise, which makes the sum unbiased for white noise. The degrees of freedom are those of the
+    chi-square variate with the same mean and variance (Satterthwaite 1946).
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[floa
     used = own > 1e-9 * sizes
     if used.sum() < 2:
         return float(np.sum(pulls**2)), 0.0
-    # A stretch that is fitted exactly says nothing; the others speak for it.
+    # A stretch that is fitted exactly gives no information; the others are scaled up for it.
     factor = np.where(used, sizes / np.where(used, own, 1.0), 0.0)
     factor *= sizes.sum() / sizes[used].sum()
     expected = float(factor @ own)
@@ -71,28 +71,29 @@ class Refit:
     Parameters
     ----------
     score : Score
-        Of the candidate.
+        Score of the candidate.
     assembly : Assembly
-        With the effect and its priors in it, at the estimate.
+        The model with the effect and its priors, at the estimate.
     fit : ModelFit
-        On the fitted runs.
+        Its fit to the fitted runs.
     share : float
         Part of the present excess that it explains after estimation.
     contribution : ndarray, shape (n,)
-        What it changes in the prediction, thinned, in noise units.
+        Its change of the prediction, thinned, in noise units.
     remaining : float
-        Sum of squares that it leaves beyond the noise's, and what of that noise alone could feign.
+        Remaining sum of squares beyond that of the noise, plus the excess that noise alone can
+        cause.
     inflation : float
         Variance of the new amplitudes over what white noise gives, where noise is coloured.
     freedom : int
-        Degrees of freedom that it was measured with; zero where it is the score's.
+        Degrees of freedom of the inflation; zero where it is that of the score.
     fall : float
-        Of the weighted sum of squares.
+        Fall of the weighted sum of squares.
     reached : bool
-        Whether noise alone could leave what it leaves.
+        Whether noise alone explains the remaining residual.
     price : float
-        By which an unknown has to lower the sum to be worth it: the logarithm of the number of
-        samples (Schwarz 1978).
+        Price of an unknown in the sum of squares: the logarithm of the number of samples (Schwarz
+        1978).
     policy : SearchPolicy
     """
 
@@ -110,12 +111,12 @@ class Refit:
     policy: SearchPolicy = SearchPolicy()
 
     def resembles(self, other: Refit) -> bool:
-        """Whether the data cannot tell two estimated effects apart.
+        """Whether the data cannot distinguish two estimated effects.
 
-        The noise says how sure a difference is: effects may do different things and be as likely,
-        if they are small (Burnham and Anderson 2002, section 2.6), and nearly the same and not, if
-        they are large. Where one of them leaves more than noise a likelihood promises too much, and
-        effects that do nearly the same are not told apart either.
+        The noise decides how significant a difference is. Small effects may be different and still
+        equally likely (Burnham and Anderson 2002, section 2.6); large effects may be similar and
+        still differ clearly. Where one of them leaves more than noise, the likelihood overstates
+        the evidence, and similar effects count as indistinguishable too.
         """
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
             return False
@@ -134,7 +135,7 @@ class Refit:
 
     @property
     def unusual(self) -> bool:
-        """Whether an amplitude lies on the side of its null where causes hardly are."""
+        """Whether an amplitude lies on the unlikely side of its null."""
         usual = self.score.option.candidate.usual
         return any(
             usual.get(name.split("[")[0], 0) * value < 0
@@ -142,7 +143,7 @@ class Refit:
         )
 
     def outdoes(self, other: Score) -> bool:
-        """Whether noise alone is left, and an effect that was only scored explains less of it."""
+        """Whether the effect leaves only noise and clearly beats an effect that was only scored."""
         mine, its = (one.fall - self.price * one.size for one in (self.score, other))
         scale = self.policy.equal_likelihood * max(self.inflation, other.inflation)
         return self.reached and mine - its > scale
@@ -154,7 +155,7 @@ class Refit:
 
     @property
     def worth(self) -> float:
-        """Fall of the sum beyond the price of the unknowns."""
+        """Fall of the sum of squares beyond the price of the unknowns."""
         return self.fall - self.price * self.size
 
     def excludes_null(self) -> bool:
@@ -193,9 +194,9 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     Parameters
     ----------
     base : Base
-        What the candidate was scored against.
+        Residuals and sensitivities of the present model.
     score : Score
-        Gives starts and the scale of priors.
+        Score, for the starts and the scale of priors.
     numerics : Numerics
         The mesh is the present fit's.
     """
@@ -209,7 +210,7 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]
     )
     if not np.isfinite(share):
-        share = -np.inf  # what cannot be solved at its estimate explains nothing
+        share = -np.inf  # a model without a solution at its estimate explains nothing
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
     measured = inflation_along(base, fit, score.names, changes)
@@ -224,35 +225,35 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
 
 
 def schwarz_price(base: Base) -> float:
-    """By how much an unknown has to lower the sum of squares: the logarithm of the samples."""
+    """Price of an unknown in the sum of squares: the logarithm of the number of samples."""
     return float(np.log(sum(run.residual.size for run in base.runs)))
 
 
 def inflation_along(
     base: Base, fit: ModelFit, names: Sequence[str], changes: Sequence[Array]
 ) -> tuple[float, int] | None:
-    """Variance of an effect's unknowns over white noise's, and its degrees of freedom; None where
-    nothing finite is known of it.
+    """Variance of an effect's unknowns over that in white noise, and its degrees of freedom; None
+    where it is not finite.
 
     Parameters
     ----------
     base : Base
-        What the effect is held against.
+        Residuals and sensitivities of the present model.
     fit : ModelFit
-        With the effect in.
+        The fit with the effect.
     names : sequence of str
         Its unknowns.
     changes : sequence of ndarray, shape (m,)
-        What it changes in each run, in noise units.
+        Its change of each run, in noise units.
 
     Notes
     -----
-    Periodic runs: as for a score, along what the estimate changes. An effect that a step from the
-    null describes badly, like a lag where friction switches, leaves a remainder there that is no
-    noise; its estimate does not. What a model leaves of a transient is seldom white, and at the
-    null, where effects are scored, it is mostly the effect itself; so it is measured on what the
-    estimate leaves. An unknown moves by the sum of its influence times the residual (Huber 1967):
-    its variance is that of the stretches' sums.
+    For periodic runs it is computed as for a score, along the change by the estimate. Linearisation
+    at the null is poor for some effects, such as a lag where friction switches: its error is no
+    noise, and the estimate avoids it. The residual of a transient is seldom white, and at the null
+    it is mostly the effect itself. There the inflation is measured on the residual of the estimate.
+    An unknown moves by the sum of its influence times the residual (Huber 1967): its variance is
+    that of the sums over stretches.
     """
     if all(record.periodic for record in fit.records):
         if not all(np.isfinite(change).all() for change in changes):
@@ -287,7 +288,7 @@ def _stretches(
     free: NDArray[np.int64],
     own: list[int],
 ) -> tuple[Array, Array, Array]:
-    """By new unknown and stretch: pull ``a @ r``, ``a @ a`` and ``a @ J``, in noise units."""
+    """Pull ``a @ r``, ``a @ a`` and ``a @ J`` by new unknown and stretch, in noise units."""
     unit = np.sqrt(fit.point.variance)[:, None]
     columns = predicted.sensitivity[:, free] / unit[:, None] * weights(run.record)
     influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
@@ -337,14 +338,14 @@ def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Nu
     Parameters
     ----------
     base : Base
-        Of the present model.
+        Residuals and sensitivities of the present model.
     model : Model
-        Driven; its nominal values are where shared unknowns start.
+        The driven model; shared unknowns start at its nominal values.
     known : mapping of str to float
-        Starts of unknowns of single runs, as far as they are known.
+        Starts of by-run unknowns, as far as known.
     numerics : Numerics
     """
-    # NumPy's kernels need no compiler, and a comparison no more digits than the data have.
+    # NumPy's kernels need no compiler, and a comparison needs no higher accuracy than the data.
     quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
     return fit_model(
         model,
@@ -359,7 +360,7 @@ def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Nu
 
 
 def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
-    """Nominal values, and of unknowns of single runs those that are known."""
+    """Nominal values, and the known values of by-run unknowns."""
     layout = Layout.of(model, [record.label for record in base.fit.records])
     start = layout.start(model)
     for k, name in enumerate(layout.names):

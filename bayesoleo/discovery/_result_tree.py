@@ -60,6 +60,11 @@ _KINDS: dict[str, tuple[Callable[[str], str], tuple[str, ...], str]] = {
     ),
 }
 
+#: Draws beyond which the stored ones are thinned: files stay below a hundred megabytes.
+MOST_DRAWS = 20_000
+BEFORE = "before"
+_OUTPUT_UNIT = "SI unit of each output"
+
 
 def predictive_group(
     fit: ModelFit, found: Sequence[Prediction], samples: Samples, errors: ErrorModel, seed: int
@@ -161,12 +166,6 @@ def _on_phases(prediction: Prediction, theta: Array) -> Array:
     y = found.y
     y[found.status != Status.CONVERGED.value] = np.nan
     return y
-
-
-#: Draws beyond which the stored ones are thinned: files stay below a hundred megabytes.
-MOST_DRAWS = 20_000
-BEFORE = "before"
-_OUTPUT_UNIT = "SI unit of each output"
 
 
 def records_tree(records: Sequence[Record], campaign: CampaignData) -> dict[str, xr.Dataset]:

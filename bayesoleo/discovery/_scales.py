@@ -27,6 +27,8 @@ _BESIDE, _FEWEST = 25, 5
 #: Width in bins of a line with the window that limits the leakage of strong lines.
 _WIDE = 3
 
+POINTS = 512
+
 
 def dominant_residual_frequency(fit: ModelFit) -> float | None:
     """Dominant frequency of the residuals of transients, Hz; None without a significant line."""
@@ -102,9 +104,6 @@ def _refined(values: Array, k: int) -> float:
 
 def _step(record: Record) -> float:
     return float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-
-
-POINTS = 512
 
 
 def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:

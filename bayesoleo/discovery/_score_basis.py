@@ -38,6 +38,20 @@ LEAST = 1e-8
 #: Sums of products over some 1e5 samples are good to this part of the size of what they sum.
 ROUND_OFF = 1e3 * float(np.finfo(float).eps)
 
+#: A sensitivity is looked at again if a parameter that moves a state by all of its size moves an
+#: output by less of its own: solutions are good to some 1e-13 of their size, and what is real is
+#: found real by the second look.
+SUSPECT = 1e-9
+#: Relative change of the constants for the second look: far above round-off, and far too small for
+#: a real sensitivity to follow by more than ``REPEATS`` of its size.
+CHANGE, REPEATS = 1e-9, 1e-3
+#: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
+#: would miss what repeats with it.
+MOST_SAMPLES = 1500
+#: Directions of input noise that are counted in a run, and the squared size, in noise units, below
+#: which one is not worth it.
+MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
+
 
 def coefficients(gram: Array, cross: Array) -> Array:
     """Coefficients ``(l, k)`` of directions on others, from ``J' W J`` and ``J' W C``.
@@ -89,15 +103,6 @@ def squared_distance(value: Array, covariance: Array) -> float:
     return float(
         scaled @ np.linalg.lstsq(covariance / np.outer(unit, unit), scaled, rcond=1e-12)[0]
     )
-
-
-#: A sensitivity is looked at again if a parameter that moves a state by all of its size moves an
-#: output by less of its own: solutions are good to some 1e-13 of their size, and what is real is
-#: found real by the second look.
-SUSPECT = 1e-9
-#: Relative change of the constants for the second look: far above round-off, and far too small for
-#: a real sensitivity to follow by more than ``REPEATS`` of its size.
-CHANGE, REPEATS = 1e-9, 1e-3
 
 
 def resolved_sensitivities(
@@ -253,14 +258,6 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
 def present_constants(fit: ModelFit, r: int) -> Array:
     """Constants of a fitted run at the estimate, shape (np,)."""
     return cast(Array, fit.predictor.constants(fit.problem.full(fit.point.theta[None]), r)[0])
-
-
-#: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
-#: would miss what repeats with it.
-MOST_SAMPLES = 1500
-#: Directions of input noise that are counted in a run, and the squared size, in noise units, below
-#: which one is not worth it.
-MOST_DIRECTIONS, NEGLIGIBLE = 256, 1e-2
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 #: Degrees of freedom of a variance that is not measured.
 ASSUMED = 1e9
 
+#: Why an effect has no score.
+SPANNED = "existing parameters already produce this change"
+UNRESOLVED = "not visible in these data: no output changes with it"
+
 
 def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     """Variance of a score over white noise's, at least one, and its degrees of freedom.
@@ -137,11 +141,6 @@ def _between_periods(runs: Sequence[RunBase], directions: Sequence[Array]) -> tu
             total += sums.size * float(np.var(sums, ddof=1))
             degrees += sums.size - 1
     return total, degrees
-
-
-#: Why an effect has no score.
-SPANNED = "the model can already do what it would"
-UNRESOLVED = "not visible in these data: no output changes with it"
 
 
 @dataclass(frozen=True)

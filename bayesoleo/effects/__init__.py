@@ -1,4 +1,4 @@
-"""Which physical effects can be missing in a model, and how each is added to it.
+"""Physical effects that a model may lack, and how each is added to it.
 
 Examples
 --------

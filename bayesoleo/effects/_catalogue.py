@@ -61,16 +61,16 @@ def candidates(
     effects: Iterable[Effect] | None = None,
     exclude: Collection[str] = (),
 ) -> list[Candidate]:
-    """Every effect at every place of a model where it applies, matters and is not in yet.
+    """Every effect at every place of a model where it applies, matters and is not present.
 
     Parameters
     ----------
     model : Model
-        In its own drive.
+        The model in its own drive.
     scales : Scales
         Sizes of the estimated motion.
     effects : iterable of Effect, optional
-        Instead of the catalogue; add to it with ``[*catalogue(), my_effect]``.
+        Effects in place of the catalogue; extend it with ``[*catalogue(), my_effect]``.
     exclude : collection of str
         Ids of effects to leave out; ``"effect at target"`` leaves out one place.
 
@@ -91,7 +91,7 @@ def candidates(
 
 
 def _is_felt(candidate: Candidate) -> bool:
-    """Whether anything depends on the new amplitudes: a constant offset of a velocity does not."""
+    """Whether the model depends on the new amplitudes, unlike a velocity on a constant offset."""
     model = candidate.model
     expressions = [*model.definitions.values()]
     expressions += [term for terms in model.equations.values() for term in terms.values()]
@@ -101,7 +101,7 @@ def _is_felt(candidate: Candidate) -> bool:
 
 
 def describe(effect: Effect) -> dict[str, Any]:
-    """What a listing says of an effect, ready for JSON.
+    """The description of an effect for listings, ready for JSON.
 
     Returns
     -------
@@ -135,7 +135,7 @@ def _entry(item: Amplitude | ShapeParameter | Constant, latex: str, kind: str) -
     return {"unit": item.unit, "latex": latex, "description": item.description, "kind": kind}
 
 
-#: Words with which a title begins as a sentence writes them.
+#: Proper names, which keep their capital where a title is part of a sentence.
 PROPER = frozenset({"Coulomb", "Hertzian", "Dahl", "Bouc-Wen", "LuGre", "Stribeck"})
 _NONPARAMETRIC = "Nonparametric: "
 
@@ -169,14 +169,14 @@ def in_sentence(title: str) -> str:
 
 
 def called(name: str, titles: Mapping[str, str]) -> str:
-    """What ``effect`` or ``effect @ target`` is called in a sentence.
+    """The name of ``effect`` or ``effect @ target`` in a sentence.
 
     Parameters
     ----------
     name : str
         An id, with a place or without one.
     titles : mapping of str to str
-        Title by id, besides those of the catalogue; an id without one becomes words.
+        Titles by id, in addition to the catalogue; an id without a title becomes words.
     """
     effect, _, place = name.partition(" @ ")
     title = titles.get(effect) or catalogue_titles().get(effect) or effect.replace("_", " ")
@@ -184,7 +184,7 @@ def called(name: str, titles: Mapping[str, str]) -> str:
 
 
 def with_titles(text: str, titles: Mapping[str, str]) -> str:
-    """A sentence with the ids of effects replaced by what they are called.
+    """A sentence with the ids of effects replaced by their titles.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def with_titles(text: str, titles: Mapping[str, str]) -> str:
 
 
 def listed(names: Sequence[str], last: str = " and ") -> str:
-    """``a, b and c``; names that hold a comma are kept apart by semicolons."""
+    """``a, b and c``; names that contain a comma are separated by semicolons."""
     comma = "; " if any("," in name for name in names) else ", "
     return last.join(part for part in (comma.join(names[:-1]), *names[-1:]) if part)
 
@@ -216,7 +216,7 @@ def titles_for(ids: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
     ----------
     ids : iterable of str
     known : mapping of str to str
-        Titles besides those of the catalogue.
+        Titles in addition to the catalogue.
     """
     effects = dict.fromkeys(name.split(" @ ")[0] for name in ids)
     found = {name: known.get(name) or catalogue_titles().get(name) for name in effects}

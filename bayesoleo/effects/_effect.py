@@ -48,11 +48,11 @@ _UNITS = {
 
 
 def check_names(used: Collection[str], own: Collection[str], allowed: set[str], id_: str) -> None:
-    """Every name is declared, every parameter is used, and none hides a word of the place."""
+    """Check that names are declared, parameters are used, and none hides a word of the place."""
     taken = sorted({*OF_THE_PLACE, *OF_THE_MOTION, "pi"} & set(own))
     if taken:
         hint = "this name stands for a quantity of the place; call the parameter something else"
-        raise InputError(f"effect {id_}: a name that is taken", value=taken[0], hint=hint)
+        raise InputError(f"effect {id_}: name is reserved", value=taken[0], hint=hint)
     known = {*own, *allowed, *OF_THE_PLACE, *OF_THE_MOTION, "pi"}
     for name in sorted(set(used) - known):
         close = difflib.get_close_matches(name, [*known, *FUNCTIONS], 1)
@@ -61,20 +61,20 @@ def check_names(used: Collection[str], own: Collection[str], allowed: set[str], 
     idle = sorted(set(own) - set(used))
     if idle:
         hint = "use it in the expression, or leave it out"
-        raise InputError(f"effect {id_}: nothing follows {idle[0]!r}", hint=hint)
+        raise InputError(f"effect {id_}: {idle[0]!r} is not used", hint=hint)
 
 
 def check_null(
     expression: str, used: Iterable[str], amplitudes: Sequence[Amplitude], id_: str
 ) -> None:
-    """Where its amplitudes are zero the force is none, and no division by one of them."""
+    """Check that the force vanishes where its amplitudes are zero, without division by one."""
     force = _parsed(expression, used, id_)
     at_null = force.subs({symbol(item.name): sp.Integer(0) for item in amplitudes})
     if amplitudes and at_null != 0 and sp.simplify(at_null) != 0:
         raise InputError(
             f"effect {id_}: is not zero where its amplitudes are",
             value=expression,
-            hint="multiply by an amplitude whatever shall be absent without it",
+            hint="multiply each term by an amplitude",
         )
 
 
@@ -86,9 +86,9 @@ def check_unit(
     states: Mapping[str, Any],
     id_: str,
 ) -> None:
-    """The expression is a force, if its units are stated in words of the place.
+    """Check that the expression is a force, if its units are stated in words of the place.
 
-    Bare numbers in it, or units that are not in these words, say nothing, and are let pass.
+    Expressions with bare numbers, or with units in other words, are not checked.
     """
     units = {item.name: item.unit for item in amplitudes}
     units |= {shape.name: shape.unit for shape in shapes}
@@ -132,7 +132,7 @@ def _over(unit: Any) -> str:
 
 
 def check_states(states: Mapping[str, Any], used: Iterable[str], id_: str) -> None:
-    """Each state's equation has its rate."""
+    """Check that each state's equation contains its rate."""
     for name, state in states.items():
         equation = _parsed(state.equation, used, id_)
         if not equation.has(derivative_symbol(name, 1)):
@@ -142,7 +142,7 @@ def check_states(states: Mapping[str, Any], used: Iterable[str], id_: str) -> No
 
 
 def check_grid(values: tuple[float, ...], shape: str, id_: str) -> None:
-    """A scan grid is ascending and positive: shapes have log-normal priors."""
+    """Check that a scan grid is ascending and positive, because shapes have log-normal priors."""
     grid = np.asarray(values, dtype=float)
     if grid.size == 0 or not (
         np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()
@@ -178,8 +178,8 @@ FAMILIES = (
 #: Source of effects that differ from run to run.
 BY_RUN = "Gelman et al. (2013), Bayesian Data Analysis, chapter 5: parameters that vary by group"
 
-#: Standard deviation of the placeholder prior of a new amplitude, in its unit. It says nothing:
-#: whoever fits the extended model rescales it to the size that the data suggest.
+#: Standard deviation of the placeholder prior of a new amplitude, in its unit. A fit of the
+#: extended model rescales it to the size that the data suggest.
 PLACEHOLDER_SD = 1.0
 
 
@@ -192,7 +192,7 @@ class Candidate:
     effect, family : str
         Canonical id of the effect, and its family.
     target : str
-        What it sits on: an equation's dof, a channel, a definition or a parameter.
+        The place: an equation's dof, a channel, a definition or a parameter.
     model : Model
         The extended model, at the null, in the drive of the model it was made from.
     parameters : tuple of str
@@ -202,10 +202,10 @@ class Candidate:
         By amplitude: +1 or -1 where only one side of the null is physical, else 0.
     shapes : mapping of str to tuple of float
         By shape parameter the values to scan, ascending, neighbours at most a factor of two apart.
-        The null leaves shapes undefined; they are estimated (log-normal prior) once the effect is
-        in. A grid of one value is not worth a scan.
+        Shapes are undefined at the null; they are estimated (log-normal prior) once the effect is
+        added. A grid of one value is not scanned.
     usual : mapping of str to int
-        By amplitude: +1 or -1 where the other side of the null is possible, but hardly a cause.
+        By amplitude: +1 or -1 where the other side of the null is possible, but an unlikely cause.
     """
 
     effect: str
@@ -223,7 +223,7 @@ Names = Mapping[str, sp.Symbol]
 
 
 def either_side(model: Model, target: str) -> int:
-    """Both sides of a null are as usual."""
+    """Both sides of the null are equally likely."""
     return 0
 
 
@@ -261,11 +261,11 @@ class Effect:
     driven : bool
         Whether it changes the model as the rig drives it; sensors and compliance always do.
     kind : str
-        ``periodic`` or ``transient`` where it can be told from such runs alone; else empty.
+        ``periodic`` or ``transient`` where only such runs determine it; else empty.
     shown : callable (scales) -> bool
-        Whether there is anything in the runs to scan for.
+        Whether the runs show the feature that the scan needs, such as a spectral line.
     side : callable (model, target) -> int
-        +1 or -1 where one side of the null is the usual one at a place, else 0.
+        +1 or -1 where one side of the null is the likely one at a place, else 0.
 
     Raises
     ------
@@ -274,7 +274,7 @@ class Effect:
 
     See Also
     --------
-    bayesoleo.effects._force_effect : a force-like effect in a few lines.
+    bayesoleo.effects.force_effect : a force-like effect in a few lines.
     """
 
     id: str
@@ -309,7 +309,7 @@ class Effect:
         return self.driven or self.family in ("sensor", "compliance")
 
     def fits(self, scales: Scales) -> bool:
-        """Whether the runs are of the kind that it needs, and show what its shapes start from."""
+        """Whether the runs are of the kind that it needs and show the feature that it scans."""
         return (not self.kind or scales.kinds == {self.kind}) and self.shown(scales)
 
     @property
@@ -328,21 +328,21 @@ class Effect:
         return {part.name: _with_prefix(self.id, part.name) + suffix for part in self._parts}
 
     def is_in(self, model: Model, target: str) -> bool:
-        """Whether this effect has been added at this target before."""
+        """Whether the model has this effect at this target."""
         present = model.parameters.get(self.names(model, target)[self.amplitudes[0].name])
         return present is not None and present.description == self.amplitudes[0].description
 
     def extend(self, model: Model, target: str, scales: Scales) -> Candidate:
-        """The candidate that this effect makes at one target.
+        """The candidate of this effect at one target.
 
         Parameters
         ----------
         model : Model
-            In its own drive.
+            The model in its own drive.
         target : str
             One of ``places(model)``.
         scales : Scales
-            For the grids of shape parameters.
+            Sizes of the motion, for the grids of shape parameters.
 
         Raises
         ------
@@ -405,9 +405,9 @@ class Effect:
 
 
 def _shape_prior(grid: tuple[float, ...]) -> LogNormal:
-    """Centred on the grid's geometric middle, its ends one standard deviation away."""
+    """Prior about the grid's geometric mean, with the ends at one standard deviation."""
     middle = float(np.sqrt(grid[0] * grid[-1]))
-    # A single value still leaves a factor of two either way.
+    # The prior of a single value has a spread of a factor of two.
     return LogNormal(middle, max(0.5 * float(np.log(grid[-1] / grid[0])), float(np.log(2.0))))
 
 

@@ -58,7 +58,7 @@ class InternalState:
     unit : str
         SI unit.
     description : str
-        What it is.
+        Its meaning.
     """
 
     equation: str
@@ -82,8 +82,8 @@ def force_effect(
 ) -> Effect:
     r"""An effect that adds a resisting force to the balance of forces.
 
-    It acts in the equations of second-order dofs; in a force law, on the output; in a system of
-    first-order dofs, where it needs no velocity, in every equation.
+    It acts in the equations of second-order dofs, or on the output of a force law. In a system of
+    first-order dofs an effect that needs no velocity acts in every equation.
 
     Parameters
     ----------
@@ -101,9 +101,9 @@ def force_effect(
         Amplitudes, zero at the null, and their units, in which the words ``force`` and ``position``
         stand for the units of the place: ``{"k3": "force/position**3"}``.
     formula, title : str, optional
-        LaTeX and a few words; made from the expression and the id where they are left out.
+        LaTeX and a few words; by default made from the expression and the id.
     shapes : tuple of ShapeParameter
-        Parameters that the null leaves undefined, with their scan grids.
+        Parameters that are undefined at the null, with their scan grids.
     states : mapping of str to InternalState
         New first-order dofs.
     requires : tuple of str
@@ -114,8 +114,8 @@ def force_effect(
     Raises
     ------
     InputError
-        If the expression uses a name that nothing declares, or does not use a parameter; if it is
-        not zero where its amplitudes are, or is not in the unit of a force.
+        If the expression uses an undeclared name or does not use a parameter; if it is not zero
+        where its amplitudes are, or is not in the unit of a force.
 
     Examples
     --------
@@ -161,7 +161,7 @@ def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any
 
 
 def _latex(expression: str, used: set[str], effect: str) -> str:
-    """LaTeX of an expression whose author gave none."""
+    """LaTeX of an expression."""
     words = {"position": "q", "velocity": r"\dot q", "acceleration": r"\ddot q"}
     known = {name: symbol(name) for name in used}
     symbols = {symbol(k): words.get(k, rf"\mathrm{{{k}}}".replace("_", r"\_")) for k in used}
@@ -211,7 +211,7 @@ def _names_in(text: str, effect: str) -> set[str]:
 
 
 def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], tuple[str, ...]]:
-    """Where an expression that uses these names makes sense."""
+    """The places of an expression that uses these names."""
 
     def places(model: Model) -> tuple[str, ...]:
         if not is_quantity(model, *requires):
@@ -257,14 +257,14 @@ def _adding_term(
             dof = Dof(state.unit, 0.0, state.description)
             model = model.with_dof(dofs[own], dof, equation)
         force = parse(expression, known, dynamic, where)
-        # Outputs show the force itself; in an equation it stands with the sign of the inertia.
+        # An output shows the force itself; in an equation the force has the sign of the inertia.
         return model.with_term(place.kind, place.target, effect, place.sign * force)
 
     return change
 
 
 def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.Expr]:
-    """Everything that an effect's expression may name, as expressions of the model."""
+    """The names that an effect's expression may use, as expressions of the model."""
     own: tuple[str, ...] = (*model.inputs, *model.dofs, *model.parameters)
     own += (*model.conditions, *model.definitions)
     known: dict[str, sp.Expr] = {name: symbol(name) for name in own}

@@ -45,9 +45,12 @@ OFFSET_BY_RUN = single_force(
 
 
 def _side_of_mass(model: Model, target: str) -> int:
-    """Where a law has no inertia, some is missing: its force then has the sense in which the law
-    resists motion, unless a rig takes back more than there is. Inertia that a model has may be
-    stated too large."""
+    """The likely sign of a mass error.
+
+    A force law without inertia lacks some: the inertia force then has the sense in which the law
+    resists motion, unless the rig overcompensates it. The inertia of a model that has one may be
+    too large, so that both signs are likely.
+    """
     place = force_places(model)[target]
     terms = balance_terms(model, place).values()
     if place.kind == "equation" or any(model.expand(one).has(acceleration(place)) for one in terms):
@@ -68,19 +71,22 @@ MASS = replace(
 )
 
 
-#: Harmonics of the drive that a periodic force may have. Dry friction that is as large in every run
-#: is a square wave in the drive's phase: with five they could hardly be told apart.
+#: Harmonics of the drive that a periodic force may have. Dry friction of equal size in every run is
+#: a square wave in the drive's phase: with five harmonics the two could hardly be distinguished.
 HARMONICS = 3
 
 
-def _locked(model: Model) -> Sequence[str]:
-    """Balances of forces of models that something drives: nothing hums or turns in a free decay."""
+def _driven_balances(model: Model) -> Sequence[str]:
+    """Balances of forces of driven models; a free decay has no periodic force."""
     return tuple(resisting_places(model)) if drives(model) else ()
 
 
-def _turning(model: Model, target: str, names: Names) -> Model:
-    """Chebyshev's polynomials in the cosine of the drive's phase are the cosines of its multiples;
-    those of the second kind, times the sine, the sines."""
+def _add_harmonics(model: Model, target: str, names: Names) -> Model:
+    """Add harmonics of the drive's phase.
+
+    Chebyshev polynomials of the first kind in the cosine of the phase are the cosines of its
+    multiples; those of the second kind, times the sine, are the sines.
+    """
     place, drive = resisting_places(model)[target], drives(model)[0]
     cosine, sine = (within(part, drive) for part in (COSINE, SINE))
     c, s = symbol(cosine), symbol(sine)
@@ -95,8 +101,8 @@ def _turning(model: Model, target: str, names: Names) -> Model:
     return turned.with_term(place.kind, place.target, "periodic_force", place.sign * force)
 
 
-# What the amplitudes of a law are to the motion, these are to the drive's phase: the same in every
-# run, however large the motion. Were they free by run, they would mimic every other effect.
+# The amplitudes are the same in every run, whatever the size of the motion. With amplitudes by run
+# the force would absorb every other effect.
 PERIODIC = Effect(
     id="periodic_force",
     family="clock",
@@ -107,8 +113,8 @@ PERIODIC = Effect(
         for k in range(1, HARMONICS + 1)
         for part, letter in (("cosine", "a"), ("sine", "b"))
     ),
-    places=_locked,
-    change=_turning,
+    places=_driven_balances,
+    change=_add_harmonics,
     source="Fourier series in the phase phi of the drive's first harmonic; Pintelon and Schoukens"
     " (2012), System Identification: A Frequency Domain Approach, section 2.3",
     applies_to="balances of forces, in periodic runs",
@@ -117,12 +123,12 @@ PERIODIC = Effect(
 )
 
 
-def _moved(model: Model) -> Sequence[str]:
-    """Equations of motion; a drift in a force law is that of its channel."""
+def _equations_of_motion(model: Model) -> Sequence[str]:
+    """Equations of motion; a drift in a force law is a drift of its channel."""
     return tuple(k for k, place in moving_places(model).items() if place.kind == "equation")
 
 
-def _drifting(model: Model, target: str, names: Names) -> Model:
+def _add_drift(model: Model, target: str, names: Names) -> Model:
     place = moving_places(model)[target]
     drift = place.sign * names["drifting_force"] * TIME
     return model.with_term(place.kind, place.target, "drifting_force", drift)
@@ -134,8 +140,8 @@ DRIFTING = Effect(
     title="Force that drifts",
     formula=r"F_t \, t",
     amplitudes=(Amplitude("drifting_force", "force/s", "F_t", "rate of a force"),),
-    places=_moved,
-    change=_drifting,
+    places=_equations_of_motion,
+    change=_add_drift,
     source="the first term of a Taylor series in time of what is not modelled",
     applies_to="equations of motion, in transient runs; in force laws it is sensor_drift",
     driven=True,
@@ -143,19 +149,20 @@ DRIFTING = Effect(
 )
 
 
-def _humming(model: Model, target: str, names: Names) -> Model:
+def _add_line(model: Model, target: str, names: Names) -> Model:
     place = resisting_places(model)[target]
     turn = 2 * sp.pi * names["frequency"] * TIME
     force = names["cosine"] * sp.cos(turn) + names["sine"] * sp.sin(turn)
     return model.with_term(place.kind, place.target, "humming_force", place.sign * force)
 
 
-def _heard(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
-    """The frequency of the line; any where nothing hums, for whoever extends a model by hand."""
+def _line(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+    """The dominant frequency; without one, that of the shortest period, for models extended by
+    hand."""
     return (scales.dominant_frequency or 1.0 / scales.shortest_period,)
 
 
-_HEARD = Scan(_heard, "that of the highest line")
+_LINE = Scan(_line, "that of the highest line")
 
 HUMMING = Effect(
     id="humming_force",
@@ -166,9 +173,9 @@ HUMMING = Effect(
         Amplitude(part, "force", f"{letter}_r", f"{part} part of a hum, by run", by_run=True)
         for part, letter in (("cosine", "a"), ("sine", "b"))
     ),
-    places=_locked,
-    change=_humming,
-    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", _HEARD),),
+    places=_driven_balances,
+    change=_add_line,
+    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", _LINE),),
     source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
     applies_to="balances of forces of driven models, in transient runs with a line that no input"
     " has",
@@ -177,7 +184,7 @@ HUMMING = Effect(
     shown=lambda scales: scales.dominant_frequency is not None,
 )
 
-# A model that names a force "gravity" is no place: the unit must be that of an acceleration.
+# The quantity must be an acceleration; a force of this name does not count.
 GRAVITY_ERROR = error_of(
     GRAVITY,
     "m/s**2",

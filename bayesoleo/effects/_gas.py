@@ -47,10 +47,10 @@ def has_gas(model: Model, *more: str) -> bool:
 
 
 def as_gas_spring(model: Model) -> Model:
-    """The same model with those names of a gas spring that follow from what it declares.
+    """The same model with the names of a gas spring that follow from its declarations.
 
-    The free volume is the volume if the pressure follows that; the temperature is the ambient's if
-    nothing is one.
+    The free volume is the volume if the pressure depends on the volume. The temperature is that of
+    the ambient if the model declares none.
     """
     if not has_gas(model):
         return model
@@ -66,7 +66,7 @@ def as_gas_spring(model: Model) -> Model:
 
 
 def of_gas(change: Change) -> Change:
-    """A change of a gas spring, with the names that it lacks."""
+    """A change of a gas spring that first declares its missing names."""
     return lambda model, target, names: change(as_gas_spring(model), target, names)
 
 
@@ -116,12 +116,12 @@ SOLUBILITY = Effect(
 
 
 def volume_ratio_rate(model: Model) -> sp.Expr:
-    """Rate of the gas volume over ``initial_volume``, with that of what pressure adds to it."""
+    """Rate of the gas volume over ``initial_volume``, including the volume that pressure adds."""
     return total_derivative(model.expand(symbol("volume_ratio")), (*model.dofs, *model.inputs))
 
 
 def _with_its_work(before: Model, after: Model) -> Model:
-    """Let the power on the gas follow the volume as it now changes."""
+    """Correct the power on the gas for the added rate of its volume."""
     if "gas_power" not in after.definitions:
         return after
     power, old = before.definitions["gas_power"], volume_ratio_rate(before)
@@ -172,7 +172,7 @@ def _compliant(
 
 
 def _volume(model: Model) -> sp.Expr:
-    """What the gas law follows: the free volume, or the volume where that has no name."""
+    """The volume of the gas law: the free volume, or the volume where that is not declared."""
     free = "free_volume_ratio"
     return symbol(free if is_quantity(model, free) else "volume_ratio")
 
@@ -282,12 +282,12 @@ _WARM = {
 
 
 def undeclared(model: Model) -> dict[str, tuple[str, ...]]:
-    """Effects of the gas that a model's names keep from being tried, and the names that it lacks.
+    """Gas effects that cannot be tried because a model lacks names, with the missing names.
 
     Parameters
     ----------
     model : Model
-        As declared.
+        The model as declared.
 
     Returns
     -------
@@ -303,7 +303,7 @@ def undeclared(model: Model) -> dict[str, tuple[str, ...]]:
     if not any(is_quantity(model, name) for name in _LAW):
         return {}
     whole = as_gas_spring(model)
-    # A model whose balances hold a first-order state besides the motion has a temperature already.
+    # A first-order state besides the motion counts as a temperature.
     warm = any(model.order(name) == 1 for name in model.dofs)
     wanted = _ANY | (_WARM if warm else _AT_AMBIENT)
     missing = {

@@ -35,7 +35,7 @@ from bayesoleo.model._parameters import Dof
 SPECIFIC_HEAT_NITROGEN = 743.0  # J/(kg K), at constant volume
 GAS_CONSTANT_NITROGEN = 296.8  # J/(kg K)
 
-# Where neither model nor runs put a number to what is an expression: a gas spring of a litre.
+# Values where neither model nor runs state a number: a gas spring of a litre.
 _STANDARD = {"initial_pressure": 1e6, "initial_volume": 1e-3, "ambient_temperature": 293.15}
 _THERMAL = ("temperature", "heat_loss", "gas_power", "heat_capacity")
 
@@ -60,8 +60,7 @@ def _polytropic(model: Model) -> Sequence[str]:
 
 
 def _nominal_capacity(model: Model, scales: Scales) -> float:
-    """Heat capacity of the gas at nominal values, J/K; of a condition without one, what the runs
-    state."""
+    """Heat capacity of the gas at nominal values, J/K. Conditions have their mean over the runs."""
     nominal = {item.name: value for item, value in model.nominal().items()}
     stated = {**_STANDARD, **scales.conditions, **nominal}
     gas = stated["initial_pressure"] * stated["initial_volume"] / stated["ambient_temperature"]
@@ -69,7 +68,7 @@ def _nominal_capacity(model: Model, scales: Scales) -> float:
 
 
 def _conduction_grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
-    """Conductions whose time constants span what the runs can show."""
+    """Conductions whose time constants cover the range that the runs can show."""
     capacity = _nominal_capacity(model, scales)
     slow, fast = 3 * scales.longest_period, scales.shortest_period / 30
     return geometric(capacity / slow, capacity / fast)
@@ -86,14 +85,14 @@ _SWEPT = values(0.25, 0.5, 1.0)
 def _exchange_heat(model: Model, target: str, names: Names) -> Model:
     """Write p = p0 (T/T0) v^-n, and heat the gas by a fraction kappa of the work done on it.
 
-    With kappa = 0 the gas stays at ambient temperature and the polytrope is what it was.
+    With kappa = 0 the gas stays at ambient temperature and the polytrope is unchanged.
     """
     temperature, ambient = symbol("temperature"), symbol("ambient_temperature")
     gas = symbol("initial_pressure") * symbol("initial_volume") / ambient
     pressure = symbol("gas_pressure")
     if is_quantity(model, "ambient_pressure"):
         pressure = pressure - symbol("ambient_pressure")  # as in eq. 6.4
-    # Of the wall that conducts, the piston sweeps a part; the rest stays in the gas.
+    # The piston sweeps a part of the conducting wall; the rest stays in contact with the gas.
     exposed = 1 - names["swept"] * (1 - symbol("volume_ratio"))
     loss = names["conduction"] * exposed * (temperature - ambient)
     extended = model.with_dof(
@@ -184,7 +183,7 @@ def _warm_wall(model: Model, target: str, names: Names) -> Model:
 
 
 def _warm_oil(model: Model, target: str, names: Names) -> Model:
-    """One more path of heat, into oil that keeps it: tau du/dt + u = T - T0."""
+    """A further path of heat, into oil that stores it: tau du/dt + u = T - T0."""
     above = symbol("temperature") - symbol("ambient_temperature")
     dof = free_name("oil_excess", model)
     excess = symbol(dof)

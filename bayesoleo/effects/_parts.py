@@ -34,8 +34,8 @@ class Scales:
         Lowest and highest value measured, by output, in the output's unit.
     kinds : frozenset of str
         Of the runs: ``periodic``, ``transient`` or both.
-    hum : float, optional
-        Frequency of a line in what transients leave that no input has, Hz.
+    dominant_frequency : float, optional
+        Frequency of a spectral line in the residual of transients that no input has, Hz.
     conditions : mapping of str to float
         Mean over the runs, SI.
     """
@@ -61,8 +61,7 @@ class Amplitude:
         As the effect's expression calls it.
     unit : str
         May use the words ``force`` (of the balance), ``position``, ``channel`` and ``parameter``
-        for the units of the place, e.g.
-        ``force/position**3``.
+        for the units of the place, e.g. ``force/position**3``.
     latex, description : str
         For reports.
     sign : int
@@ -90,7 +89,7 @@ def always(_: Model | Scales) -> bool:
 
 @dataclass(frozen=True)
 class ShapeParameter:
-    """A new parameter that the null leaves undefined: a velocity, a length, a time constant.
+    """A new parameter that is undefined at the null: a velocity, a length, a time constant.
 
     ``grid`` gives the values to scan; ``needed`` says whether a model needs this shape at all.
     """
@@ -122,7 +121,7 @@ class Scan:
     of : callable (model, target, scales) -> tuple of float
         The values.
     text : str
-        What they are, in words and numbers.
+        Their description in words and numbers.
     """
 
     of: Grid
@@ -184,7 +183,7 @@ def period_grid(shortest: float, longest: float) -> Scan:
 
 
 def velocity_once(fraction: float) -> Scan:
-    """One fraction of the largest velocity: not scanned, estimated once the effect is in."""
+    """One fraction of the largest velocity, which is estimated without a scan."""
 
     def grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
         return (fraction * scales.velocity[coordinate_of(model, target)],)

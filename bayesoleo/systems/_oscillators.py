@@ -8,6 +8,13 @@ from __future__ import annotations
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Dof, Output, Parameter
 
+_LINEAR = {
+    "inertia": "mass*ddot(position)",
+    "damping": "damping*dot(position)",
+    "stiffness": "stiffness*position",
+    "excitation": "-force",
+}
+
 
 def gas_spring() -> Model:
     r"""Ideal gas spring, :math:`y = (1/(1-x))^\theta` (Verbeek 1993, section 3.4.2); no dof.
@@ -48,14 +55,6 @@ def _oscillator() -> dict[str, Parameter]:
         "damping": Parameter(0.5, "N*s/m", relative_sd=0.5, latex="c"),
         "stiffness": Parameter(100.0, "N/m", relative_sd=0.3, latex="k"),
     }
-
-
-_LINEAR = {
-    "inertia": "mass*ddot(position)",
-    "damping": "damping*dot(position)",
-    "stiffness": "stiffness*position",
-    "excitation": "-force",
-}
 
 
 def linear_oscillator() -> Model:

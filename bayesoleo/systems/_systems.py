@@ -22,6 +22,27 @@ from bayesoleo.systems import _oleo as oleo, _oscillators as autonomous, _oscill
 #: Splines that a formula shows one by one.
 MOST_SPLINES = 4
 
+_SYSTEMS: dict[str, Callable[[], Model]] = {
+    "gas_spring": mechanical.gas_spring,
+    "viscous_damper": mechanical.viscous_damper,
+    "linear_oscillator": mechanical.linear_oscillator,
+    "duffing": mechanical.duffing,
+    "end_stop": mechanical.end_stop,
+    "f16n1d1": partial(oleo.mechanical_oleo, 1),
+    "f16n1d2": partial(oleo.mechanical_oleo, 2),
+    "f16n2d1": partial(oleo.thermomechanical_oleo, 1),
+    "f16n2d2": partial(oleo.thermomechanical_oleo, 2),
+    "f16n1d1_thesis": partial(oleo.mechanical_oleo_thesis, 1),
+    "f16n1d2_thesis": partial(oleo.mechanical_oleo_thesis, 2),
+    "f16n2d1_thesis": partial(oleo.thermomechanical_oleo_thesis, 1),
+    "f16n2d2_thesis": partial(oleo.thermomechanical_oleo_thesis, 2),
+    "f16n2d1_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 1, printed=True),
+    "f16n2d2_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 2, printed=True),
+    "van_der_pol": autonomous.van_der_pol,
+    "lorenz": autonomous.lorenz,
+    "rossler": autonomous.rossler,
+}
+
 
 def as_latex(expression: sp.Expr, model: Model) -> str:
     """LaTeX of an expression, with the parameters' own symbols and dots for time derivatives."""
@@ -124,28 +145,6 @@ def _parameter(item: Parameter) -> dict[str, Any]:
         "prior": prior,
         "description": item.description,
     }
-
-
-_SYSTEMS: dict[str, Callable[[], Model]] = {
-    "gas_spring": mechanical.gas_spring,
-    "viscous_damper": mechanical.viscous_damper,
-    "linear_oscillator": mechanical.linear_oscillator,
-    "duffing": mechanical.duffing,
-    "end_stop": mechanical.end_stop,
-    "f16n1d1": partial(oleo.mechanical_oleo, 1),
-    "f16n1d2": partial(oleo.mechanical_oleo, 2),
-    "f16n2d1": partial(oleo.thermomechanical_oleo, 1),
-    "f16n2d2": partial(oleo.thermomechanical_oleo, 2),
-    "f16n1d1_thesis": partial(oleo.mechanical_oleo_thesis, 1),
-    "f16n1d2_thesis": partial(oleo.mechanical_oleo_thesis, 2),
-    "f16n2d1_thesis": partial(oleo.thermomechanical_oleo_thesis, 1),
-    "f16n2d2_thesis": partial(oleo.thermomechanical_oleo_thesis, 2),
-    "f16n2d1_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 1, printed=True),
-    "f16n2d2_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 2, printed=True),
-    "van_der_pol": autonomous.van_der_pol,
-    "lorenz": autonomous.lorenz,
-    "rossler": autonomous.rossler,
-}
 
 
 def systems() -> tuple[str, ...]:

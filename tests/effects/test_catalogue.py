@@ -112,8 +112,8 @@ def test_names_do_not_collide(scales):
         (("a drag", "damping", "k*velocity", {"k": ""}), "not an identifier.*a drag"),
         (("drag", "damping", "k*", {"k": ""}), r"not an expression.*k\*"),
         (("drag", "damping", "velocity", {}), "no parameters"),
-        (("drag", "damping", "k*velocity", {"k": "", "d": ""}), "nothing follows 'd'"),
-        (("drag", "damping", "position*velocity", {"position": ""}), "a name that is taken"),
+        (("drag", "damping", "k*velocity", {"k": "", "d": ""}), "'d' is not used"),
+        (("drag", "damping", "position*velocity", {"position": ""}), "name is reserved"),
         (("drag", "damping", "velocity**2 + k*velocity", {"k": ""}), "not zero where its ampl"),
         (("drag", "damping", "velocity/k", {"k": ""}), "not zero where its amplitudes are"),
         (
