@@ -17,14 +17,14 @@ from typing import Annotated, Any
 
 import typer
 
-from bayesoleo._workflow.settings import OPTION, RUNNING, Option, Settings
+from bayesoleo._workflow.settings import OPTION, RUNNING, SettingOption, Settings
 
 OUTPUT = "What is written"
 #: Settings that say how the model is solved, in the order of ``--help``.
 SOLVED = ("drive", "scheme", "solver", "steps")
 #: Settings of the sampler.
 SAMPLED = ("quick", "seed", "jobs", "scheduler", "effective_size")
-_OPTIONS: dict[str, Option] = {
+_OPTIONS: dict[str, SettingOption] = {
     item.name: item.metadata[OPTION] for item in fields(Settings) if OPTION in item.metadata
 }
 

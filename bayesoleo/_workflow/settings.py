@@ -27,7 +27,7 @@ OPTION = "option"
 
 
 @dataclass(frozen=True)
-class Option:
+class SettingOption:
     """The option of a setting.
 
     Parameters
@@ -65,7 +65,7 @@ def _setting(
 ) -> Any:
     """A field with an option; a tuple is written with commas on the command line."""
     value = ",".join(default) if isinstance(default, tuple) else default
-    option = Option(kind, text, panel, value, read, shown)
+    option = SettingOption(kind, text, panel, value, read, shown)
     return field(default=default, metadata={OPTION: option})
 
 

@@ -15,6 +15,8 @@ import bayesoleo as bo
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._session.campaign import Campaign
 from bayesoleo.effects import find_effect
+from bayesoleo.errors import InputError
+from bayesoleo.prediction import RunPlan, motion
 from tests.session.shown import check_shown
 from tests.small_campaigns import damper
 
@@ -186,3 +188,26 @@ def test_neither_a_model_nor_a_campaign(campaign: bo.Campaign) -> None:
         bo.Problem(campaign, 3)
     with pytest.raises(bo.errors.InputError, match=r"key data: .*'dict'.*bo\.load_campaign"):
         bo.Problem({"x": [1.0]}, damper())
+
+
+def test_a_simulated_campaign_gives_its_parameters_back(tmp_path: Path) -> None:
+    plans = [
+        RunPlan(label, frequency, {"displacement": motion(0.0, [0.02])})
+        for label, frequency in (("slow", 1.0), ("fast", 3.0))
+    ]
+    truth, noise = {"damping": 60.0, "stiffness": 1200.0}, {"force": 0.05}
+    simulated = bo.Campaign.simulate(
+        tmp_path / "c", damper(cubic=False), plans, truth, noise=noise, seed=3
+    )
+    assert [run.label for run in simulated.runs] == ["slow", "fast"]
+    assert simulated.noise["force"].values == pytest.approx(0.05, rel=0.2)
+    point = bo.Problem(simulated, damper(cubic=False), jobs=1).fit().tree["point"]
+    off = (point["estimate"] - [truth[name] for name in point["parameter"].values]) / point["sd"]
+    assert np.abs(off).max() < 4.0  # standard deviations
+
+
+def test_a_campaign_is_written_into_an_empty_folder_only(tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(InputError, match="empty"):
+        bo.Campaign.demo(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
