@@ -2,7 +2,7 @@
 
 Three kinds of failure are kept apart: bad input raises an :class:`InputError` whose one-line
 message says where, what value and what to write instead; a numerical failure is a
-:class:`~bayesoleo.solvers.status.Status`, never an exception; inside a log density a failure
+:class:`~bayesoleo.solvers.Status`, never an exception; inside a log density a failure
 becomes minus infinity and is counted by reason.
 """
 
@@ -10,6 +10,18 @@ from __future__ import annotations
 
 from importlib import import_module
 from typing import Any
+
+__all__ = [
+    "BayesoleoError",
+    "CampaignError",
+    "DataWarning",
+    "InputError",
+    "MissingExtraError",
+    "ModelError",
+    "ModelWarning",
+    "ResultsError",
+    "UnfinishedError",
+]
 
 
 class BayesoleoError(Exception):

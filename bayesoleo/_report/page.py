@@ -52,7 +52,7 @@ def case(
     units : mapping of str to str
         SI unit of each output.
     tree : DataTree
-        The result; where the error lives is told if it holds residuals of periodic runs.
+        The result; the residual breakdown is shown if it holds residuals of periodic runs.
 
     Returns
     -------
@@ -429,7 +429,7 @@ def _figures(
     makers = {
         "data": ("the data", sections.data_figures),
         "fit": ("the fit", sections.fit_figures),
-        "where": ("where the error lives", sections.whereabouts_figure),
+        "where": ("the residual breakdown", sections.breakdown_figure),
         "residual": ("the residual", sections.residual_figures),
         "posterior": ("the posterior", sections.posterior_figures),
         "predictive": ("the posterior's prediction", sections.predictive_figures),

@@ -171,8 +171,8 @@ def fit_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     return _drawn(entries)
 
 
-def whereabouts_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
-    """Where the error lives that repeats; nothing without a periodic run that has any."""
+def breakdown_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The breakdown of the repeating residual; nothing without a periodic run that has one."""
     try:
         excess = residual_breakdown(tree)["excess"].values
     except (InputError, KeyError):
@@ -180,9 +180,9 @@ def whereabouts_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
     if not (excess > FLOOR**2 - 1).any():
         return []
     caption = (
-        "Where the error lives that repeats beyond its noise, all runs together: at which "
-        "harmonics, and what of it a function of one coordinate explains that is the same in all "
-        "runs - of run and group, a constant for each. Constants point to conditions and sensors, "
+        "How the repeating error divides over harmonics and coordinates, all runs together. Each "
+        "bar is the share that one function of that coordinate, the same in all runs, explains; "
+        "for run and group it is a constant for each. Constants point to conditions and sensors, "
         "a function of velocity to friction and damping, of position to stiffness and gas."
     )
     return _drawn([(lambda: plots.residual_breakdown(tree), caption)])

@@ -454,8 +454,8 @@ class Explanation(Stored):
 
     @property
     def verdict(self) -> str:
-        """``nothing missing``, ``effect added`` or ``unexplained remainder``; of a function without
-        a significant term, that."""
+        """``nothing missing``, ``effect added`` or ``unexplained remainder``; for a function
+        without a significant term, a sentence that says so."""
         return str(self.tree.attrs[schema.VERDICT])
 
     @property

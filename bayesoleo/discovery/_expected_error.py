@@ -345,8 +345,8 @@ def expected_of_held_out(
 def _own_response(
     predictor: Predictor, run: _LinearisedRun, own: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """How the run's own unknowns answer its residual ``(l, l)``, and what an error of the shared
-    ones becomes of all ``(l, l)``."""
+    """Response of the by-run unknowns to the residual ``(l, l)``, and the map from errors of the
+    shared unknowns to errors of all ``(l, l)``."""
     size = own.size
     response, moved = np.zeros((size, size)), np.diag((~own).astype(float))
     if not own.any():

@@ -42,7 +42,7 @@ def borne_out(
     drawn: bool = False,
     policy: SearchPolicy = SearchPolicy(),
 ) -> float:
-    """Largest factor, at most one, by which the input's noise may be what the residual holds.
+    """Largest factor, at most one, of the input's noise that the residual has the power for.
 
     Parameters
     ----------

@@ -113,7 +113,7 @@ def known_beside(base: Base, own: Array, cross: Array, score: Array) -> CurveDir
 
 
 def _weights(directions: Array, own: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Coefficients from as many of themselves as there are directions, and which these are.
+    """Matrix that gives all coefficients from the independent ones, and the independent ones.
 
     All combinations of ``directions (K, r)``: the splines that the others depend on are chosen by
     pivoting, so that none of the weights is large.

@@ -38,9 +38,9 @@ LEAST = 1e-8
 #: Sums of products over some 1e5 samples are good to this part of the size of what they sum.
 ROUND_OFF = 1e3 * float(np.finfo(float).eps)
 
-#: A sensitivity is looked at again if a parameter that moves a state by all of its size moves an
-#: output by less of its own: solutions are good to some 1e-13 of their size, and what is real is
-#: found real by the second look.
+#: A sensitivity is computed again if a parameter that moves a state by its full size moves an
+#: output by less than this part of the output's size: solutions are good to some 1e-13 of their
+#: size, and the second computation confirms a real one.
 SUSPECT = 1e-9
 #: Relative change of the constants for the second look: far above round-off, and far too small for
 #: a real sensitivity to follow by more than ``REPEATS`` of its size.

@@ -36,8 +36,8 @@ from bayesoleo.solvers._elimination import eliminate
 
 #: Variance of the state before the first sample, over that of a sample's noise.
 DIFFUSE = 1e9
-#: Periods of the highest frequency that the spline at an end is fitted to, half of which it is
-#: joined over, and by which a record is continued.
+#: Lengths in periods of the highest frequency: of the end that the spline is fitted to (it is
+#: joined over half of it), and of the continuation beyond the record.
 _END, _BEYOND = 8.0, 8.0
 #: Roughness of a spline that goes through its samples, to 3e-5; more would compete with the start,
 #: of which nothing is known.

@@ -32,10 +32,10 @@ _SHAPE = 14.0
 MAIN_LOBE = 5
 #: Part of the band over which a floor is looked for; the lowest such part is the floor.
 _FLOOR_PART = 0.125
-#: A spectrum is taken as signal where it exceeds the floor this many times: a value is wrong by
-#: less with it than without from twice the floor on. Where a derivative is taken, noise that is
-#: not white does the more harm the higher its frequency, so a signal has to be twice as large as
-#: the noise there (four times its power).
+#: A spectrum is taken as signal where it exceeds the floor this many times: keeping a line reduces
+#: the error of a value once its power is twice the floor. Where a derivative is taken, noise that
+#: is not white does the more harm the higher its frequency, so a signal has to be twice as large
+#: as the noise there (four times its power).
 _VALUE, _DERIVATIVE = 2.0, 5.0
 #: Signal over noise, in power of the derivative, at which a part of the spectrum beyond a gap
 #: stays.

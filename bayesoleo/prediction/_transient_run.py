@@ -29,8 +29,8 @@ from bayesoleo.solvers._transient import solve_transient, state_rows, transient_
 
 #: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
 WHOLE = 128
-#: Steps are not cut for the sake of inputs below so many samples of them, nor below this angle at
-#: the highest frequency that an input holds, which a method of fifth order follows to 1e-4.
+#: To follow the inputs, steps are shortened to this many samples and to this angle at the highest
+#: frequency of an input at most, which a method of fifth order follows to 1e-4.
 SAMPLES_A_STEP, ANGLE = 4, 0.75
 #: Steps of that angle beyond which a library's integrator, step by step, would take minutes.
 MOST_INTEGRATED = 5_000

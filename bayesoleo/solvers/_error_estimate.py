@@ -49,7 +49,7 @@ MAXIMUM_ROUNDS, MOST_STEPS = 10, 60_000
 SHARE = 0.02
 #: A kink this close to an edge, over the step and in cycles, takes its place.
 BESIDE, CLOSEST = 0.05, 1e-9
-#: So far before its end, over its length, a step is asked for what it has there.
+#: One-sided values at a step's end are taken this part of its length before the end.
 ONE_SIDE = 1e-6
 #: Places in a step at which motions are compared.
 COMPARED = 8

@@ -32,9 +32,9 @@ from bayesoleo.solvers._state_space import StateSpace
 TOLERANCE = 1e-6
 #: Local error of the first look, which tells how large the states get.
 LOOK = 1e-3
-#: Neighbouring steps differ by this factor at most. Where other parameters move a kink (a velocity
-#: that changes sign under dry friction) out of the steps made for it, the step that it meets is
-#: then at most a fixed part of the way that it moved.
+#: Neighbouring steps differ by this factor at most. If other parameters move a kink (a velocity
+#: that changes sign under dry friction) away from its fine steps, the step that it reaches is no
+#: longer than a fixed part of the distance moved.
 GRADING = 1.5
 #: Steps at least: an integrator sees inputs at its own steps only, and must not stride over them.
 FEWEST_STEPS = 64

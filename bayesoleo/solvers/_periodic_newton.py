@@ -59,11 +59,11 @@ LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
-#: Relative step from which on steps can be taken for those of a contraction.
+#: Old derivatives are tried only below this relative step.
 CHORD_FROM = 0.1
 #: Steps with old derivatives, half as expensive, before there are new ones.
 MOST_CHORDS = 2
-#: Contraction that is none.
+#: Ratio of successive steps above which old derivatives converge too slowly.
 SLOW_CHORD = 0.1
 #: What the steps that are not taken would add up to.
 CHORD_LEFT = 1e-14

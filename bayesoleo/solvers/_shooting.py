@@ -35,7 +35,7 @@ from bayesoleo.solvers._switched import PhaseFunction
 LOOSE = 1e-3
 #: A pass's tolerance over the residual of the one before: its noise must not hide progress.
 FOLLOW = 1e-2
-#: Residual that a pass's own error makes, over its tolerance: less need not fall.
+#: Residual, over the tolerance, that integration error alone can cause.
 NOISE = 30.0
 #: A correction this small, over the sizes of the states, leaves its square.
 LAST_CORRECTION = 1e-7

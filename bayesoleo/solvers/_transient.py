@@ -30,8 +30,8 @@ from bayesoleo.solvers._periodic import LAST_STEP, SMALL_STEP, Boundary, Solutio
 #: Newton iterations on the whole time at once, before it is walked through piece by piece.
 MAXIMUM_ITERATIONS = 12
 MAXIMUM_HALVINGS = 8
-#: The same on a piece. Its steps count as solved where one more of Newton's would move them by no
-#: more than this part of their size: it is taken, and leaves round-off.
+#: Newton iterations on one piece. A piece is solved when the next Newton step is below this part of
+#: its size; that step is still taken and leaves round-off.
 PIECE_ITERATIONS, SETTLED = 16, 1e-6
 
 

@@ -7,7 +7,7 @@ import pytest
 from fitted_states import NUMERICS
 from scipy.integrate import solve_ivp
 from small_campaigns import damper, damper_campaign, spring_damper_force
-from test_unnamed_effects import ABOUT, EFFECTS, inner_wall
+from test_nonparametric_effects import ABOUT, EFFECTS, inner_wall
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import tables

@@ -40,7 +40,8 @@ def test_the_recipe_has_the_dependencies_of_the_core() -> None:
     recipe = text_of(".conda/recipe.yaml")
     for dependency in PROJECT["dependencies"]:
         name, bound = re.fullmatch(r"([\w-]+)(?:\[\w+\])?(>=.*)", dependency).groups()
-        assert re.search(rf"^    - {name}(-base)? {re.escape(bound)}$", recipe, re.MULTILINE)
+        base = "-base" if name == "matplotlib" else ""  # without its window
+        assert re.search(rf"^    - {name}{base} {re.escape(bound)}$", recipe, re.MULTILINE)
 
 
 def test_the_workflow_tests_every_python_that_is_declared() -> None:
