@@ -32,7 +32,15 @@ def headline(summary: Mapping[str, Any]) -> str:
     """The result as a sentence, which begins with how sure it is."""
     broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))
     lead = "Unfinished, the search did not come to its end. " if broken else ""
-    return f"{lead}{_said(summary)}"
+    return f"{lead}{_said(summary)}{_not_tried(summary)}"
+
+
+def _not_tried(summary: Mapping[str, Any]) -> str:
+    """A sentence on effects of the catalogue that the search was not given; empty if none."""
+    left_out = summary.get("effects_left_out", 0)
+    if not left_out or not summary["effects"]:
+        return ""
+    return f" The search was not given {left_out} other effects of the catalogue."
 
 
 def _said(summary: Mapping[str, Any]) -> str:

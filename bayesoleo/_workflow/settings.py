@@ -240,6 +240,14 @@ class Settings:
         return catalogue() if self.effects is None else self.effects
 
     @property
+    def left_out(self) -> int:
+        """Number of effects of the catalogue that are not looked for."""
+        from bayesoleo.effects._catalogue import catalogue
+
+        searched = {effect.id for effect in self.searched}
+        return sum(effect.id not in searched for effect in catalogue())
+
+    @property
     def searched(self) -> tuple[Effect, ...]:
         """The effects that are looked for."""
         return tuple(effect for effect in self._offered if effect.id not in self.without)

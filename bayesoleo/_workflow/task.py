@@ -257,12 +257,14 @@ class Task:
 
     def about(self) -> dict[str, Any]:
         """Top-level keys of the summary."""
+        left_out = self.settings.left_out
         return {
             "format": schema.FORMAT,
             "campaign": self.campaign.name,
             "model": self.assembly.native.name,
             "drive": self.assembly.drive or ", ".join(self.assembly.native.inputs),
             "seed": self.settings.seed,
+            **({"effects_left_out": left_out} if left_out else {}),
         }
 
 

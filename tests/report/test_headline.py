@@ -9,6 +9,7 @@ import pytest
 from bayesoleo import _schema as schema
 from bayesoleo._report import tables as yardstick
 from bayesoleo._report.sentences import headline
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.effects import catalogue
 from bayesoleo.effects._catalogue import called, in_sentence, with_titles
 
@@ -156,3 +157,16 @@ def test_titles_read_as_parts_of_sentences():
 )
 def test_ids_in_sentences_become_titles(text, said):
     assert with_titles(text, {"sensor_lag": "Lag", "play": "Play: no stiffness"}) == said
+
+
+def test_effects_that_were_not_tried_are_counted():
+    sentence = told(["coulomb_friction @ stroke"], schema.CERTAIN, effects_left_out=52)
+    assert sentence.endswith("The search was not given 52 other effects of the catalogue.")
+    assert "catalogue" not in told(["coulomb_friction @ stroke"], schema.CERTAIN)
+
+
+def test_settings_count_what_they_leave_out_of_the_catalogue():
+    every = len(catalogue())
+    assert Settings().left_out == 0
+    assert Settings(without=("coulomb_friction",)).left_out == 1
+    assert Settings(effects=catalogue()[:2]).left_out == every - 2
