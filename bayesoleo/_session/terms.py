@@ -25,6 +25,7 @@ from bayesoleo._session.function_work import (
 )
 from bayesoleo._types import Array
 from bayesoleo._workflow.settings import Settings
+from bayesoleo.assessment._residual_tests import autocorrelation_time
 from bayesoleo.discovery._score_basis import coefficients, remains
 from bayesoleo.errors import InputError
 from bayesoleo.model._parameters import Parameter
@@ -224,10 +225,29 @@ def _score(
     freedom = residual.size - slope.shape[1] - size
     if freedom < 1:
         return None
-    ratio = (fall / size) / max((total - fall) / freedom, np.finfo(float).tiny)
+    # Samples whose errors are correlated count for fewer: the remainder with the term tells by how
+    # much. Another term that is missing is smooth as well, so that the test is then conservative.
+    left = residual - (new - slope @ project) @ expected
+    together = _correlated_samples(left, slope.shape[1] + size)
+    ratio = (fall / size) / max((total - fall) / freedom, np.finfo(float).tiny) / together
+    freedom = max(freedom / together, 1.0)
     local = float(stats.f.sf(ratio, size, freedom))
     p_value = float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
     return TermScore(term, expected, fall / total, p_value)
+
+
+def _correlated_samples(left: Array, fitted: int) -> float:
+    """Samples that count for one: the larger of the measured autocorrelation time and that of a
+    first-order autoregression, whose coefficient is corrected for the parameters that were fitted
+    (Marriott and Pope 1954, extended from a mean and a trend to ``fitted`` smooth terms)."""
+    power = float(left @ left)
+    if left.size < 20 or power == 0.0:
+        return 1.0
+    first = float(left[1:] @ left[:-1]) / power
+    if first <= 2.0 / np.sqrt(left.size):  # as white as chance makes it
+        return 1.0
+    first = min(first + (fitted + (fitted + 2) * first) / left.size, 0.99)
+    return max(autocorrelation_time(left), (1.0 + first) / (1.0 - first))
 
 
 def _extended(work: FunctionWork, best: TermScore) -> FunctionWork:

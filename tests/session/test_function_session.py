@@ -169,3 +169,22 @@ def test_a_column_of_any_name(table) -> None:
     frame = pd.DataFrame({"variables": table["x"], "y": table["y"]})
     fit = bo.Problem(frame, lambda variables, a: a * variables, parameters={"a": SLOPE["slope"]})
     assert "samples of variables, y" in repr(fit)
+
+
+def test_correlated_errors_are_no_missing_term() -> None:
+    """Errors with the autocorrelation 0.9 made a polynomial term significant in three of four."""
+
+    def line(x, slope, offset):
+        return slope * x + offset
+
+    x, named = np.linspace(0.0, 2.0, 120), 0
+    parameters = {"slope": bo.Parameter(1.0, sd=5.0), "offset": bo.Parameter(0.0, sd=1.0)}
+    terms = {"quadratic": lambda x, c: c * x**2, "cubic": lambda x, c: c * x**3}
+    for seed in range(12):
+        errors = np.random.default_rng(seed).standard_normal(x.size)
+        for i in range(1, x.size):
+            errors[i] = 0.9 * errors[i - 1] + np.sqrt(1 - 0.81) * errors[i]
+        data = {"x": x, "y": 1.5 * x + 0.05 * errors}
+        found = bo.Problem(data, line, parameters=parameters).fit().explain(candidates=terms)
+        named += bool(found.effects)
+    assert named <= 2  # of twelve with the probability 0.01 each, more come once in 5 000 times
