@@ -7,6 +7,7 @@ because the ambient pressure is not in the unit: a gauge pressure remains one.
 
 from __future__ import annotations
 
+import difflib
 import re
 import threading
 from dataclasses import dataclass
@@ -242,7 +243,10 @@ def _suggestion(wrong: str) -> str:
     powers = re.sub(r"(?<=[A-Za-z])\^?(-?\d)", r"**\1", wrong)
     words = re.split(r"([A-Za-zµ]+)", powers)
     split = "".join(_split_product(word) for word in words)
-    for trial in (case, powers, split, wrong.lower()):
+    # A slip inside a word, as degrC; of a short word another unit is as likely to be meant.
+    close = difflib.get_close_matches(wrong, _COMMON, 1, cutoff=0.8) if len(wrong) > 3 else []
+    slip = next((unit for unit in close if (unit[0], unit[-1]) == (wrong[0], wrong[-1])), wrong)
+    for trial in (case, powers, slip, split, wrong.lower()):
         if trial != wrong and _is_known(trial):
             return f"did you mean {trial}? or write "
     return "write "

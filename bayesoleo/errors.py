@@ -8,7 +8,10 @@ becomes minus infinity and is counted by reason.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable, Sequence
 from importlib import import_module
+from os import PathLike
 from typing import Any
 
 __all__ = [
@@ -22,6 +25,10 @@ __all__ = [
     "ResultsError",
     "UnfinishedError",
 ]
+
+
+#: Words that a message lists at most, and beside the one that was probably meant.
+LISTED, FEW = 30, 12
 
 
 class BayesoleoError(Exception):
@@ -101,6 +108,63 @@ class MissingExtraError(BayesoleoError, ImportError):
         self.extra = extra
         text = f"this needs the package {module}; pip install 'bayesoleo[{extra}]' installs it"
         super().__init__(text, name=module)
+
+
+def choose(wrong: object, allowed: Iterable[object], most: int = 1) -> str:
+    """What to write instead of a word: the closest of those allowed, and all where they are few."""
+    names = [str(name) for name in allowed]
+    close = difflib.get_close_matches(str(wrong), names, most)
+    listed = f"one of: {', '.join(names[:LISTED])}" + (", …" if len(names) > LISTED else "")
+    if not close:
+        return listed
+    return f"did you mean {' or '.join(close)}?" + (f" {listed}" if len(names) <= FEW else "")
+
+
+def check_number(
+    value: object, key: str, *, hint: str, kind: type[InputError] = InputError
+) -> None:
+    """Raise unless a value is one number; text is none, whatever it holds.
+
+    Parameters
+    ----------
+    value : object
+    key, hint : str
+        As :class:`InputError` takes them.
+    kind : type
+        Of the error.
+    """
+    try:
+        number = not isinstance(value, str | bytes) and float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = False
+    if number is False:
+        raise kind("is not a number", key=key, value=value, hint=hint)
+
+
+def check_level(level: float) -> None:
+    """Raise unless a probability lies between 0 and 1."""
+    check_number(level, "level", hint="write level=0.95")
+    if not 0 < level < 1:
+        raise InputError(
+            "must lie between 0 and 1", key="level", value=level, hint="write level=0.95"
+        )
+
+
+def check_names(names: Sequence[str], known: Sequence[str], key: str, *, example: str) -> None:
+    """Raise unless each of several names is known; ``example`` is the whole argument."""
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise InputError("is not a sequence of names", key=key, value=names, hint=example)
+    for name in names:
+        if name not in known:
+            raise InputError(
+                "there is no such unknown", key=key, value=name, hint=choose(name, known)
+            )
+
+
+def check_path(value: object, key: str, *, hint: str) -> None:
+    """Raise unless a value is text or a path; parameters are those of :func:`check_number`."""
+    if not isinstance(value, str | PathLike):
+        raise InputError("is not a path", key=key, value=value, hint=hint)
 
 
 def import_extra(module: str, extra: str) -> Any:

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import typer
 
 from bayesoleo._workflow.settings import OPTION, RUNNING, SettingOption, Settings
+from bayesoleo.errors import InputError
 
 OUTPUT = "What is written"
 #: Settings that say how the model is solved, in the order of ``--help``.
@@ -111,11 +112,14 @@ def of_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., No
     return decorate
 
 
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _parameter(name: str) -> inspect.Parameter:
     """The parameter of a command for a setting."""
     one = _OPTIONS[name]
-    flag = f"--{name.replace('_', '-')}"
-    shown = typer.Option(flag, rich_help_panel=one.panel, help=one.help, **one.shown)
+    shown = typer.Option(_flag(name), rich_help_panel=one.panel, help=one.help, **one.shown)
     kind = inspect.Parameter.KEYWORD_ONLY
     annotated: Any = Annotated
     return inspect.Parameter(name, kind, default=one.default, annotation=annotated[one.kind, shown])
@@ -130,12 +134,15 @@ def settings(**given: Any) -> Settings:
         If there is no such scheme, solver, error model or effect, or the file of effects cannot be
         used.
     """
-    from bayesoleo.prediction._periodic_solver import check_solver
-
     found = {}
     for name, value in given.items():
         read = _OPTIONS[name].read
         found[name] = value if read is None or value is None else read(value)
-    if "solver" in found:  # checked here first, so that the error names the option
-        check_solver(found["solver"], found.get("scheme", Settings.scheme), "--solver")
-    return Settings(**found, command=shlex.join(["bayesoleo", *sys.argv[1:]]))
+    try:
+        return Settings(**found, command=shlex.join(["bayesoleo", *sys.argv[1:]]))
+    except InputError as error:
+        if error.key not in found:
+            raise
+        raise InputError(
+            error.problem, key=_flag(error.key), value=error.value, hint=error.hint
+        ) from error

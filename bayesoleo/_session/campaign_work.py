@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._open_questions import Question
 from bayesoleo.discovery._result_tree import fitted_groups, point_group
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.plots._style import format_unit
 from bayesoleo.systems._systems import equations
@@ -54,18 +53,14 @@ def changed(
     known = [item.name for item in fields(Settings)]
     for name, value in keywords.items():
         if name not in known:
-            near = difflib.get_close_matches(name, allowed or known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"use {', '.join(allowed or known)}"
+            hint = choose(name, allowed or known)
             raise InputError("there is no such setting", key=name, value=value, hint=hint)
         if allowed is not None and name not in allowed:
             raise InputError(
                 "cannot be changed at this step", key=name, value=value,
                 hint=f"give it to the problem: bo.Problem(…, {name}={value!r})",
             )  # fmt: skip
-    given: dict[str, Any] = {}
-    for name, value in keywords.items():
-        given[name] = tuple(value) if isinstance(value, list) else value
-    return replace(settings, **given)
+    return replace(settings, **keywords)
 
 
 Say = Callable[[str], None]

@@ -20,11 +20,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
 from bayesoleo._display import LabelledResult
 from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array
+from bayesoleo.errors import InputError, choose
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._style import engineering
 
@@ -89,6 +91,40 @@ def residuals(tree: xr.DataTree) -> xr.Dataset:
     return xr.Dataset(data).assign_coords(kept)
 
 
+#: Correlation of neighbouring residuals, in standard deviations of white ones, that is told.
+ALIKE = 3.0
+
+
+def misfit(tree: xr.DataTree, output: str, sd: float) -> str:
+    """How a residual compares with the noise of its output; of a function, with its neighbours.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Of a fit.
+    output : str
+    sd : float
+        Standard deviation of the residual, SI.
+    """
+    left = tree[schema.RESIDUAL].to_dataset()[schema.before(output)]
+    if schema.NOISE in tree.children:
+        noise = tree[schema.NOISE].to_dataset()[output].sel({schema.RUN: left[schema.RUN]})
+        size = float(np.sqrt((noise**2).weighted(left.count(schema.SAMPLE)).mean()))
+        return f", {sd / size:.3g} times the noise of a sample ({size:.4g})" if size > 0 else ""
+    data = residuals(tree)
+    values, place = np.asarray(data[output].values[0]), abscissa_of(data)
+    inputs = [name for name in data.coords if schema.SAMPLE in data[name].dims]
+    if len(inputs) == 1:
+        values = values[np.argsort(data[place].values[0], kind="stable")]
+    alike = float(values[1:] @ values[:-1] / (values @ values)) if values.any() else 0.0
+    if values.size < 20 or alike * np.sqrt(values.size) < ALIKE:
+        return ""
+    return (
+        f"; neighbouring residuals are alike (correlation {alike:.2f}): a term is missing, or "
+        "errors are correlated"
+    )
+
+
 #: Runs shown at most, and columns of the figure.
 RUNS, COLUMNS = 12, 4
 
@@ -101,18 +137,38 @@ def fit_and_residual(data: xr.Dataset, output: str | None = None) -> Figure:
     data : xarray.Dataset
         Of :func:`bayesoleo._session.display.residuals`.
     output : str, optional
-        By default the first.
+        By default all, one below the other.
+
+    Raises
+    ------
+    InputError
+        If there is no such output.
     """
-    name = output or outputs(data)[0]
-    measured = data[measured_name(name)]
-    scale = engineering(reading.unit(measured), style.magnitude(measured.values))
+    known = outputs(data)
+    if output is not None and output not in known:
+        hint = choose(output, known)
+        raise InputError("there is no such output", key="output", value=output, hint=hint)
+    names = known if output is None else [output]
     runs = [str(run) for run in data[schema.RUN].values[:RUNS]]
     columns = min(len(runs), COLUMNS)
     rows = -(-len(runs) // columns)
-    figure = style.blank(2.6 * columns + 1.0, 2.9 * rows + 0.3)
-    axes = figure.subplots(
-        2 * rows, columns, squeeze=False, gridspec_kw={"height_ratios": [2, 1] * rows}
-    )
+    height = 2.9 * rows * len(names) + 0.6
+    figure = style.blank(2.6 * columns + 1.0, height)
+    parts = figure.subfigures(len(names), 1, squeeze=False)[:, 0]
+    for name, part in zip(names, parts, strict=True):
+        axes = part.subplots(
+            2 * rows, columns, squeeze=False, gridspec_kw={"height_ratios": [2, 1] * rows}
+        )
+        _runs(axes, data, name, runs)
+        part.subplots_adjust(0.09, 0.2 / rows, 0.98, 1 - 0.09 / rows, 0.25, 0.35)
+    return figure
+
+
+def _runs(axes: NDArray[Any], data: xr.Dataset, name: str, runs: list[str]) -> None:
+    """One output of all runs."""
+    measured = data[measured_name(name)]
+    scale = engineering(reading.unit(measured), style.magnitude(measured.values))
+    columns = axes.shape[1]
     for place in axes.flat:
         place.set_visible(False)
     for number, run in enumerate(runs):
@@ -129,8 +185,7 @@ def fit_and_residual(data: xr.Dataset, output: str | None = None) -> Figure:
         if column == 0:
             upper.set_ylabel(scale.label(name), fontsize=style.SMALL)
             lower.set_ylabel("residual", fontsize=style.SMALL)
-    figure.subplots_adjust(0.09, 0.2 / rows, 0.98, 1 - 0.09 / rows, 0.25, 0.35)
-    return figure
+    axes[0, 0].legend(frameon=False, fontsize=style.SMALL)
 
 
 def _curves(upper: Axes, lower: Axes, one: xr.Dataset, name: str, factor: float) -> None:
@@ -148,8 +203,8 @@ def _curves(upper: Axes, lower: Axes, one: xr.Dataset, name: str, factor: float)
         lines = [_in_order(x, curve) for curve in curves]
     many = lines[0][0].size > reading.BINS // 2
     shape = {"lw": 4.0, "alpha": 0.55} if many else {"lw": 0.0, "marker": "o", "ms": 3.5}
-    upper.plot(*lines[0], color=style.MEASURED, **shape)
-    upper.plot(*lines[1], color=style.BEFORE, lw=1.3)
+    upper.plot(*lines[0], color=style.MEASURED, label="measured", **shape)
+    upper.plot(*lines[1], color=style.BEFORE, lw=1.3, label="predicted")
     lower.axhline(0.0, color=style.NEUTRAL, lw=0.8)
     line = {"lw": 0.9} if many else {"lw": 0.0, "marker": "o", "ms": 2.5}
     lower.plot(*lines[2], color=style.BEFORE, **line)

@@ -107,16 +107,24 @@ def read_table(data: Any) -> dict[str, Array]:
         )  # fmt: skip
     table = {}
     for name in data.variables if isinstance(data, xr.Dataset) else data:
-        try:
-            column = np.asarray(data[name], dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                "is not a column of numbers", key=f"data[{name!r}]", value=str(error),
-                hint="give numbers, or leave the column out",
-            ) from error  # fmt: skip
+        column = _numbers(data[name], f"data[{name!r}]")
         if column.ndim == 1:
             table[str(name)] = column
     return table
+
+
+def _numbers(values: Any, key: str) -> Array:
+    """Values as floats; text is refused even where it reads as a number."""
+    found = np.asarray(values)
+    items = found.flat if found.dtype.kind in "OSU" else ()
+    text = next((item for item in items if isinstance(item, str | bytes)), None)
+    hint = "give numbers, or leave the column out; text is converted by numpy.asarray(…, float)"
+    if text is not None:
+        raise InputError("holds text, not numbers", key=key, value=str(text), hint=hint)
+    try:
+        return np.asarray(found, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError("does not hold numbers", key=key, value=str(error), hint=hint) from error
 
 
 def output_of(table: Mapping[str, Array], wanted: str | None, used: Sequence[str]) -> str:
@@ -147,6 +155,11 @@ def parameters_of(given: Mapping[str, Any] | None) -> dict[str, Parameter]:
     InputError
         If one is neither, or is estimated without a prior.
     """
+    if given is not None and not isinstance(given, Mapping):
+        raise InputError(
+            "is not a dictionary", key="parameters", value=given,
+            hint='write parameters={"a": bo.Parameter(1.0, sd=…)}',
+        )  # fmt: skip
     found = {}
     for name, item in (given or {}).items():
         key = f"parameters[{name!r}]"
@@ -171,6 +184,38 @@ def parameters_of(given: Mapping[str, Any] | None) -> dict[str, Parameter]:
             hint='write parameters={"a": bo.Parameter(1.0, sd=…)}',
         )  # fmt: skip
     return found
+
+
+def check_call(call: Call, inputs: Mapping[str, Array], problem: FunctionProblem) -> None:
+    """Call a function once where the estimate starts, so that it fails here or not at all.
+
+    Raises
+    ------
+    InputError
+        If it raises something, or returns another number of values than were measured.
+    """
+    size = problem.data[0].size
+    for name, column in inputs.items():
+        if column.size != size and ("column", name) in call.arguments:
+            raise InputError(
+                f"has {column.size} rows, the measured column has {size}", key=f"data[{name!r}]",
+                hint="give columns of one length",
+            )  # fmt: skip
+    try:
+        problem.predict(problem.start)
+    except InputError:
+        raise
+    except Exception as error:  # the function is the user's: it may raise anything
+        hint = "correct the function, or the names of its arguments"
+        if ("table", None) in call.arguments:
+            hint = (
+                "its first argument is no column, so that it received all columns as a dictionary; "
+                f"name its arguments after columns: {', '.join(inputs)}"
+            )
+        raise InputError(
+            f"function fails at the start values: {type(error).__name__}: {error}",
+            key="model", value=_name(call.function), hint=hint,
+        ) from error  # fmt: skip
 
 
 def unknowns_of(parameters: Mapping[str, Parameter]) -> list[str]:
@@ -214,9 +259,10 @@ def call_of(
             found.append(("vector", None))
         else:
             raise InputError(
-                "is neither a column of the data nor a parameter", key=f"argument {name}",
-                value=_name(function),
-                hint=f'write parameters={{"{name}": bo.Parameter(1.0, sd=…), …}}',
+                f"of {_name(function)} is neither a column of the data ({', '.join(columns)}) nor "
+                "a parameter", key=f"argument {name}",
+                hint="rename it after a column, or declare it: "
+                f'parameters={{"{name}": bo.Parameter(1.0, sd=…), …}}',
             )  # fmt: skip
     if ("vector", None) not in found:
         for name in parameters:
@@ -462,7 +508,7 @@ class FunctionWork:
                     "a function of several columns needs a table", key="data",
                     hint=f"give a dictionary with {', '.join(self.inputs)}",
                 )  # fmt: skip
-            return {next(iter(self.inputs)): np.atleast_1d(np.asarray(data, dtype=float))}
+            return {next(iter(self.inputs)): np.atleast_1d(_numbers(data, "data"))}
         table = read_table(data)
         missing = [name for name in self.inputs if name not in table]
         if missing:

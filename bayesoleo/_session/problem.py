@@ -14,6 +14,7 @@ from bayesoleo._session.function_work import (
     FunctionWork,
     arguments_of,
     call_of,
+    check_call,
     output_of,
     parameters_of,
     read_table,
@@ -156,7 +157,7 @@ class Problem(Showing):
         >>> fit = problem.fit(method="MBE")  # doctest: +SKIP
         """
         with status_line(progress) as callback:
-            found, tree = self._work.fit(method.lower(), callback)
+            found, tree = self._work.fit(str(method).lower(), callback)
         return Fit(tree, self._work, found)
 
     def _text(self) -> str:
@@ -204,5 +205,5 @@ def _of_function(
     call = call_of(function, inputs, declared)
     name = getattr(function, "__name__", type(function).__name__)
     work = FunctionWork(name, call, table, measured_column, declared, settings)
-    _ = work.statement  # what does not fit is found before anything is computed
+    check_call(call, work.inputs, work.statement)
     return work

@@ -38,7 +38,7 @@ from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.task import reduce
 from bayesoleo.assessment._assess import assess
-from bayesoleo.errors import InputError, ResultsError
+from bayesoleo.errors import InputError, ResultsError, check_path
 from bayesoleo.estimation._indifference_regions import indifference
 from bayesoleo.estimation._profile_likelihood import profile
 from bayesoleo.estimation._sampling_distribution import sampling_distribution
@@ -124,6 +124,7 @@ class Stored(Showing):
         Path
             The file; :func:`load_result` reads it.
         """
+        check_path(path, "path", hint='write save("results.nc")')
         write_tree(self.to_datatree(), path)
         return Path(path)
 
@@ -173,7 +174,7 @@ class Fit(Stored):
         Parameters
         ----------
         output : str, optional
-            Channel; by default the first.
+            Channel; by default all.
         """
         return figures.fit_and_residual(self.residuals, output)
 
@@ -350,8 +351,11 @@ class Fit(Stored):
         for name, variance in zip(
             point[schema.OUTPUT].values, point[schema.VARIANCE].values, strict=True
         ):
-            lines.append(f"{name}: residual standard deviation {np.sqrt(variance):.4g}")
-        lines.append(str(point.attrs["status_message"]))
+            sd = float(np.sqrt(variance))
+            more = residuals.misfit(self.tree, name, sd)
+            lines.append(f"{name}: residual standard deviation {sd:.4g}{more}")
+        more = "; fit.assess() and fit.explain() test whether the model is complete"
+        lines.append(str(point.attrs["status_message"]) + more)
         return "\n".join([*lines, *json.loads(point.attrs.get("notes", "[]"))])
 
 
@@ -551,6 +555,7 @@ def load_result(path: str | os.PathLike[str]) -> Fit | Posterior | Explanation:
     --------
     >>> load_result("results/results.nc").verdict  # doctest: +SKIP
     """
+    check_path(path, "path", hint='write load_result("results/results.nc")')
     tree = read_tree(path)
     if schema.DISCOVERY in tree.children:
         return Explanation(tree)

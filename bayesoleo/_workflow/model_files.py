@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import inspect
 import os
@@ -20,7 +19,7 @@ from bayesoleo.effects._catalogue import catalogue
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._gas import undeclared
 from bayesoleo.effects._places import LOOKED_FOR
-from bayesoleo.errors import InputError, ModelError, ModelWarning
+from bayesoleo.errors import InputError, ModelError, ModelWarning, check_path, choose
 from bayesoleo.model._model import Model, unused
 from bayesoleo.systems._systems import system
 
@@ -57,6 +56,7 @@ def load_model(text: str | os.PathLike[str]) -> Model:
     >>> load_model("gas_spring").name
     'gas_spring'
     """
+    check_path(text, "model", hint='write load_model("model.py:model") or load_model("f16n2d2")')
     text = os.fspath(text)
     file, colon, name = text.rpartition(":")
     if text.endswith(".py"):
@@ -213,8 +213,7 @@ def _keyword(text: str) -> str | None:
     if found is None or not isinstance(declaration, type):
         return None
     keywords = list(inspect.signature(declaration).parameters)
-    close = difflib.get_close_matches(found[2], keywords, 1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"one of: {', '.join(keywords)}"
+    return choose(found[2], keywords)
 
 
 def _line(error: BaseException, path: Path) -> int | None:

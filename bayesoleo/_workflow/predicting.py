@@ -27,7 +27,7 @@ from bayesoleo.data._reduction import ReducedCampaign
 from bayesoleo.discovery._error_table import compared
 from bayesoleo.discovery._fit import weights
 from bayesoleo.discovery._hold_out_error import Prediction
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._nuisance import uncertain_conditions
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import without_invented
@@ -131,10 +131,9 @@ def predict(
     ----------
     Gneiting and Raftery (2007); Dawid (1984); Verbeek (1993), section 6.4 (drop tests).
     """
-    if not 0 < level < 1 or draws < 2:
-        raise InputError(
-            "level must lie between 0 and 1, draws be two or more", value=(level, draws)
-        )
+    check_level(level)
+    if draws < 2:
+        raise InputError("draws must be two or more", key="draws", value=draws)
     rng = np.random.default_rng(seed)
     known = draws_of(tree, draws, rng)
     used = model_of(tree) if model is None else model

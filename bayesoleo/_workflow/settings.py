@@ -6,12 +6,12 @@ metadata are set from Python only. This file imports no numerics, so that ``--he
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import Field, dataclass, field, fields
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 
 if TYPE_CHECKING:
     from bayesoleo.discovery._fit import Numerics
@@ -74,21 +74,39 @@ def words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
-def _scheme(name: str) -> str:
-    """Check the name of a scheme."""
-    if name not in SCHEMES:
-        close = difflib.get_close_matches(name, SCHEMES, 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        hint += f"one of: {', '.join(SCHEMES)}"
-        raise InputError("unknown scheme", key="--scheme", value=name, hint=hint)
-    return name
+#: What a setting may be, what it is called, and an example, by the start of its annotation.
+_KINDS: dict[str, tuple[Any, str, str]] = {
+    "int": (Integral, "a whole number", "{least}"),
+    "bool": (bool, "True or False", "True"),
+    "str": (str, "text", '"…"'),
+    "tuple[str": (tuple, "a sequence of names", '("{word}",)'),
+    "tuple[Effect": (
+        tuple, "a sequence of effects", '(bayesoleo.effects.find_effect("{word}"),)',
+    ),
+    "SearchPolicy": (object, "a SearchPolicy", ""),
+}  # fmt: skip
 
 
-def _error_model(word: str) -> str:
-    """Check the name of an error model."""
-    from bayesoleo.error_models._registry import check_word
-
-    return check_word(word)
+def _check_kind(item: Field[Any], value: Any) -> None:
+    """Refuse a value that is no whole number, text, … where the setting is one."""
+    start = next(start for start in _KINDS if str(item.type).startswith(start))
+    kind, called, example = _KINDS[start]
+    if value is None and "None" in str(item.type):
+        return
+    right = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    if right and kind is tuple:
+        right = all(isinstance(one, str) == (start == "tuple[str") for one in value)
+    option = item.metadata.get(OPTION)
+    least = None if option is None else option.shown.get("min")
+    if not right:
+        value = getattr(value, "id", value)  # of a single effect
+        words_ = [value, *value] if isinstance(value, tuple | str) else []
+        word = next((one for one in words_ if isinstance(one, str)), "…")
+        hint = f"write {item.name}={example.format(word=word, least=least)}"
+        raise InputError(f"is not {called}", key=item.name, value=value, hint=hint)
+    if least is not None and value < least:
+        hint = f"write {item.name}={least} or more"
+        raise InputError("is too small", key=item.name, value=value, hint=hint)
 
 
 def _effects(text: str) -> tuple[Effect, ...]:
@@ -167,7 +185,7 @@ class Settings:
     scheme: str = _setting(
         "radau3", str, SOLVING,
         f"Discretisation: {', '.join(SCHEMES)} (second-order backward differences).",
-        read=_scheme, metavar="NAME",
+        metavar="NAME",
     )  # fmt: skip
     steps: int | None = _setting(
         None, int | None, SOLVING, "Steps a period.",
@@ -197,7 +215,7 @@ class Settings:
         "What errors have in common: independent (one variance an output), per-run, full "
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
         "shared-discrepancy (and is partly alike in all runs).",
-        read=_error_model, metavar="NAME",
+        metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(
         (), str, SOLVING,
@@ -223,14 +241,23 @@ class Settings:
 
     def __post_init__(self) -> None:
         from bayesoleo.effects._nonparametric import FAMILY
+        from bayesoleo.error_models._registry import check_word
         from bayesoleo.prediction._periodic_solver import check_solver
 
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.type.startswith("tuple") and isinstance(value, list | set):  # of notebooks
+                object.__setattr__(self, item.name, tuple(value))
+            _check_kind(item, getattr(self, item.name))
+        if self.scheme not in SCHEMES:
+            hint = choose(self.scheme, SCHEMES)
+            raise InputError("unknown scheme", key="scheme", value=self.scheme, hint=hint)
         check_solver(self.solver, self.scheme)
+        check_word(self.error_model)
         known = [effect.id for effect in self._offered] + [FAMILY]
         for name in self.without:
             if name not in known:
-                close = difflib.get_close_matches(name, known, 3)
-                hint = f"did you mean {' or '.join(close)}?" if close else "see bayesoleo effects"
+                hint = choose(name, known, 3)
                 raise InputError("unknown effect", key="without", value=name, hint=hint)
 
     @property

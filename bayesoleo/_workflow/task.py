@@ -41,6 +41,8 @@ TURNED = -0.5
 LARGE = 100.0
 #: A power of ten is looked for where the shapes agree like this, and sizes that well with it.
 ALIKE, NEAR = 0.95, 0.05
+#: K between a temperature in degC and in K, and how near to it a difference is told.
+CELSIUS, NEAR_CELSIUS = 273.15, 40.0
 #: Sizes are compared of what stands above the noise by this factor.
 ABOVE_NOISE = 3.0
 
@@ -58,6 +60,9 @@ class StartCheck:
         With what was measured, about the means; None where either does not move.
     ratio : float or None
         Standard deviation predicted over that measured.
+    below : float or None
+        How far the prediction lies below what was measured where it lies lowest, SI; the quantile
+        at 95 %.
     """
 
     run: str
@@ -65,6 +70,7 @@ class StartCheck:
     status: str
     correlation: float | None = None
     ratio: float | None = None
+    below: float | None = None
 
 
 def starts_of(
@@ -113,14 +119,14 @@ def _compared(record: Record, output: str, predicted: np.ndarray) -> StartCheck:
     measured = record.samples[output][kept]
     moved, seen = predicted[kept] - predicted[kept].mean(), measured - measured.mean()
     size, noise = float(np.std(seen)), record.signal_noise.get(output, 0.0)
-    message = Status.CONVERGED.message
+    message, below = Status.CONVERGED.message, float(np.quantile(measured - predicted[kept], 0.95))
     if size <= ABOVE_NOISE * noise or not np.isfinite(moved).all():
-        return StartCheck(record.label, output, message)
+        return StartCheck(record.label, output, message, below=below)
     ratio = float(np.std(moved)) / size
     correlation = None
     if ratio > 0:
         correlation = float(moved @ seen / (np.linalg.norm(moved) * np.linalg.norm(seen)))
-    return StartCheck(record.label, output, message, correlation, ratio)
+    return StartCheck(record.label, output, message, correlation, ratio, below)
 
 
 def about_start(starts: Sequence[StartCheck], model: Model) -> list[str]:
@@ -142,11 +148,25 @@ def about_start(starts: Sequence[StartCheck], model: Model) -> list[str]:
             f"the model has no solution at its nominal values in {', '.join(failed)}: check signs,"
             " units and nominal values"
         )
-    for output in model.outputs:
+    for output, declared in model.outputs.items():
+        below = [item.below for item in starts if item.output == output and item.below is not None]
+        if declared.unit == "K" and below:
+            found += _about_temperature(output, below)
         own = [item for item in starts if item.output == output and item.ratio is not None]
         if own:
             found += _about_output(output, own, bool(model.dofs))
     return found
+
+
+def _about_temperature(output: str, below: Sequence[float]) -> list[str]:
+    """Whether a model computes in degC although it says K: data in degC are converted to K."""
+    if any(not abs(value - CELSIUS) < NEAR_CELSIUS for value in below):
+        return []
+    return [
+        f"at the nominal values {output} lies {_range(below)} K below what was measured in every "
+        "run, about as far as degC from K: channels in degC are converted to K; write the "
+        "temperatures and the nominal values of the model in K"
+    ]
 
 
 def _by_run(starts: Sequence[StartCheck]) -> list[StartCheck]:

@@ -20,13 +20,12 @@ from bayesoleo.data._campaign_toml import (
     Channel,
     Declaration,
     RunDeclaration,
-    choose,
     read_declaration,
 )
 from bayesoleo.data._files import read_columns
 from bayesoleo.data._registry import dataset_folder
 from bayesoleo.data._sample_quality import Stretches, bridged, impossible_sample, masked
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, check_path, choose
 
 # Names of a time column in seconds that need not be declared.
 _TIME_COLUMNS = tuple(
@@ -283,6 +282,7 @@ def load_campaign(path: str | os.PathLike[str]) -> CampaignData:
     CampaignError
         If the campaign is invalid; one line that says where and why, and how to correct it.
     """
+    check_path(path, "path", hint='write load_campaign("folder")')
     given = Path(path)
     toml = given if given.suffix == ".toml" else given / FILE
     declaration = read_declaration(toml)

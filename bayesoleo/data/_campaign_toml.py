@@ -11,7 +11,6 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
 from typing import Any, cast
@@ -20,7 +19,7 @@ import numpy as np
 
 from bayesoleo._units import Unit, check_kind, parse_unit
 from bayesoleo.data._sample_quality import Stretches, read_stretches
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, choose
 
 FILE = "campaign.toml"
 
@@ -38,14 +37,6 @@ _CONDITION = ("value", "unit", "sd")
 FORMAT = 1
 _TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
 _CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
-
-
-def choose(wrong: str, allowed: Sequence[str] | Mapping[str, Any]) -> str:
-    """What to write instead of ``wrong``: the closest of ``allowed``, or all of them."""
-    names = [str(name) for name in allowed]
-    close = get_close_matches(wrong, names, n=1)
-    listed = ", ".join(names[:30]) + (", ..." if len(names) > 30 else "")
-    return (f"did you mean {close[0]!r}? " if close else "") + f"one of: {listed}"
 
 
 def load_table(path: Path) -> dict[str, Any]:

@@ -17,7 +17,6 @@ import numpy as np
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
 from bayesoleo.data._campaign import CampaignData, Run
-from bayesoleo.data._campaign_toml import choose
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import significant_harmonics, within_bandwidth
 from bayesoleo.data._noise import average_on, innovation_noise, periodic_average
@@ -30,7 +29,7 @@ from bayesoleo.data._sample_quality import (
     step_of,
     whole_periods,
 )
-from bayesoleo.errors import CampaignError, InputError
+from bayesoleo.errors import CampaignError, InputError, choose
 from bayesoleo.prediction._band_limited import band_limited_channels, sample_noise
 from bayesoleo.prediction._records import Record
 

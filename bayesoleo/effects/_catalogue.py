@@ -5,7 +5,6 @@ Sentences for readers use the titles of effects, not their ids.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
@@ -14,7 +13,7 @@ from typing import Any
 from bayesoleo.effects import _damping, _end_stop, _forces, _friction, _gas, _heat, _sensors
 from bayesoleo.effects._effect import Candidate, Effect
 from bayesoleo.effects._parts import Amplitude, Constant, Scales, ShapeParameter
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.model._model import Model
 
 #: The effects of each file, by family.
@@ -49,9 +48,7 @@ def find_effect(id: str) -> Effect:  # noqa: A002 - the word that users of a cat
     """
     known = {effect.id: effect for effect in catalogue()}
     if id not in known:
-        close = difflib.get_close_matches(id, known, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(known)}"
-        raise InputError("unknown effect", value=id, hint=hint)
+        raise InputError("unknown effect", value=id, hint=choose(id, known, 3))
     return known[id]
 
 

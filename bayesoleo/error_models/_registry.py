@@ -18,7 +18,6 @@ word                   errors
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -33,7 +32,7 @@ from bayesoleo.error_models._independent import (
     ProfiledIndependentErrors,
 )
 from bayesoleo.error_models._shared import SharedDiscrepancyErrors
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.model._priors import Prior
 
 
@@ -68,14 +67,8 @@ def check_word(word: str) -> str:
         If there is none.
     """
     if word not in ERROR_MODELS:
-        close = difflib.get_close_matches(word, ERROR_MODELS, 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise InputError(
-            "unknown error model",
-            key="error_model",
-            value=word,
-            hint=f"{hint}one of {', '.join(ERROR_MODELS)}",
-        )
+        hint = choose(word, ERROR_MODELS)
+        raise InputError("unknown error model", key="error_model", value=word, hint=hint)
     return word
 
 

@@ -29,7 +29,7 @@ from scipy.interpolate import PchipInterpolator
 from bayesoleo import _schema as schema
 from bayesoleo._display import LabelledResult
 from bayesoleo._types import Array, Integers
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, check_level, check_names
 from bayesoleo.estimation._identifiability import axes_text, over_variances, principal_axes
 from bayesoleo.estimation._objectives import curvature, inverse_scaled
 from bayesoleo.estimation._point_estimate import PointEstimate
@@ -325,6 +325,7 @@ def indifference(
     """
     chosen = _pairs(problem, pairs)
     if epsilon is None:
+        check_level(level)
         epsilon = 0.5 * float(stats.chi2.isf(1 - level, 2))
     if not epsilon > 0 or points < 8 or points % 2:
         hint = "epsilon must be positive, points an even number from eight"
@@ -363,9 +364,11 @@ def _pairs(
         )
     if pairs is None:
         return list(combinations(range(len(names)), 2))
-    for name in {name for pair in pairs for name in pair}:
-        if name not in names:
-            raise InputError("there is no such unknown", key=name, hint=f"use {', '.join(names)}")
+    example = f'write [("{names[0]}", "{names[1]}")]'
+    for pair in pairs:
+        if isinstance(pair, str) or len(pair) != 2:
+            raise InputError("is not a list of pairs", key="pairs", value=pairs, hint=example)
+        check_names(pair, names, "pairs", example=example)
     return [(names.index(a), names.index(b)) for a, b in pairs]
 
 

@@ -21,7 +21,7 @@ from bayesoleo._display import LabelledResult, columns
 from bayesoleo._types import Array
 from bayesoleo.error_models._fitting import LinearisedResidual, inverse_gram
 from bayesoleo.error_models._independent import output_counts, staged_variance, sums_of_squares
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._objectives import (
     curvature,
@@ -250,7 +250,7 @@ def linearised_intervals(
         ``estimate``, ``sd``, ``low``, ``high`` over ``parameter``, in which a variance appears as
         ``variance[output]``, and ``covariance``.
     """
-    _check_level(level)
+    check_level(level)
     covariance = linearised_covariance(problem, point, form, prior=prior, exact=exact)
     names = [*point.names, *(f"variance[{output}]" for output in point.outputs)]
     values = np.concatenate((point.theta, point.variance))
@@ -294,7 +294,7 @@ def over_experiments(
     ----------
     Verbeek (1993), eqs. 2.18-2.20 and 2.42.
     """
-    _check_level(level)
+    check_level(level)
     table, labels, failed = _table(estimates, names)
     count = len(table)
     if count < 2:
@@ -344,11 +344,6 @@ def _table(
     if len(labels) != table.shape[1]:
         raise InputError("names must have one entry per column", key="names", value=labels)
     return table[good_rows], labels, int((~good_rows).sum())
-
-
-def _check_level(level: float) -> None:
-    if not 0 < level < 1:
-        raise InputError("level must lie between 0 and 1", key="level", value=level)
 
 
 def _dataset(names: list[str], values: Array, covariance: Array, half: Array) -> xr.Dataset:

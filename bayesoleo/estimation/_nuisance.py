@@ -17,7 +17,6 @@ estimator starts from there with the nuisances free.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -30,7 +29,7 @@ from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import substitute
 from bayesoleo.error_models._fitting import LinearisedResidual, least_squares
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.estimation._problem import EstimationProblem, Held
 from bayesoleo.model._correlated_priors import scaled_root
@@ -253,11 +252,8 @@ def declared_nuisance(
     chosen = tuple(dict.fromkeys(kinds))
     for kind in chosen:
         if kind not in KINDS:
-            close = difflib.get_close_matches(kind, KINDS, 1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            raise InputError(
-                "unknown nuisance", key="nuisance", value=kind, hint=f"{hint}one of {_list(KINDS)}"
-            )
+            hint = choose(kind, KINDS)
+            raise InputError("unknown nuisance", key="nuisance", value=kind, hint=hint)
     conditions = _declared_conditions(model, records) if "conditions" in chosen else ()
     sensors = [kind for kind in ("offset", "gain") if kind in chosen]
     if not sensors:

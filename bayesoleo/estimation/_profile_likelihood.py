@@ -24,7 +24,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._display import LabelledResult, columns
 from bayesoleo._types import Array, Float
 from bayesoleo.error_models._independent import output_counts, staged_variance
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, check_level, check_names
 from bayesoleo.estimation._estimate import estimate
 from bayesoleo.estimation._objectives import log_prior
 from bayesoleo.estimation._point_estimate import PointEstimate
@@ -186,14 +186,10 @@ def profile(
     ----------
     Verbeek (1993), eq. 2.43 with one unknown; Bates and Watts (1988), section 6.1.
     """
-    if not 0 < level < 1:
-        raise InputError("level must lie between 0 and 1", key="level", value=level)
-    chosen = list(problem.names) if names is None else list(names)
-    for name in chosen:
-        if name not in problem.names:
-            raise InputError(
-                "there is no such unknown", key=name, hint=f"use {', '.join(problem.names)}"
-            )
+    check_level(level)
+    chosen: Sequence[str] = problem.names if names is None else names
+    check_names(chosen, problem.names, "names", example=f'write ["{problem.names[0]}"]')
+    chosen = list(chosen)
     drop = LogLikelihoodRatio(problem, point, kind)
     limit = float(np.sqrt(stats.chi2.isf(1 - level, 1)))
     covariance = point.covariance if drop.kind == "posterior" else point.covariance_likelihood

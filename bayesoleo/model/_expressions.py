@@ -8,7 +8,6 @@ rather than a new symbol.
 from __future__ import annotations
 
 import ast
-import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
@@ -16,7 +15,7 @@ from functools import cache
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
-from bayesoleo.errors import ModelError
+from bayesoleo.errors import ModelError, choose
 
 #: Seconds since the first sample; for outputs and for transients, a periodic state cannot depend
 #: on it.
@@ -259,10 +258,7 @@ class _Builder(ast.NodeVisitor):
             return sp.pi
         if node.id == "time":
             return TIME
-        close = difflib.get_close_matches(node.id, self.known, 1)
-        hint = (
-            f"did you mean {close[0]}?" if close else f"declared: {', '.join(sorted(self.known))}"
-        )
+        hint = choose(node.id, sorted(self.known))
         raise ModelError(f"{self.where}: unknown name {node.id}", value=self.text, hint=hint)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> sp.Expr:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import sympy as sp
 
-from bayesoleo.errors import ModelError
+from bayesoleo.errors import ModelError, check_number
 from bayesoleo.model._priors import Normal, Prior, TruncatedNormal, Uniform
 
 
@@ -63,6 +63,7 @@ class Parameter:
     nuisance: bool = False
 
     def __post_init__(self) -> None:
+        self._check_numbers()
         if not np.isfinite(self.value):
             raise ModelError("a parameter needs a finite value", value=self.value)
         stated = [self.sd is not None, self.relative_sd is not None, self.prior is not None]
@@ -81,6 +82,28 @@ class Parameter:
                     value=self.value,
                     hint=f"choose a value between {low:g} and {high:g}, or wider bounds",
                 )
+
+    def _check_numbers(self) -> None:
+        """Refuse what is no number or prior before it fails somewhere else."""
+        hint = 'write numbers and the unit by itself: bo.Parameter(1200.0, "N/m", sd=100.0)'
+        for name in ("value", "sd", "relative_sd"):
+            value = getattr(self, name)
+            if value is not None or name == "value":
+                check_number(value, name, hint=hint, kind=ModelError)
+        if not isinstance(self.unit, str):
+            raise ModelError("is not the text of a unit", key="unit", value=self.unit, hint=hint)
+        if self.prior is not None and not hasattr(self.prior, "log_density"):
+            raise ModelError(
+                "is not a prior", key="prior", value=self.prior,
+                hint="write bo.model.Normal(mean, sd), Uniform(low, high) or sd=…",
+            )  # fmt: skip
+        if self.bounds is None:
+            return
+        pair = "write the lowest and the highest value: bounds=(0.0, 10.0)"
+        if not isinstance(self.bounds, Sequence | np.ndarray) or len(self.bounds) != 2:
+            raise ModelError("is not a pair", key="bounds", value=self.bounds, hint=pair)
+        for bound in self.bounds:
+            check_number(bound, "bounds", hint=pair, kind=ModelError)
 
     @property
     def toleranced(self) -> bool:

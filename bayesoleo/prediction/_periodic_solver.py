@@ -11,7 +11,6 @@ later solutions start, and the basis of scores and of the response to input nois
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -20,7 +19,7 @@ from typing import Any, cast
 import numpy as np
 
 from bayesoleo._types import Array, Integers
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
@@ -69,7 +68,7 @@ MOST_ADAPTIVE_STEPS = 20_000
 _ON_UNEQUAL_STEPS = ("radau2", "radau3", "gauss2", "gauss3")
 
 
-def check_solver(name: str, scheme: str = DEFAULT_SCHEME, key: str = "solver") -> str:
+def check_solver(name: str, scheme: str = DEFAULT_SCHEME) -> str:
     """The name of a solver, if there is one that can use the scheme.
 
     Raises
@@ -78,15 +77,12 @@ def check_solver(name: str, scheme: str = DEFAULT_SCHEME, key: str = "solver") -
         If there is no such solver, or it cannot use the scheme.
     """
     if name not in SOLVERS:
-        close = difflib.get_close_matches(name, SOLVERS, 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        hint += f"use {', '.join(SOLVERS)}"
-        raise InputError("unknown solver", key=key, value=name, hint=hint)
+        raise InputError("unknown solver", key="solver", value=name, hint=choose(name, SOLVERS))
     if name in ("adaptive", "hybrid") and scheme not in _ON_UNEQUAL_STEPS:
         hint = f"use scheme {' or '.join(_ON_UNEQUAL_STEPS)}, or solver {COLLOCATION}"
         raise InputError(
             f"scheme {scheme!r} needs equal steps, which this solver does not take",
-            key=key, value=name, hint=hint,
+            key="solver", value=name, hint=hint,
         )  # fmt: skip
     return name
 

@@ -5,7 +5,6 @@ The description of a model also lists its parameters with units and priors.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import sympy as sp
 from sympy.printing.latex import LatexPrinter
 
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose
 from bayesoleo.model._expressions import as_text, bspline, split_derivative
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -161,7 +160,6 @@ def system(name: str) -> Model:
         If there is none; the message names the closest.
     """
     if name not in _SYSTEMS:
-        close = difflib.get_close_matches(name.lower(), _SYSTEMS, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"known: {', '.join(_SYSTEMS)}"
-        raise InputError("unknown system", value=name, hint=f"{hint} (or write file.py:object)")
+        hint = f"{choose(str(name).lower(), _SYSTEMS, 3)} (or write file.py:object)"
+        raise InputError("unknown system", value=name, hint=hint)
     return _SYSTEMS[name]()

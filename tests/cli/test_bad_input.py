@@ -54,7 +54,7 @@ def test_a_transient_to_propose_from_is_refused_before_anything_is_estimated(
 
 BAD_TOML = {
     "no such file": ('file = "slow.csv"', 'file = "slwo.csv"', "slwo.csv, run slow: no such file"),
-    "no such column": ('"f_N"', '"F_N"', "column F_N: no such column; did you mean 'f_N'"),
+    "no such column": ('"f_N"', '"F_N"', "column F_N: no such column; did you mean f_N"),
     "unknown unit": ('unit = "mm"', 'unit = "furlog"', "key channels.displacement.unit: unknown"),
     "other unit": ('unit = "N"', 'unit = "lb"', "channels.force.unit: unit does not measure force"),
     "same label": ('label = "fast"', 'label = "slow"', "run slow, key label: "),
@@ -126,7 +126,7 @@ def test_unknown_options_of_the_model(refused, campaign, model):
     assert "key --scheme: unknown scheme (got 'radau4'); did you mean radau3?" in line
     for command in ("close", "trace", "propose", "check"):
         line = refused(command, campaign, "--model", model, "--without", "play,viscous_dampng")
-        assert "key without: unknown effect (got 'viscous_dampng'); did you mean viscous" in line
+        assert "key --without: unknown effect (got 'viscous_dampng'); did you mean viscous" in line
 
 
 def test_unknown_effect(refused):

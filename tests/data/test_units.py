@@ -86,6 +86,7 @@ def test_unknown_unit():
         ("Bar", "bar"),
         ("barA", "bara"),
         ("Kelvin", "kelvin"),
+        ("degrC", "degC"),
         ("ms-2", "m*s**-2"),
         ("m s-2", "m s**-2"),
     ],

@@ -212,9 +212,9 @@ def test_bad_requests_are_named(bent):
     problem, point, _ = bent
     with pytest.raises(InputError, match="two experiments or more"):
         over_experiments(np.ones((1, 2)))
-    with pytest.raises(InputError, match="level must lie between 0 and 1"):
+    with pytest.raises(InputError, match="key level: must lie between 0 and 1"):
         linearised_intervals(problem, point, level=95)
     with pytest.raises(InputError, match="use 'propagated' or 'posterior'"):
         linearised_intervals(problem, point, "sandwich")
-    with pytest.raises(InputError, match="use size, rate"):
+    with pytest.raises(InputError, match="one of: size, rate"):
         profile(problem, point, ["speed"])

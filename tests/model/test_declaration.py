@@ -106,3 +106,26 @@ def test_one_expression_becomes_numbered_terms():
     model = declare(equations={"q": "m*ddot(q) + k*q - force"})
     assert sorted(model.equations["q"]) == ["term 1", "term 2", "term 3"]
     assert sp.expand(model.equation("q") - sp.Add(*model.equations["q"].values())) == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            {"value": "1200"},
+            r'key value: is not a number \(got \'1200\'\); .*Parameter\(1200.0, "N/m"',
+        ),
+        ({"value": None}, "key value: is not a number"),
+        ({"value": 1.0, "sd": "3"}, r"key sd: is not a number \(got '3'\)"),
+        ({"value": 1.0, "unit": 3}, r"key unit: is not the text of a unit \(got 3\)"),
+        ({"value": 1.0, "bounds": 3}, r"key bounds: is not a pair \(got 3\); .*bounds=\(0\.0"),
+        ({"value": 1.0, "bounds": (0, "1")}, r"key bounds: is not a number \(got '1'\)"),
+        (
+            {"value": 1.0, "prior": 3},
+            r"key prior: is not a prior \(got 3\); write bo\.model\.Normal",
+        ),
+    ],
+)
+def test_what_is_no_parameter(wrong, message):
+    with pytest.raises(ModelError, match=message):
+        Parameter(**wrong)

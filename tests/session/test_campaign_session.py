@@ -13,6 +13,7 @@ import pytest
 
 import bayesoleo as bo
 from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._session import display as figures
 from bayesoleo._session.campaign import Campaign
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
@@ -174,6 +175,44 @@ def test_no_bar_is_shown_for_a_quick_step(campaign: bo.Campaign) -> None:
 def test_what_a_campaign_does_not_take(campaign, wrong, message) -> None:
     with pytest.raises(bo.errors.InputError, match=message):
         bo.Problem(campaign, damper(), **wrong)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"seed": "one"}, r"key seed: is not a whole number \(got 'one'\); write seed=0"),
+        ({"seed": -1}, r"key seed: is too small \(got -1\); write seed=0 or more"),
+        ({"quick": "yes"}, r"key quick: is not True or False \(got 'yes'\); write quick=True"),
+        ({"jobs": 0}, r"key jobs: is too small \(got 0\); write jobs=1 or more"),
+        ({"drive": 3}, r"key drive: is not text \(got 3\)"),
+        ({"nuisance": "offset"}, r'key nuisance: .*got \'offset\'.*write nuisance=\("offset",\)'),
+        ({"between_runs": "mass"}, r'key between_runs: .*write between_runs=\("mass",\)'),
+        ({"without": "play"}, r'key without: .*write without=\("play",\)'),
+        ({"effects": "play"}, r'key effects: .*write effects=\(.*find_effect\("play"\),\)'),
+        ({"effects": ("play",)}, r'key effects: .*write effects=\(.*find_effect\("play"\),\)'),
+        ({"effects": find_effect("play")}, r"key effects: .*got 'play'.*find_effect"),
+        ({"scheme": "radau4"}, r"key scheme: .*got 'radau4'.*did you mean radau3"),
+        ({"error_model": "ful"}, r"key error_model: .*got 'ful'.*did you mean full"),
+    ],
+)
+def test_wrong_settings(setting, message) -> None:
+    with pytest.raises(bo.errors.InputError, match=message):
+        bo.Settings(**setting)
+
+
+def test_settings_from_a_notebook() -> None:
+    assert bo.Settings(nuisance=["gain"], seed=np.int64(3)).nuisance == ("gain",)
+
+
+def test_every_output_is_drawn_with_a_legend(fit: bo.Fit) -> None:
+    data = fit.residuals
+    both = data.merge(data.rename({n: n.replace("force", "other") for n in data.data_vars}))
+    figure = figures.fit_and_residual(both)
+    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    assert [[t.get_text() for t in one.get_texts()] for one in legends] == 2 * [
+        ["measured", "predicted"]
+    ]
+    assert "times the noise of a sample" in repr(fit)
 
 
 def test_settings_of_an_earlier_step(fit: bo.Fit) -> None:

@@ -121,7 +121,7 @@ def test_nothing_is_added_to_a_complete_function(table) -> None:
         (None, line, {"parameters": {"slope": 1.0}}, r"parameters\['slope'\].*got 1\.0.*Parameter"),
         (
             None, line, {"parameters": {"slope": bo.Parameter(1.0, sd=1.0)}},
-            r"argument offset: is neither a column .*line.*offset",
+            r"argument offset: of line is neither a column of the data \(x\) .*offset",
         ),
         (
             None, line, {"parameters": {**SLOPE, "c": bo.Parameter(1.0, sd=1.0)}},
@@ -135,6 +135,20 @@ def test_nothing_is_added_to_a_complete_function(table) -> None:
         (None, line, {"parameters": SLOPE, "drive": "x"}, r"key drive: a function has no such"),
         ({"x": ["a"], "y": [1.0]}, line, {"parameters": SLOPE}, r"data\['x'\].*numbers"),
         (3, line, {"parameters": SLOPE}, r"key data: .*'int'.*\{\"x\": x, \"y\": y\}"),
+        ({"x": ["1"], "y": [1.0]}, line, {"parameters": SLOPE}, r"data\['x'\].*text.*got '1'"),
+        (
+            {"x": [1.0, 2.0, 3.0], "y": [1.0, 2.0]}, line, {"parameters": SLOPE},
+            r"data\['x'\]: has 3 rows, the measured column has 2; give columns of one length",
+        ),
+        (
+            {"t": [1.0], "u": [1.0], "y": [1.0]}, line, {"parameters": SLOPE},
+            r"key model: .*TypeError.*got 'line'.*all columns as a dictionary.*columns: t, u",
+        ),
+        (
+            None, lambda x, theta: theta[2] * x, {"parameters": SLOPE},
+            r"key model: function fails at the start values: IndexError",
+        ),
+        (None, line, {"parameters": ["slope"]}, r"key parameters: is not a dictionary .*write par"),
     ],
 )  # fmt: skip
 def test_what_a_function_does_not_take(table, data, function, options, message) -> None:
@@ -153,6 +167,44 @@ def test_what_a_function_does_not_take(table, data, function, options, message) 
 def test_what_is_no_term(line_fit: bo.Fit, candidates, message) -> None:
     with pytest.raises(bo.errors.InputError, match=message):
         line_fit.explain(candidates=candidates)
+
+
+def test_remainder_beside_its_neighbours_is_told(table, line_fit: bo.Fit) -> None:
+    """The line lacks a cubic term; of a complete function nothing is said (one in 1 000 chance)."""
+    assert "neighbouring residuals are alike (correlation 0." in repr(line_fit)
+    x, rng = table["x"], np.random.default_rng(2)
+    for _ in range(20):
+        data = {"x": rng.permutation(x)}
+        data["y"] = 1.5 * data["x"] + 0.05 * rng.standard_normal(x.size)
+        assert "alike" not in repr(bo.Problem(data, line, parameters=SLOPE).fit())
+
+
+def test_wrong_questions(line_fit: bo.Fit) -> None:
+    for pairs in (["slope", "offset"], "slope"):
+        with pytest.raises(bo.errors.InputError, match=r'key pairs: .*\[\("slope", "offset"\)\]'):
+            line_fit.indifference(pairs)
+    with pytest.raises(bo.errors.InputError, match=r"key pairs: .*got 'slop'.*did you mean slope"):
+        line_fit.indifference([("slop", "offset")])
+    with pytest.raises(
+        bo.errors.InputError, match=r'key names: .*got \'slope\'.*write \["slope"\]'
+    ):
+        line_fit.profile("slope")
+    with pytest.raises(bo.errors.InputError, match=r"key level: is not a number .*level=0\.95"):
+        line_fit.profile(level="high")
+    with pytest.raises(bo.errors.InputError, match=r"key output: .*got 'z'.*one of: y"):
+        line_fit.plot("z")
+    with pytest.raises(bo.errors.InputError, match=r"key seed: .*got 'one'"):
+        line_fit.sample(seed="one")
+    with pytest.raises(bo.errors.InputError, match=r"key path: is not a path \(got 3\)"):
+        line_fit.save(3)
+
+
+@pytest.mark.parametrize("read", [bo.load_campaign, bo.load_result, bo.load_model])
+def test_what_is_no_path(read) -> None:
+    with pytest.raises(
+        bo.errors.InputError, match=rf"is not a path \(got 3\); .*{read.__name__}\("
+    ):
+        read(3)
 
 
 def test_sampling_goes_on_in_its_folder(line_problem: bo.Problem, tmp_path: Path) -> None:

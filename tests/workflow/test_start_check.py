@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo import _workflow as workflow
+from bayesoleo import Campaign, _workflow as workflow
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import StartCheck, about_start
 from bayesoleo.data import CampaignData
 from bayesoleo.errors import DataWarning
-from bayesoleo.model import Model
+from bayesoleo.model import Model, Output, Parameter
+from bayesoleo.prediction import RunPlan, motion
 from bayesoleo.systems import system
 
 
@@ -93,3 +94,28 @@ def test_noise_alone_has_no_size(campaign):
     with pytest.warns(DataWarning, match="nothing in force repeats"):
         plan = workflow.check(replace(campaign, runs=runs), damper(), Settings(jobs=1))
     assert not [text for text in plan["data_warnings"] if "nominal" in text]
+
+
+@pytest.mark.parametrize(("rest", "told_"), [(20.0, True), (290.0, False), (150.0, False)])
+def test_degrees_celsius_in_a_model_are_told(tmp_path, rest, told_):
+    """Data in degC become K; a model with its rest at 20 lies 273 K below them."""
+
+    def box(rest: float) -> Model:
+        return Model(
+            "box",
+            inputs={"power": "W"},
+            dofs={"box": "K"},
+            parameters={
+                "capacity": Parameter(500.0, "J/K", sd=200.0),
+                "loss": Parameter(2.0, "W/K", sd=1.0),
+            },
+            equations={"box": f"capacity*dot(box) + loss*(box - {rest}) - power"},
+            outputs={"temperature": Output("box", "K")},
+        )
+
+    plans = [RunPlan(name, 1e-3, {"power": motion(20.0, [p])}) for name, p in (("a", 10), ("b", 5))]
+    made = Campaign.simulate(tmp_path / "c", box(293.15), plans, noise={"temperature": 0.01})
+    warned = workflow.check(made, box(rest), Settings(jobs=1))["data_warnings"]
+    found = [text for text in warned if "degC" in text]
+    assert len(found) == told_
+    assert all("temperature lies 27" in text and "in K" in text for text in found)
