@@ -60,10 +60,12 @@ _SUBPACKAGES = (
     "error_models",
     "errors",
     "estimation",
+    "gallery",
     "model",
     "plots",
     "posterior",
     "prediction",
+    "results",
     "solvers",
     "systems",
 )

@@ -8,6 +8,9 @@ from .estimating import (
     estimate_each as estimate_each,
     sample as sample,
 )
+from .predicting import (
+    predict as predict,
+)
 from .settings import (
     Settings as Settings,
 )

@@ -133,8 +133,8 @@ class Settings:
     jobs : int, optional
         Threads; by default all cores. Results do not depend on it.
     scheduler : str, optional
-        Other processes or machines that take part: ``local:4``, or the address of a Dask scheduler;
-        see :func:`bayesoleo._dask.connected`. Results do not depend on them either.
+        Other processes or machines that take part: ``local:4``, or the address of a Dask scheduler.
+        Results do not depend on them either.
     quick : bool
         Draw enough for two-digit intervals only.
     effective_size : int
@@ -142,7 +142,7 @@ class Settings:
     scheme : str
         Discretisation: ``radau3`` …, or ``thesis``.
     solver : {"collocation", "adaptive", "shooting", "hybrid", "library"}
-        Of periodic runs; see :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+        Of periodic runs; see :func:`~bayesoleo.prediction.periodic_orbit`.
     steps : int, optional
         Steps of the mesh in a period; by default refined until the estimate no longer moves.
     max_effects : int
@@ -164,8 +164,8 @@ class Settings:
         What the errors of the outputs have in common; see
         :mod:`bayesoleo.error_models`.
     between_runs : tuple of str
-        Parameters that scatter between runs about a mean that is estimated; see
-        :mod:`bayesoleo.posterior._hierarchy`.
+        Parameters that scatter between runs about a mean that is estimated
+        (:func:`bayesoleo.posterior.hierarchical`).
     policy : SearchPolicy
         The numbers by which the search for missing effects decides.
     """

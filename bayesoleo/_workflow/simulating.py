@@ -120,7 +120,7 @@ def simulate_like(
     steps : int, optional
         Steps of the mesh.
     solver : str
-        See :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+        See :func:`~bayesoleo.prediction.periodic_orbit`.
 
     Returns
     -------

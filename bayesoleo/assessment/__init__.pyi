@@ -1,9 +1,5 @@
 from ._assess import (
     assess as assess,
-    assessment_text as assessment_text,
-    correlograms as correlograms,
-    dependence_on as dependence_on,
-    outliers_of as outliers_of,
 )
 from ._residual_breakdown import (
     Series as Series,
@@ -12,7 +8,9 @@ from ._residual_breakdown import (
     series_of_tree as series_of_tree,
 )
 from ._residual_tests import (
+    Dependence as Dependence,
     PredictiveScore as PredictiveScore,
+    ResidualTest as ResidualTest,
     autocorrelation as autocorrelation,
     autocorrelation_time as autocorrelation_time,
     dependence as dependence,

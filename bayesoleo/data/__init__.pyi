@@ -11,19 +11,17 @@ from ._data_warnings import (
     data_warnings as data_warnings,
     drift as drift,
     frequency_warnings as frequency_warnings,
-    motions_per_period as motions_per_period,
-    periods_per_motion as periods_per_motion,
-    record_drifts as record_drifts,
 )
 from ._fourier import (
     HarmonicBasis as HarmonicBasis,
 )
 from ._harmonics import (
     SpectralLine as SpectralLine,
-    foreign_line as foreign_line,
     significant_harmonics as significant_harmonics,
 )
 from ._noise import (
+    LocalAverage as LocalAverage,
+    NoiseSpectrum as NoiseSpectrum,
     PeriodicAverage as PeriodicAverage,
     periodic_average as periodic_average,
 )
@@ -31,7 +29,6 @@ from ._reduction import (
     ReducedCampaign as ReducedCampaign,
     on_grid as on_grid,
     reduce_campaign as reduce_campaign,
-    reduce_run as reduce_run,
 )
 from ._registry import (
     dataset_folder as dataset_folder,
@@ -43,10 +40,6 @@ from ._residual_time_shift import (
     find_frequency as find_frequency,
     period_search as period_search,
     residual_time_shift as residual_time_shift,
-)
-from ._sample_quality import (
-    repeating_rounding as repeating_rounding,
-    step_of as step_of,
 )
 from ._write_campaign import (
     SimulatedRun as SimulatedRun,

@@ -1,21 +1,53 @@
 from ._assembly import (
+    AddedEffect as AddedEffect,
     Assembly as Assembly,
     Option as Option,
+    RecordNoise as RecordNoise,
+    Roles as Roles,
     assign as assign,
+)
+from ._error_table import (
+    ErrorTable as ErrorTable,
+    RunError as RunError,
 )
 from ._fit import (
     ModelFit as ModelFit,
     Numerics as Numerics,
     fit_model as fit_model,
 )
+from ._hold_out_error import (
+    Prediction as Prediction,
+)
+from ._inference import (
+    Inference as Inference,
+)
 from ._loop import (
+    ClosedLoop as ClosedLoop,
     close_loop as close_loop,
+)
+from ._nonparametric_search import (
+    CurveSearch as CurveSearch,
+    Tried as Tried,
 )
 from ._policy import (
     SearchPolicy as SearchPolicy,
 )
+from ._ranking import (
+    Ranked as Ranked,
+)
+from ._refit import (
+    Refit as Refit,
+)
+from ._round import (
+    Progress as Progress,
+    Round as Round,
+)
 from ._scales import (
     scales_of as scales_of,
+)
+from ._score_basis import (
+    Base as Base,
+    RunBase as RunBase,
 )
 from ._score_tests import (
     Score as Score,

@@ -184,7 +184,7 @@ class Numerics:
     scheme : str
         Discretisation.
     solver : str
-        Of periodic runs, see :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+        Of periodic runs, see :func:`~bayesoleo.prediction.periodic_orbit`.
     steps : int or None
         Steps of the mesh; ``None`` refines until the estimate no longer moves.
     jobs : int or None
@@ -192,8 +192,8 @@ class Numerics:
     backend : str
         ``numba`` or ``numpy``.
     scheduler : str or None
-        Other processes or machines for fits that do not depend on each other; see
-        :func:`bayesoleo._dask.connected`.
+        Other processes or machines for fits that do not depend on each other: ``local:4``, or the
+        address of a Dask scheduler.
     policy : SearchPolicy
         By which fits are judged and compared.
     """

@@ -151,11 +151,11 @@ class Tried:
         Logarithm of the probability that noise explains as much, for this function alone, were its
         size known: what functions are chosen by.
     weights : ndarray, shape (K, r)
-        See :class:`~bayesoleo.effects._nonparametric.Spline`.
+        See :class:`~bayesoleo.effects.Spline`.
     expected : ndarray, shape (r,)
         Of the free coefficients.
     contribution : ndarray
-        As of :class:`~bayesoleo.discovery._score_tests.Score`.
+        As of :class:`~bayesoleo.discovery.Score`.
     """
 
     target: str

@@ -14,10 +14,16 @@ from ._force_effect import (
     InternalState as InternalState,
     force_effect as force_effect,
 )
+from ._nonparametric import (
+    Axis as Axis,
+    NonparametricEffect as NonparametricEffect,
+    Spline as Spline,
+)
 from ._parts import (
     Amplitude as Amplitude,
     Constant as Constant,
     Scales as Scales,
+    Scan as Scan,
     ShapeParameter as ShapeParameter,
     velocity_grid as velocity_grid,
 )

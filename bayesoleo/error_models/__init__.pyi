@@ -1,8 +1,12 @@
 from ._base import (
     ErrorModel as ErrorModel,
     Frame as Frame,
+    Measured as Measured,
+    Probit as Probit,
     ProfiledErrorModel as ProfiledErrorModel,
     Quantity as Quantity,
+    Residuals as Residuals,
+    RunSamples as RunSamples,
 )
 from ._correlated import (
     CorrelatedErrors as CorrelatedErrors,
@@ -25,9 +29,7 @@ from ._independent import (
 )
 from ._registry import (
     ERROR_MODELS as ERROR_MODELS,
-    check_word as check_word,
     error_model as error_model,
-    profiled_error_model as profiled_error_model,
 )
 from ._shared import (
     SharedDiscrepancyErrors as SharedDiscrepancyErrors,

@@ -83,7 +83,7 @@ def error_model(
         One of :data:`ERROR_MODELS`.
     problem : Problem
         Problem to fit. All but ``independent`` and ``per-run`` need one that gives residuals by
-        sample, :class:`~bayesoleo.estimation._problem.ResidualProblem`.
+        sample, as a :class:`~bayesoleo.estimation.CampaignProblem` does.
     log_variance_prior : mapping of str to Prior, optional
         By output, the prior of the logarithm of its variance; by default flat.
 

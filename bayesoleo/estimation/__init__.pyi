@@ -36,6 +36,11 @@ from ._intervals import (
 from ._iteration import (
     Iteration as Iteration,
 )
+from ._least_squares import (
+    BatchNormalEquations as BatchNormalEquations,
+    BatchProblem as BatchProblem,
+    WhitenedEquations as WhitenedEquations,
+)
 from ._multiple_shooting import (
     EstimatedTrajectory as EstimatedTrajectory,
     ShootingEstimate as ShootingEstimate,
@@ -60,7 +65,6 @@ from ._per_run import (
 )
 from ._point_estimate import (
     PointEstimate as PointEstimate,
-    as_text as as_text,
     to_dataset as to_dataset,
 )
 from ._problem import (

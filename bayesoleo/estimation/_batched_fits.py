@@ -232,7 +232,7 @@ class Replications:
     covariance : ndarray, shape (R, l, l)
         Linearised, with the prior's precision where the method is BE, without it elsewhere.
     status : ndarray of int, shape (R,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+        Values of :class:`~bayesoleo.solvers.Status`.
     iterations : ndarray of int, shape (R,)
     together : ndarray of bool, shape (R,)
         Which ones never left the batch.

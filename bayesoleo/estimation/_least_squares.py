@@ -59,7 +59,7 @@ class BatchNormalEquations:
     sums : ndarray, shape (L, s)
         Sums of squared residuals.
     status : ndarray of int, shape (L,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`; where it is not ``CONVERGED`` the
+        Values of :class:`~bayesoleo.solvers.Status`; where it is not ``CONVERGED`` the
         numbers mean nothing.
     """
 

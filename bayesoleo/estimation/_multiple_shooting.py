@@ -142,7 +142,7 @@ def multiple_shooting(
     model : Model
     records : sequence of Record
         Reduced runs of a campaign, or arrays through
-        :func:`~bayesoleo.prediction._records.transient_record`. Some of the model's outputs do.
+        :func:`~bayesoleo.prediction.transient_record`. Some of the model's outputs do.
     method : {"mbe", "be", "gauss-newton"}
         As in :func:`~bayesoleo.estimation.estimate`; ``"be"`` ends in the posterior's mode, the
         others in the maximum-likelihood point, for which what is known of constants with a
@@ -180,7 +180,7 @@ def multiple_shooting(
     Examples
     --------
     >>> from bayesoleo.estimation import multiple_shooting
-    >>> from bayesoleo.prediction._records import transient_record
+    >>> from bayesoleo.prediction import transient_record
     >>> from bayesoleo.systems import system
     >>> time = np.linspace(0.0, 2.0, 41)
     >>> model = system("linear_oscillator").with_values({"mass": 1.0})

@@ -75,7 +75,7 @@ class PointEstimate:
         Covariance of the outputs' errors; diagonal unless the objective has correlated errors.
     failures : mapping of str to int
         Trial points that could not be evaluated, by the lower-case name of their
-        :class:`~bayesoleo.solvers._orbit.Status`: steps towards them were halved.
+        :class:`~bayesoleo.solvers.Status`: steps towards them were halved.
     stability : Stability, optional
         Floquet multipliers of each run's periodic solution at the estimate, and how often one
         jumped to another branch during the iteration; None without periodic solutions.

@@ -55,7 +55,7 @@ class Misfit:
     sum_of_squares : ndarray, shape (L, N, s)
         By parameter vector, run and output; NaN where the vector failed.
     status : ndarray of int, shape (L,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+        Values of :class:`~bayesoleo.solvers.Status`.
     """
 
     sum_of_squares: Float[Array, "vectors runs outputs"]

@@ -232,7 +232,7 @@ def sampling_distribution(
         Threads over blocks; by default the cores this process may use.
     scheduler : str, optional
         Other processes or machines that make the blocks instead: ``local:4``, or the address of a
-        Dask scheduler; see :func:`bayesoleo._dask.connected`.
+        Dask scheduler.
     progress : bool or float, optional
         Whether to show a bar.
 

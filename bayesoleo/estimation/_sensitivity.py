@@ -125,8 +125,8 @@ def local_sensitivity(
     theta : array_like, shape (l,)
         Where.
     features : mapping of str to callable, optional
-        See :class:`~bayesoleo.estimation._sensitivity.Features`; by default the mean and
-        the rms of every output.
+        By name, functions of one run's predicted outputs, a mapping of str to ndarray, that return
+        a number; by default the mean of every output and the rms about it.
     per : {"prior", "percent"}, optional
         A step is one standard deviation of the prior, or one per cent of the value.
 

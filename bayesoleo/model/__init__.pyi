@@ -1,13 +1,18 @@
 from ._correlated_priors import (
+    Correlated as Correlated,
     JointNormal as JointNormal,
     sample_of as sample_of,
     with_joint_prior as with_joint_prior,
+)
+from ._derivatives import (
+    Derived as Derived,
 )
 from ._drive import (
     driven_by as driven_by,
     possible_drives as possible_drives,
 )
 from ._kernels import (
+    Kernels as Kernels,
     kernels as kernels,
 )
 from ._model import (
@@ -24,6 +29,9 @@ from ._priors import (
     LogNormal as LogNormal,
     Normal as Normal,
     Prior as Prior,
+    Shape as Shape,
+    Transform as Transform,
+    Transforms as Transforms,
     TruncatedNormal as TruncatedNormal,
     Uniform as Uniform,
 )

@@ -31,9 +31,8 @@ class Model:
     """Equations of motion and outputs as sums of named terms.
 
     Implements ``g(q, q', q'', x, theta) = 0`` with ``y = f(q, q', q'', x, theta)`` (Verbeek 1993,
-    eqs. 2.1-2.3). Expressions are text over declared names (see
-    :mod:`bayesoleo.model._expressions`); ``dot(q)`` and ``ddot(q)`` are time derivatives of dofs
-    *and* inputs.
+    eqs. 2.1-2.3). Expressions are text over declared names, written as in
+    Python; ``dot(q)`` and ``ddot(q)`` are time derivatives of dofs *and* inputs.
 
     Parameters
     ----------

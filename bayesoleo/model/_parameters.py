@@ -148,7 +148,7 @@ class Dof:
         Value with which a transient run starts, over parameters, conditions, channels - as measured
         at the run's first sample, smoothed - and the word ``equilibrium``: the value at rest under
         the first sample's inputs. Periodic runs have no start. By default it is estimated for each
-        transient run; see :mod:`bayesoleo.model._initial_states`.
+        transient run.
     initial_rate : str, float or sympy.Expr, optional
         The velocity at the start, of a dof of second order; zero where only ``initial`` is given.
     """

@@ -40,18 +40,10 @@ from ._residuals import (
     residual as residual,
     residual_breakdown as residual_breakdown,
 )
-from ._stored import (
-    Study as Study,
-    print_before_after as print_before_after,
-)
 from ._style import (
     AFTER as AFTER,
     BEFORE as BEFORE,
     INK as INK,
     SIMILAR as SIMILAR,
-    Scale as Scale,
-    engineering as engineering,
     format_number as format_number,
-    format_unit as format_unit,
-    format_value as format_value,
 )

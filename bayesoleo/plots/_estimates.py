@@ -333,7 +333,7 @@ def prior_sensitivity(data: xr.Dataset) -> Figure:
     Parameters
     ----------
     data : xarray.Dataset
-        From :func:`bayesoleo.posterior._comparison`.
+        From :func:`bayesoleo.posterior.prior_sensitivity`.
 
     Returns
     -------

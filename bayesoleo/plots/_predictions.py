@@ -163,7 +163,7 @@ def forecast(found: LabelledResult | xr.Dataset | xr.DataTree, output: str | Non
     Parameters
     ----------
     found : LabelledResult, xarray.Dataset or xarray.DataTree
-        Of :func:`bayesoleo._workflow.predicting.predict`.
+        Of :meth:`bayesoleo.Fit.predict` or the command ``predict``.
     output : str, optional
         By default the first.
 

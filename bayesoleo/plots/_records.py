@@ -114,7 +114,7 @@ def period_search(search: PeriodSearch, unit: str = "", name: str = "signal") ->
     Parameters
     ----------
     search : PeriodSearch
-        From :func:`bayesoleo.data._residual_time_shift`.
+        From :func:`bayesoleo.data.period_search`.
     unit : str, optional
         SI unit of the signal.
     name : str, optional

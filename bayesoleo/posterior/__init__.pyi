@@ -1,5 +1,6 @@
 from ._comparison import (
     DRAWS as DRAWS,
+    Uniformity as Uniformity,
     compare as compare,
     comparison_text as comparison_text,
     prior_sensitivity as prior_sensitivity,
@@ -7,15 +8,18 @@ from ._comparison import (
     uniformity as uniformity,
 )
 from ._datatree import (
-    choose_draws as choose_draws,
     to_datasets as to_datasets,
 )
 from ._diagnostics import (
     Comparison as Comparison,
     Samples as Samples,
-    compare_with_point as compare_with_point,
+)
+from ._ensembles import (
+    MoveWeights as MoveWeights,
 )
 from ._hierarchy import (
+    HierarchicalUnknowns as HierarchicalUnknowns,
+    Population as Population,
     hierarchical as hierarchical,
 )
 from ._laplace import (
@@ -26,6 +30,7 @@ from ._laplace import (
     laplace_mixture as laplace_mixture,
 )
 from ._log_density import (
+    Density as Density,
     LogDensity as LogDensity,
 )
 from ._mixture import (
@@ -33,4 +38,8 @@ from ._mixture import (
 )
 from ._sampler import (
     sample as sample,
+)
+from ._unknowns import (
+    PlainUnknowns as PlainUnknowns,
+    Unknowns as Unknowns,
 )

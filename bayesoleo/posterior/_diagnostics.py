@@ -216,7 +216,7 @@ class Samples:
     mixture : Mixture
         What the independence move proposed from, in coordinates without bounds.
     autocorrelation_time, effective_size, rhat_nested : ndarray, shape (d,)
-        Diagnostics of :mod:`bayesoleo.posterior._diagnostics`.
+        Integrated autocorrelation time in steps, effective number of draws and nested R-hat.
     acceptance : dict of str to float
         Accepted part of the proposals by kind of move, and ``"all"``, among the kept draws.
     evaluations : int
@@ -228,8 +228,8 @@ class Samples:
     warning : str
         Criteria that were not met; empty otherwise.
     failed : ndarray of int, shape (draws, reasons)
-        Proposals of density zero on the way to each kept draw, by
-        :data:`bayesoleo.posterior._checkpoints.REASONS`.
+        Proposals of density zero on the way to each kept draw, one
+        column for each :class:`~bayesoleo.solvers.Status` that is a failure.
     branch_jumps : int
         Solutions of runs, warm-up included, that left the branch of the one they started from.
         Where there are any, the density may be that of several answers of the model to one input.

@@ -124,7 +124,7 @@ class LogDensity:
     unknowns : Unknowns, optional
         Map from ``p`` coordinates to the problem's unknowns, and their prior; by default one
         coordinate for each unknown, with the problem's prior. See
-        :mod:`bayesoleo.posterior._hierarchy`.
+        :func:`bayesoleo.posterior.hierarchical`.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class LogDensity:
         Rows evaluated so far.
     failures : collections.Counter
         Rows of density zero so far, by the lower-case name of their
-        :class:`~bayesoleo.solvers._orbit.Status`.
+        :class:`~bayesoleo.solvers.Status`.
 
     Raises
     ------

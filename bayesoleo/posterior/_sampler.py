@@ -166,13 +166,12 @@ def sample(
         Shorter warm-up, an effective size of at most 200 and not more than
         :data:`QUICK_EVALUATIONS`.
     climbs : int, optional
-        Starting points of the search for modes that the start does not have
-        (:mod:`~bayesoleo.posterior._mode_search`), by default :data:`CLIMBS`, or
-        :data:`QUICK_CLIMBS`; zero disables it. Without the search, walkers that all start in one
+        Starting points of the search for modes that the start does not have, by default
+        32, with ``quick`` 16; zero disables it. Without the search, walkers that all start in one
         mode reach their effective sample size there and miss others.
     scheduler : str, optional
         Processes or machines that evaluate the density: ``local:4``, or the address of a Dask
-        scheduler; see :func:`bayesoleo._dask.connected`. The draws are the same.
+        scheduler. The draws are the same.
 
     Returns
     -------

@@ -1,6 +1,13 @@
+from ._band_limited import (
+    Smoothed as Smoothed,
+)
 from ._branches import (
+    AnswerBranch as AnswerBranch,
     follow_branch as follow_branch,
     limit_cycle as limit_cycle,
+)
+from ._filtering import (
+    Band as Band,
 )
 from ._inputs import (
     dynamics_of as dynamics_of,
@@ -10,16 +17,21 @@ from ._orbits import (
     periodic_orbit as periodic_orbit,
 )
 from ._periodic_run import (
+    PredictedSamples as PredictedSamples,
     RunPredictor as RunPredictor,
 )
 from ._periodic_solver import (
+    PeriodicMotion as PeriodicMotion,
     periodic_problem as periodic_problem,
 )
 from ._predictor import (
     Predictor as Predictor,
+    RunPrediction as RunPrediction,
 )
 from ._records import (
+    Harmonics as Harmonics,
     Record as Record,
+    Signal as Signal,
     transient_record as transient_record,
 )
 from ._simulate import (
@@ -28,4 +40,7 @@ from ._simulate import (
     motion as motion,
     record_of as record_of,
     simulate_run as simulate_run,
+)
+from ._stability import (
+    Stability as Stability,
 )

@@ -54,7 +54,7 @@ class AnswerBranch:
 
     along: str
     branch: Branch
-    answers: _Answers
+    _answers: _Answers
     units: Mapping[str, str]
 
     @property
@@ -73,11 +73,11 @@ class AnswerBranch:
 
     def swing_of(self, point: BranchPoint, output: str) -> float:
         """The same at one orbit."""
-        return 0.5 * float(np.ptp(self.answers.output(point, output)))
+        return 0.5 * float(np.ptp(self._answers.output(point, output)))
 
     def output(self, point: BranchPoint, output: str) -> Array:
         """An output over the points of one period, shape (N,); SI."""
-        return self.answers.output(point, output)
+        return self._answers.output(point, output)
 
     def __repr__(self) -> str:
         unit = self.units[self.along]

@@ -69,7 +69,7 @@ class PeriodicOrbits:
 
     @property
     def status(self) -> Integers:
-        """Values of :class:`~bayesoleo.solvers._orbit.Status`, shape (L,): look here first."""
+        """Values of :class:`~bayesoleo.solvers.Status`, shape (L,): look here first."""
         return np.array([int(orbit.status) for orbit in self.orbits], dtype=np.int64)
 
     @property

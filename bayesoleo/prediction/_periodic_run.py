@@ -48,7 +48,7 @@ class PredictedSamples:
     y_p : ndarray, shape (L, ny, na, N), or None
         Derivatives with respect to the active parameters.
     status : ndarray of int, shape (L,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+        Values of :class:`~bayesoleo.solvers.Status`.
     jumped : ndarray of bool, shape (L,), or None
         Whether a periodic solution left the branch of the anchor from which it was started, or
         changed the number of its unstable multipliers; None where there is no such thing.
@@ -364,7 +364,7 @@ class RunPredictor:
         of failed lanes mean nothing.
 
         The same as comparing :meth:`predict` with the measurement, but fused where there is
-        compiled code for it (:mod:`bayesoleo.prediction._sum_of_squares`).
+        compiled code for it.
         """
         fused = self._fused_squares()
         if fused is None:

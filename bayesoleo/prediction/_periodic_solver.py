@@ -116,7 +116,7 @@ class PeriodicSolver:
     Parameters
     ----------
     name : {"adaptive", "shooting", "hybrid", "library"}
-        See :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+        See :func:`~bayesoleo.prediction.periodic_orbit`.
     model : Model
         In the drive in which it is solved.
     kernels : Kernels
@@ -391,7 +391,7 @@ class SolvedRun(RunPredictor):
     scheme_name : str
         Of the meshes.
     solver : {"adaptive", "shooting", "hybrid", "library"}
-        See :func:`~bayesoleo.prediction._orbits.periodic_orbit`.
+        See :func:`~bayesoleo.prediction.periodic_orbit`.
     backend : {"numba", "numpy"}
         Of the kernels on an adaptive mesh; integrators take compiled ones, since calling NumPy's
         step by step takes minutes.

@@ -131,9 +131,9 @@ class Predictor:
     steps : int
         Steps of the mesh in a period; how finely the steps of transients are cut.
     scheme : str
-        Discretisation, see :func:`bayesoleo.solvers._schemes.scheme`.
+        Discretisation: ``radau2``, ``radau3``, ``gauss2``, ``gauss3`` or ``thesis``.
     solver : str
-        Of periodic runs, see :func:`~bayesoleo.prediction._orbits.periodic_orbit`; a transient is
+        Of periodic runs, see :func:`~bayesoleo.prediction.periodic_orbit`; a transient is
         solved by collocation.
     backend : {"numba", "numpy"}
         Kernels; NumPy's are ready at once.

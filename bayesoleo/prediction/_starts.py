@@ -126,7 +126,7 @@ class StartStates:
     by_parameter : ndarray, shape (L, D, na)
         Its derivatives.
     status : ndarray of int, shape (L,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+        Values of :class:`~bayesoleo.solvers.Status`.
     """
 
     state: Float[Array, "vectors states"]

@@ -21,7 +21,7 @@ from bayesoleo.solvers._period_arrangement import total
 
 
 class Places(NamedTuple):
-    """A :class:`~bayesoleo.solvers._collocation.SamplePlan` in blocks: index and position
+    """A :class:`~bayesoleo.solvers.SamplePlan` in blocks: index and position
     (blocks, BLOCK), weights (blocks, s, BLOCK)."""
 
     index: Any  # whole numbers; tuples have a method of this name

@@ -245,7 +245,7 @@ def solve_adaptive(
         A guess: values and derivatives of all dofs, shape (nz, N), at phases in cycles; or what
         another solution's :meth:`AdaptiveSolution.start` gives.
     method : str
-        A collocation method, see :func:`~bayesoleo.solvers._mesh.tableau`.
+        A collocation method: ``radau2``, ``radau3``, ``gauss2`` or ``gauss3``.
     tolerance : float
         Estimated largest error of a state, anywhere in the period, over that state's swing.
     max_steps : int
@@ -398,7 +398,7 @@ def solve_stiffening(
     Parameters
     ----------
     problem, p, start
-        As for :func:`~bayesoleo.solvers._adaptive_mesh.solve_adaptive`, the stiffness at its full
+        As for :func:`~bayesoleo.solvers.solve_adaptive`, the stiffness at its full
         value.
     index : int
         Of the stiffness among the constants.

@@ -67,7 +67,7 @@ class Dynamics:
         return sum(self.orders)
 
     def addresses(self) -> loop.Addresses:
-        """The kernels as :func:`bayesoleo.solvers._march.march` takes them."""
+        """The kernels as the compiled integrator takes them."""
         k = self.kernels
         used = (k.jacobian, k.parameters, k.output, k.output_jacobian, k.admissible)
         return loop.Addresses(*(kernel.address for kernel in used))

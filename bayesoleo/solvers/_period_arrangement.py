@@ -295,7 +295,7 @@ def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
 
 
 class Options(NamedTuple):
-    """How the iteration goes; see :func:`bayesoleo.solvers._periodic.solve_periodic`."""
+    """How the iteration goes; see :func:`bayesoleo.solvers.solve_periodic`."""
 
     max_iterations: int
     monotone: bool

@@ -155,7 +155,7 @@ class Solution:
     x : ndarray, shape (L, n, w)
         The scheme's unknowns.
     status : ndarray of int, shape (L,)
-        Values of :class:`~bayesoleo.solvers._orbit.Status`.
+        Values of :class:`~bayesoleo.solvers.Status`.
     iterations : ndarray of int, shape (L,)
         Newton iterations.
     """

@@ -7,7 +7,6 @@ from ._oleo import (
     drop_test as drop_test,
 )
 from ._systems import (
-    as_latex as as_latex,
     describe as describe,
     equations as equations,
     equations_latex as equations_latex,

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo
-from bayesoleo.plots import Study
+from bayesoleo.gallery import Study
 from bayesoleo.prediction import Predictor, transient_record
 from bayesoleo.systems import drop_test
 

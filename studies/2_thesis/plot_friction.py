@@ -20,8 +20,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo as bo
+from bayesoleo.gallery import Study
 from bayesoleo.model import driven_by
-from bayesoleo.plots import Study
 from bayesoleo.prediction import RunPlan, motion
 
 amplitude = bo.Parameter(100.0, "N", relative_sd=1.0, by_run=True)

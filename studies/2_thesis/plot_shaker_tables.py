@@ -19,8 +19,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo as bo
+from bayesoleo.gallery import Study
 from bayesoleo.model import driven_by
-from bayesoleo.plots import AFTER, BEFORE, Study
+from bayesoleo.plots import AFTER, BEFORE
 from bayesoleo.prediction import RunPlan, motion
 
 known = {"initial_pressure": 4.9e5, "ambient_temperature": 293.0}

@@ -18,8 +18,8 @@ import matplotlib.pyplot as plt
 
 import bayesoleo as bo
 from bayesoleo.effects import Scales, find_effect
+from bayesoleo.gallery import Study
 from bayesoleo.model import driven_by
-from bayesoleo.plots import Study
 from bayesoleo.prediction import RunPlan, motion
 
 oleo, known = bo.system("f16n2d2"), {"initial_pressure": 4.9e5, "ambient_temperature": 293.0}

@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import bayesoleo as bo
 from bayesoleo import Model, Output, Parameter, plots
 from bayesoleo.effects import find_effect
-from bayesoleo.plots import Study, print_before_after
+from bayesoleo.gallery import Study, print_before_after
 from bayesoleo.prediction import RunPlan, motion
 
 DECLARATION = """

@@ -21,7 +21,8 @@ import numpy as np
 
 import bayesoleo as bo
 from bayesoleo.effects import find_effect
-from bayesoleo.plots import AFTER, BEFORE, Study
+from bayesoleo.gallery import Study
+from bayesoleo.plots import AFTER, BEFORE
 
 campaign = bo.Campaign.demo(Path(tempfile.mkdtemp()) / "campaign")
 effects = [find_effect(n) for n in ("stribeck_friction", "linear_stiffness", "viscous_damping")]

@@ -18,8 +18,8 @@ from pathlib import Path
 import bayesoleo as bo
 from bayesoleo import plots
 from bayesoleo.effects import find_effect
+from bayesoleo.gallery import Study
 from bayesoleo.model import driven_by
-from bayesoleo.plots import Study
 from bayesoleo.prediction import RunPlan, motion
 
 

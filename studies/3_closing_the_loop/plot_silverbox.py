@@ -21,7 +21,7 @@ import numpy as np
 import bayesoleo as bo
 from bayesoleo import Model, Output, Parameter
 from bayesoleo.effects import called, find_effect
-from bayesoleo.plots import Study, print_before_after
+from bayesoleo.gallery import Study, print_before_after
 from bayesoleo.prediction import RunPlan, motion
 
 BLOCKS = (("block 1", 17.354, 35.799, "fit"), ("block 2", 195.584, 214.030, "hold-out"))

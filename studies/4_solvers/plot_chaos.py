@@ -21,7 +21,7 @@ from scipy.integrate import solve_ivp
 import bayesoleo
 from bayesoleo import plots
 from bayesoleo.estimation import multiple_shooting
-from bayesoleo.plots import Study
+from bayesoleo.gallery import Study
 from bayesoleo.prediction import transient_record
 
 

@@ -25,7 +25,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo as bo
-from bayesoleo.plots import Study
+from bayesoleo.gallery import Study
 from bayesoleo.prediction import RunPlan, motion, periodic_orbit
 
 model = bo.system("end_stop")

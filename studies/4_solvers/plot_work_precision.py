@@ -18,7 +18,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import bayesoleo as bo
-from bayesoleo.plots import AFTER, BEFORE, INK, SIMILAR, Study
+from bayesoleo.gallery import Study
+from bayesoleo.plots import AFTER, BEFORE, INK, SIMILAR
 from bayesoleo.prediction import RunPlan, motion, periodic_orbit
 
 model = bo.system("f16n2d1").with_values({"friction_base": 0.0, "friction_per_pressure": 0.0})

@@ -23,8 +23,8 @@ import numpy as np
 
 from bayesoleo.error_models import error_model
 from bayesoleo.estimation import FunctionProblem
+from bayesoleo.gallery import Study
 from bayesoleo.model import Normal
-from bayesoleo.plots import Study
 from bayesoleo.posterior import LogDensity, laplace_mixture, rank_of, sample, uniformity
 
 position = np.linspace(0.0, 0.9, 100)

@@ -22,7 +22,7 @@ import numpy as np
 
 import bayesoleo as bo
 from bayesoleo import plots
-from bayesoleo.plots import Study
+from bayesoleo.gallery import Study
 
 campaign = bo.Campaign.demo(Path(tempfile.mkdtemp()) / "campaign", seed=0)
 TRUTH = {

@@ -20,8 +20,8 @@ import numpy as np
 from bayesoleo import plots
 from bayesoleo.assessment import assess
 from bayesoleo.estimation import FunctionProblem, estimate, over_experiments, sampling_distribution
+from bayesoleo.gallery import Study
 from bayesoleo.model import Normal
-from bayesoleo.plots import Study
 
 position = np.linspace(0.0, 0.9, 100)
 NOISE = 0.005 * 10**1.2

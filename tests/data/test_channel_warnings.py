@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 from small_campaigns import damper_campaign, spring_damper_force
 
-from bayesoleo.data import data_warnings, foreign_line, repeating_rounding, step_of
-from bayesoleo.data._harmonics import foreign_lines
-from bayesoleo.data._sample_quality import clipped, rounding_that_repeats
+from bayesoleo.data import data_warnings
+from bayesoleo.data._harmonics import foreign_line, foreign_lines
+from bayesoleo.data._sample_quality import (
+    clipped,
+    repeating_rounding,
+    rounding_that_repeats,
+    step_of,
+)
 
 FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
 

@@ -12,13 +12,12 @@ from bayesoleo.data import (
     data_warnings,
     drift,
     load_campaign,
-    motions_per_period,
     on_grid,
     period_search,
-    periods_per_motion,
     reduce_campaign,
     write_campaign,
 )
+from bayesoleo.data._data_warnings import motions_per_period, periods_per_motion
 from bayesoleo.errors import InputError
 
 PER_PERIOD, PERIODS = 200.37, 6

@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from bayesoleo.plots import _stored as stored_module
+from bayesoleo import gallery as stored_module
 
 STUDIES = Path(__file__).resolve().parents[2] / "studies"
 PAGES = sorted(STUDIES.glob("*/plot_*.py"))

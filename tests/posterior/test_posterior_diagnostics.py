@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bayesoleo.posterior import compare_with_point
 from bayesoleo.posterior._diagnostics import (
     autocorrelation_time,
+    compare_with_point,
     effective_size,
     nested_rhat,
     rhat_limit,

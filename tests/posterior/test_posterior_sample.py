@@ -8,8 +8,9 @@ from posterior_gas_spring import gas_spring, quadrature
 from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
-from bayesoleo.posterior import LogDensity, Mixture, choose_draws, laplace_mixture, sample
+from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
+from bayesoleo.posterior._datatree import choose_draws
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:

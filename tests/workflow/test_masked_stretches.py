@@ -14,7 +14,8 @@ from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.assessment import assess
-from bayesoleo.data import load_campaign, reduce_campaign, reduce_run
+from bayesoleo.data import load_campaign, reduce_campaign
+from bayesoleo.data._reduction import reduce_run
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import Numerics, without_masked
 from bayesoleo.discovery._scales import scales_of

@@ -30,6 +30,8 @@ from bayesoleo.effects._catalogue import called
 from bayesoleo.plots._discovery import chosen
 from bayesoleo.plots._style import engineering, format_number
 
+__all__ = ["Study", "print_before_after"]
+
 DPI = 100
 
 
