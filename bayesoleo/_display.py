@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import xarray as xr
+
+from bayesoleo import _schema as schema
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,3 +52,8 @@ def columns(head: list[str], rows: list[list[str]]) -> str:
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def variable(dims: tuple[str, ...], values: Any, name: str, unit: str) -> xr.Variable:
+    """A variable with a title for people and its unit."""
+    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})

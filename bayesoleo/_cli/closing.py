@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -188,12 +188,10 @@ def demo(
 
     shell.check_writable(out)
     chosen = replace(chosen, quick=not full)
-    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
-    with shell.stoppable(out):
-        callback("simulating a shaker campaign of an oleo")
+    with shell.stoppable(out, quiet) as told:
+        told["callback"]("simulating a shaker campaign of an oleo")
         campaign = _fresh_campaign(out, chosen.seed, demo_campaign)
-        model = load_model(DEMO_SYSTEM)
-        _closed(campaign, model, chosen, out, callback, progress)
+        _closed(campaign, load_model(DEMO_SYSTEM), chosen, out, told)
 
 
 def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
@@ -252,27 +250,18 @@ def close(
     from bayesoleo._workflow.model_files import load_model
 
     folder = shell.output_folder(out, campaign)
-    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
-    declared = load_model(model)
-    with shell.stoppable(folder):
-        _closed(campaign, declared, chosen, folder, callback, progress)
+    with shell.stoppable(folder, quiet) as told:
+        _closed(campaign, load_model(model), chosen, folder, told)
 
 
 def _closed(
-    campaign: Path,
-    model: Model,
-    chosen: Settings,
-    folder: Path,
-    callback: Callable[[str], None],
-    progress: bool,
+    campaign: Path, model: Model, chosen: Settings, folder: Path, told: Mapping[str, Any]
 ) -> None:
     """Close the loop and print what came out, also where a late stage failed."""
     from bayesoleo import _workflow as workflow
 
     try:
-        tree = workflow.close(
-            campaign, model, chosen, out=folder, callback=callback, progress=progress
-        )
+        tree = workflow.close(campaign, model, chosen, out=folder, **told)
     except UnfinishedError as error:
         _print_loop(error.tree, folder)
         raise

@@ -219,13 +219,20 @@ def one_line_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def stoppable(folder: Path | None) -> Iterator[None]:
+def stoppable(folder: Path | None, quiet: bool = True) -> Iterator[dict[str, Any]]:
     """Turn an interrupt into a line that says what is kept in a folder.
 
     Parameters
     ----------
     folder : Path or None
         Where the command writes, if it does.
+    quiet : bool
+        Whether to show no progress.
+
+    Yields
+    ------
+    dict
+        ``callback`` and ``progress``, as steps of the workflow take them.
 
     Raises
     ------
@@ -233,7 +240,7 @@ def stoppable(folder: Path | None) -> Iterator[None]:
         In place of KeyboardInterrupt.
     """
     try:
-        yield
+        yield {"callback": teller(quiet), "progress": progress_shown(quiet)}
     except KeyboardInterrupt as stop:
         raise Stopped(f"stopped: {kept_in(folder)}") from stop
 

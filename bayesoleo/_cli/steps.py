@@ -111,7 +111,7 @@ def estimate(
 
     Prints start, MBE point, mode and linearised standard deviation. Writes nothing without --out;
     with it, results.nc in that folder; with --each, each.nc. A transient is predicted from its
-    start: for chaotic records use bayesoleo.estimation._multiple_shooting in Python.
+    start: for chaotic records use bayesoleo.estimation.multiple_shooting in Python.
 
     \b
     Examples:
@@ -228,12 +228,8 @@ def sample(
     from bayesoleo._workflow.model_files import load_model
 
     folder = shell.output_folder(out, campaign, "-sample")
-    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
-    declared = load_model(model)
-    with shell.stoppable(folder):
-        tree = workflow.sample(
-            campaign, declared, chosen, out=folder, callback=callback, progress=progress
-        )
+    with shell.stoppable(folder, quiet) as told:
+        tree = workflow.sample(campaign, load_model(model), chosen, out=folder, **told)
     console = shell.console()
     summary = Posterior(tree).summary()
     shell.say(summary)
@@ -270,12 +266,8 @@ def trace(
 
     if out is not None:
         out = shell.output_folder(out, campaign)
-    callback, progress = shell.teller(quiet), shell.progress_shown(quiet)
-    declared = load_model(model)
-    with shell.stoppable(out):
-        tree = workflow.trace(
-            campaign, declared, chosen, out=out, callback=callback, progress=progress
-        )
+    with shell.stoppable(out, quiet) as told:
+        tree = workflow.trace(campaign, load_model(model), chosen, out=out, **told)
     summary = json.loads(tree.attrs[schema.SUMMARY])
     console = shell.console()
     first = summary["rounds"][0]

@@ -21,7 +21,7 @@ from bayesoleo import _schema as schema, plots
 from bayesoleo._display import LabelledResult, columns
 from bayesoleo._report.page import write_report
 from bayesoleo._report.terminal import print_summary
-from bayesoleo._session import display as figures, display as residuals
+from bayesoleo._session import display
 from bayesoleo._session.campaign import DELAY, Campaign, status_line
 from bayesoleo._session.campaign_work import (
     SAMPLING,
@@ -166,7 +166,7 @@ class Fit(Stored):
     @property
     def residuals(self) -> xr.Dataset:
         """Residual, measurement and prediction of each fitted run, ``(run, sample)``."""
-        return residuals.residuals(self.tree)
+        return display.residuals(self.tree)
 
     def plot(self, output: str | None = None) -> Figure:
         """Measurement, prediction and residual of each run.
@@ -176,7 +176,7 @@ class Fit(Stored):
         output : str, optional
             Channel; by default all.
         """
-        return figures.fit_and_residual(self.residuals, output)
+        return display.fit_and_residual(self.residuals, output)
 
     @kept
     def profile(
@@ -352,7 +352,7 @@ class Fit(Stored):
             point[schema.OUTPUT].values, point[schema.VARIANCE].values, strict=True
         ):
             sd = float(np.sqrt(variance))
-            more = residuals.misfit(self.tree, name, sd)
+            more = display.misfit(self.tree, name, sd)
             lines.append(f"{name}: residual standard deviation {sd:.4g}{more}")
         more = "; fit.assess() and fit.explain() test whether the model is complete"
         lines.append(str(point.attrs["status_message"]) + more)
@@ -478,7 +478,7 @@ class Explanation(Stored):
         """Error of each run before and after; of a function, the fit with the added terms."""
         if schema.SUMMARY in self.tree.attrs:
             return plots.error(self.tree)
-        return figures.fit_and_residual(residuals.residuals(self.tree))
+        return display.fit_and_residual(display.residuals(self.tree))
 
     @kept
     def sample(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
 from bayesoleo._workflow.simulating import model_of, parameter_sets
 from bayesoleo.assessment._residual_breakdown import judged_errors
@@ -351,12 +351,12 @@ def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> 
     return xr.Dataset(
         {
             **{
-                key: _variable(grid, tables[key], text, own if in_unit else "1")
+                key: variable(grid, tables[key], text, own if in_unit else "1")
                 for key, (text, in_unit) in _NUMBERS.items()
             },
-            "pit": _variable((*grid, "bin"), pit, "density of the transform", "1"),
-            **{key: _variable(each, band, key, own) for key, band in bands.items()},
-            schema.TIME: _variable((schema.RUN, "point"), time, "time since the first sample", "s"),
+            "pit": variable((*grid, "bin"), pit, "density of the transform", "1"),
+            **{key: variable(each, band, key, own) for key, band in bands.items()},
+            schema.TIME: variable((schema.RUN, "point"), time, "time since the first sample", "s"),
             "failed": ((schema.RUN,), failed),
             schema.UNIT: ((schema.OUTPUT,), units),
         },
@@ -372,10 +372,6 @@ def _shown(record: Record) -> NDArray[np.int64]:
     """Samples of the first span, thinned out."""
     first = int(np.searchsorted(record.position, 1.0 + 1e-9))
     return np.unique(np.linspace(0, first - 1, min(first, POINTS)).round().astype(np.int64))
-
-
-def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
 
 def forecast_text(data: xr.Dataset) -> str:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.assessment import _residual_tests as tests
 from bayesoleo.assessment._residual_breakdown import Series, series_of_problem, series_of_tree
@@ -256,23 +256,23 @@ def _dataset(series: Sequence[Series]) -> xr.Dataset:
     data = xr.Dataset(
         {
             **{
-                key: _variable(
+                key: variable(
                     grid, table, _NUMBERS[key], "output's SI unit" if key in _IN_UNIT else "1"
                 )
                 for key, table in tables.items()
             },
-            "share": _variable((*grid, "variable"), share, "part of the variance explained", "1"),
-            "share_p": _variable((*grid, "variable"), share_p, "its probability", "1"),
-            "outlier_time": _variable((*grid, "rank"), far_time, "time of the outlier", "s"),
-            "outlier_score": _variable(
+            "share": variable((*grid, "variable"), share, "part of the variance explained", "1"),
+            "share_p": variable((*grid, "variable"), share_p, "its probability", "1"),
+            "outlier_time": variable((*grid, "rank"), far_time, "time of the outlier", "s"),
+            "outlier_score": variable(
                 (*grid, "rank"), far_score, "distance of the outlier in robust sd", "1"
             ),
-            "correlogram": _variable((*grid, "lag"), whole, "autocorrelation of the residual", "1"),
-            "noise_correlogram": _variable(
+            "correlogram": variable((*grid, "lag"), whole, "autocorrelation of the residual", "1"),
+            "noise_correlogram": variable(
                 (*grid, "lag"), noise, "autocorrelation of what does not repeat", "1"
             ),
             **{
-                key: _variable((schema.OUTPUT,), np.array([row[key] for row in across]), text, "1")
+                key: variable((schema.OUTPUT,), np.array([row[key] for row in across]), text, "1")
                 for key, text in ACROSS.items()
             },
             schema.UNIT: ((schema.OUTPUT,), np.array([units[o] for o in outputs], dtype=object)),
@@ -287,10 +287,6 @@ def _dataset(series: Sequence[Series]) -> xr.Dataset:
     periodic = {one.run: one.periodic for one in series}
     data.attrs = {"series": len(series), "periodic": int(all(periodic.values()))}
     return data
-
-
-def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
 
 def _shares(series: Series, names: Sequence[str]) -> tuple[Array, Array]:

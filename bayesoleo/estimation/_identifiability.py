@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._objectives import curvature
@@ -74,15 +74,15 @@ def principal_axes(
     one = {"prior": "prior standard deviations", "value": "part of the value"}[scale]
     data = xr.Dataset(
         {
-            "information": _variable(("axis",), information, "information of the data", "1"),
-            schema.SD: _variable(("axis",), sd, "standard deviation along the axis", one),
-            "direction": _variable(
+            "information": variable(("axis",), information, "information of the data", "1"),
+            schema.SD: variable(("axis",), sd, "standard deviation along the axis", one),
+            "direction": variable(
                 ("axis", schema.PARAMETER), vectors.T, "direction in scaled parameters", "1"
             ),
-            "words": _variable(
+            "words": variable(
                 ("axis",), np.array([say(v, names) for v in vectors.T], object), "axis", ""
             ),
-            "scale": _variable((schema.PARAMETER,), unit, "scale", "unit of each parameter"),
+            "scale": variable((schema.PARAMETER,), unit, "scale", "unit of each parameter"),
         },
         coords={schema.PARAMETER: names},
     )
@@ -133,10 +133,6 @@ def _unit(problem: EstimationProblem, point: PointEstimate, scale: Scale) -> Arr
             hint="use scale='prior'",
         )
     return np.abs(point.theta)
-
-
-def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
 
 def axes_text(data: xr.Dataset) -> str:

@@ -311,10 +311,6 @@ def _largest(records: Sequence[Record], channel: str) -> float:
     return max(float(np.abs(record.samples[channel]).max()) for record in records)
 
 
-def _list(words: Sequence[str]) -> str:
-    return ", ".join(words)
-
-
 def _sd_of(condition: str) -> str:
     return f"{condition}_sd"
 

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
+from bayesoleo._display import variable
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.prediction._stability import Stability
@@ -244,10 +245,6 @@ def to_dataset(
     return dataset.assign_coords(method=(schema.ITERATION, _methods(stages)))
 
 
-def _variable(dims: tuple[str, ...], values: object, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {"long_name": name, "units": unit})
-
-
 def _parameters(
     point: PointEstimate, mbe: PointEstimate | None, units: Sequence[str] | None
 ) -> dict[str, xr.Variable]:
@@ -258,20 +255,20 @@ def _parameters(
     reached = robust.theta if robust is not None and is_mbe else np.full(len(point.names), np.nan)
     labels = [""] * len(point.names) if units is None else list(units)
     return {
-        schema.START: _variable(dims, start, "start of the estimate", _MIXED),
-        schema.MBE: _variable(dims, reached, "modified Bayesian estimate", _MIXED),
-        schema.ESTIMATE: _variable(dims, point.theta, "estimate", _MIXED),
-        schema.SD: _variable(dims, point.sd, "linearised standard deviation", _MIXED),
-        schema.UNIT: _variable(dims, np.array(labels, dtype=object), "unit of the parameter", ""),
+        schema.START: variable(dims, start, "start of the estimate", _MIXED),
+        schema.MBE: variable(dims, reached, "modified Bayesian estimate", _MIXED),
+        schema.ESTIMATE: variable(dims, point.theta, "estimate", _MIXED),
+        schema.SD: variable(dims, point.sd, "linearised standard deviation", _MIXED),
+        schema.UNIT: variable(dims, np.array(labels, dtype=object), "unit of the parameter", ""),
     }
 
 
 def _spread(point: PointEstimate) -> dict[str, xr.Variable]:
     square = (schema.PARAMETER, schema.PARAMETER_COLUMN)
-    covariance = _variable(
+    covariance = variable(
         square, point.covariance, "linearised covariance", "product of the parameters' units"
     )
-    variance = _variable(
+    variance = variable(
         (schema.OUTPUT,), point.variance, "error variance", "square of the output's SI unit"
     )
     return {schema.COVARIANCE: covariance, schema.VARIANCE: variance}
@@ -284,9 +281,9 @@ def _stability(found: Stability) -> dict[str, xr.Variable]:
     stable = np.where(found.unstable < 0, -1, found.unstable == 0).astype(np.int8)
     meaning = {"flag_values": [-1, 0, 1], "flag_meanings": "unknown unstable stable"}
     variables = {
-        schema.FLOQUET: _variable(dims, parts, "Floquet multipliers, largest first", "1"),
-        schema.STABLE: _variable((schema.RUN,), stable, "whether the solution is stable", "1"),
-        schema.BRANCH_JUMPS: _variable(
+        schema.FLOQUET: variable(dims, parts, "Floquet multipliers, largest first", "1"),
+        schema.STABLE: variable((schema.RUN,), stable, "whether the solution is stable", "1"),
+        schema.BRANCH_JUMPS: variable(
             (schema.RUN,), found.jumps, "jumps of the solution to another branch", "1"
         ),
     }
@@ -299,8 +296,8 @@ def _history(stages: Sequence[PointEstimate]) -> dict[str, xr.Variable]:
     objective = np.concatenate([stage.history_objective for stage in stages])
     dims = (schema.ITERATION, schema.PARAMETER)
     return {
-        schema.HISTORY: _variable(dims, theta, "parameters by iteration", _MIXED),
-        schema.OBJECTIVE: _variable(
+        schema.HISTORY: variable(dims, theta, "parameters by iteration", _MIXED),
+        schema.OBJECTIVE: variable(
             (schema.ITERATION,), objective, "objective of the method by iteration", "1"
         ),
     }

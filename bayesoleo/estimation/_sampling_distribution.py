@@ -12,14 +12,13 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._storage.resume import Arrays, Slots
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
@@ -42,9 +41,9 @@ def by_replication(parts: Arrays) -> dict[str, xr.Variable]:
     each, of_output = ("replication", schema.PARAMETER), ("replication", schema.OUTPUT)
     squared = "square of the output's SI unit"
     return {
-        "replicate": _variable(each, parts["theta"], "estimate by replication", _MIXED),
-        "status": _variable(("replication",), parts["status"], "outcome", "1"),
-        schema.VARIANCE: _variable(
+        "replicate": variable(each, parts["theta"], "estimate by replication", _MIXED),
+        "status": variable(("replication",), parts["status"], "outcome", "1"),
+        schema.VARIANCE: variable(
             of_output, parts["variance"], "error variance by replication", squared
         ),
     }
@@ -81,11 +80,7 @@ def moments(found: Array, truth: Array, expected: Array, bound: Array) -> dict[s
         "bound": (square, bound, "least covariance (Cramér and Rao)", products),
         "efficiency": (one, bound_sd**2 / sd**2, "variance of the bound over that found", "1"),
     }
-    return {name: _variable(*item) for name, item in table.items()}
-
-
-def _variable(dims: tuple[str, ...], values: NDArray[Any], name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
+    return {name: variable(*item) for name, item in table.items()}
 
 
 def sampling_text(data: xr.Dataset) -> str:

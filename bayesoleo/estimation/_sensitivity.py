@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -171,10 +171,10 @@ def local_sensitivity(
     words = "one prior standard deviation" if per == "prior" else "one per cent"
     data = xr.Dataset(
         {
-            "change": _variable(square, change, f"change by {words}", "unit of each feature"),
-            "percent": _variable(square, percent, f"change by {words}", "%"),
-            "value": _variable(("feature",), table[0], "value", "unit of each feature"),
-            "step": _variable((schema.PARAMETER,), step, words, "unit of each parameter"),
+            "change": variable(square, change, f"change by {words}", "unit of each feature"),
+            "percent": variable(square, percent, f"change by {words}", "%"),
+            "value": variable(("feature",), table[0], "value", "unit of each feature"),
+            "step": variable((schema.PARAMETER,), step, words, "unit of each parameter"),
         },
         coords={"feature": found.names, schema.PARAMETER: list(problem.names)},
     )
@@ -345,15 +345,11 @@ def _indices(
             ("_high", interval.high),
         ):
             values = np.reshape(numbers, shape)
-            variables[key + end] = _variable(square, values, text, "1")
-    variables["variance"] = _variable(
+            variables[key + end] = variable(square, values, text, "1")
+    variables["variance"] = variable(
         ("feature",), np.asarray(variance), "variance over the priors", "square of its unit"
     )
     return xr.Dataset(variables, coords={"feature": list(features), schema.PARAMETER: list(names)})
-
-
-def _variable(dims: tuple[str, ...], values: Array, name: str, unit: str) -> xr.Variable:
-    return xr.Variable(dims, values, {schema.LONG_NAME: name, schema.UNITS: unit})
 
 
 def _percent_text(data: xr.Dataset) -> str:

@@ -373,12 +373,6 @@ class Model:
         )
         return replace(self, outputs={**self.outputs, target: output})
 
-    def with_output(self, name: str, expression: Text) -> Model:
-        """Replace an output's expression as a whole."""
-        return replace(
-            self, outputs={**self.outputs, name: replace(self.outputs[name], terms=expression)}
-        )
-
     def with_definition(self, name: str, expression: Text) -> Model:
         """Add a definition, or redefine the one of that name in place."""
         return replace(self, definitions={**self.definitions, name: expression})

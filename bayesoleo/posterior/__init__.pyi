@@ -11,7 +11,6 @@ from ._datatree import (
     to_datasets as to_datasets,
 )
 from ._diagnostics import (
-    Comparison as Comparison,
     Samples as Samples,
 )
 from ._ensembles import (

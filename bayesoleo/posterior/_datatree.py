@@ -22,6 +22,7 @@ non-factorized normal and Student-t models", *Computational Statistics* 36, sect
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -248,10 +249,8 @@ def _evaluate(
     return likelihood, predicted
 
 
-def choose_draws(
-    samples: Samples, size: int, *, seed: int, run: str | None = None
-) -> tuple[Array, Array]:
-    """Pick draws at random, none twice.
+def choose_all(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]:
+    """Pick draws at random, none twice, with the quantities of the error model.
 
     Parameters
     ----------
@@ -261,28 +260,6 @@ def choose_draws(
         Number of draws; all of them if there are fewer.
     seed : int
         Seeds the choice.
-    run : str, optional
-        Run whose variances are taken where the error model has them by run.
-
-    Returns
-    -------
-    theta : ndarray, shape (K, l)
-        Parameters in their units.
-    variance : ndarray, shape (K, s)
-        Error variances of the outputs, in squared units.
-    """
-    picks = _picks(samples, size, seed)
-    log_variance = samples.log_variance_of(run).reshape(samples.log_density.size, -1)
-    return _flat(samples.theta)[picks], np.exp(log_variance[picks])
-
-
-def choose_all(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]:
-    """Draws as in :func:`choose_draws`, with the quantities of the error model.
-
-    Parameters
-    ----------
-    samples, size, seed
-        See :func:`choose_draws`.
 
     Returns
     -------
@@ -301,7 +278,7 @@ def _picks(samples: Samples, size: int, seed: int) -> Integers:
 
 
 def _flat(draws: Array) -> Array:
-    return draws.reshape(-1, draws.shape[-1])
+    return draws.reshape(math.prod(draws.shape[:-1]), draws.shape[-1])  # also of no quantities
 
 
 def sd_of_averages(errors: Array, phase: Array, bins: int) -> Array:

@@ -147,51 +147,6 @@ def rhat_limit(ensembles: int, size: float) -> float:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """A point estimate beside the posterior, each field an array of shape (l,).
-
-    Parameters
-    ----------
-    shift : ndarray
-        Posterior mean minus point, in the point's standard deviations.
-    sd_ratio : ndarray
-        Posterior standard deviation over the point's.
-    skewness : ndarray
-        Third standardised moment of the posterior.
-    """
-
-    shift: Array
-    sd_ratio: Array
-    skewness: Array
-
-
-def compare_with_point(theta: Array, point: Array, sd: Array) -> Comparison:
-    """Compare draws with a point estimate and its linearised standard deviations.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (chains, draws, l)
-        Draws in natural units.
-    point, sd : ndarray, shape (l,)
-        Estimate and standard deviation, in the same units.
-
-    Returns
-    -------
-    Comparison
-
-    References
-    ----------
-    Verbeek (1993), eq. 2.36-2.41 (the linearised standard deviation).
-    """
-    flat = theta.reshape(-1, theta.shape[-1])
-    return Comparison(
-        shift=(flat.mean(axis=0) - point) / sd,
-        sd_ratio=flat.std(axis=0, ddof=1) / sd,
-        skewness=np.asarray(stats.skew(flat, axis=0)),
-    )
-
-
-@dataclass(frozen=True)
 class Samples:
     """Draws of the posterior with their diagnostics.
 

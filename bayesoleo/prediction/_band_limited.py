@@ -29,7 +29,6 @@ from math import perm
 
 import numpy as np
 from scipy import signal
-from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize_scalar
 
 from bayesoleo._types import Array, Float
@@ -209,23 +208,6 @@ def smooth_signal(values: Array, step: float) -> Smoothed:
     states[:, 0] += values[0]
     noise = size * float(np.sqrt(innovations(scaled, 10.0**logarithm)[1]))
     return Smoothed(step, states, noise, 10.0**logarithm)
-
-
-def exact_signal(values: Array, step: float) -> Smoothed:
-    """The curve through samples that have no noise: the quintic interpolating spline.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-        At equidistant times from zero; at least six.
-    step : float
-        Their interval, s.
-    """
-    if values.size < 6:
-        raise InputError("too few samples", value=values.size, hint="give six or more")
-    time = step * np.arange(values.size)
-    spline = make_interp_spline(time, values, k=5)
-    return Smoothed(step, np.stack([spline(time, nu=k) for k in range(3)], axis=1))
 
 
 def band_limited(

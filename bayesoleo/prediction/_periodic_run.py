@@ -123,12 +123,17 @@ class RunPredictor:
             active=len(derived.active),
         )
         self.plan = self.scheme.plan(record.phase, steps) if derived.dofs else None
+        self.motions: dict[str, Motion] = {}
+        self._observe(record.phase)
+
+    def _observe(self, position: Array) -> None:
+        """What is measured, the inputs at the samples, and no solution yet."""
+        derived, record = self.kernels.derived, self.record
         self.sample_inputs = input_rows(
-            record, derived.inputs, record.phase, "samples", self.known_rows
+            record, derived.inputs, position, "samples", self.known_rows
         )
         self.measured = np.stack([record.samples[name] for name in derived.outputs])
         self.anchor: Anchor | None = None
-        self.motions: dict[str, Motion] = {}
         self.active = np.array(
             [derived.constants.index(name) for name in derived.active], dtype=np.int64
         )

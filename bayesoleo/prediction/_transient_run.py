@@ -80,14 +80,7 @@ class TransientRun(RunPredictor):
         self.period, self.fineness = record.span, steps
         self.known_rows: RowCache = {} if like is None else like.known_rows
         self.position = record.position
-        self.sample_inputs = input_rows(
-            record, derived.inputs, self.position, "samples", self.known_rows
-        )
-        self.measured = np.stack([record.samples[name] for name in derived.outputs])
-        self.anchor: Anchor | None = None
-        self.active = np.array(
-            [derived.constants.index(name) for name in derived.active], dtype=np.int64
-        )
+        self._observe(self.position)
         self.initial = InitialState(model, kernels, record)
         self._input_names = derived.inputs
         highest = highest_derivatives(derived.inputs)

@@ -72,18 +72,6 @@ def periodic_signal(frequency: float, cosine: Array, sine: Array) -> InputSignal
     )
 
 
-def piecewise_signal(knots: Array, pieces: Array) -> InputSignal:
-    """A signal of cubics between knots only; ``pieces`` is ``(M, nu, 4)``."""
-    none = np.zeros((pieces.shape[1], 0))
-    return InputSignal(
-        0.0,
-        none,
-        none.copy(),
-        np.array(knots, dtype=float),
-        np.array(pieces, dtype=float, order="C"),
-    )
-
-
 def evaluate(signal: InputSignal, times: Array) -> Array:
     """Rows at times ``(N,)`` in s, shape (nu, N)."""
     u = np.empty((signal.cosine.shape[0], times.size))

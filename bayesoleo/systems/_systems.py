@@ -16,17 +16,17 @@ from bayesoleo.errors import InputError, choose
 from bayesoleo.model._expressions import as_text, bspline, split_derivative
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
-from bayesoleo.systems import _oleo as oleo, _oscillators as autonomous, _oscillators as mechanical
+from bayesoleo.systems import _oleo as oleo, _oscillators as oscillators
 
 #: Splines that a formula shows one by one.
 MOST_SPLINES = 4
 
 _SYSTEMS: dict[str, Callable[[], Model]] = {
-    "gas_spring": mechanical.gas_spring,
-    "viscous_damper": mechanical.viscous_damper,
-    "linear_oscillator": mechanical.linear_oscillator,
-    "duffing": mechanical.duffing,
-    "end_stop": mechanical.end_stop,
+    "gas_spring": oscillators.gas_spring,
+    "viscous_damper": oscillators.viscous_damper,
+    "linear_oscillator": oscillators.linear_oscillator,
+    "duffing": oscillators.duffing,
+    "end_stop": oscillators.end_stop,
     "f16n1d1": partial(oleo.mechanical_oleo, 1),
     "f16n1d2": partial(oleo.mechanical_oleo, 2),
     "f16n2d1": partial(oleo.thermomechanical_oleo, 1),
@@ -37,9 +37,9 @@ _SYSTEMS: dict[str, Callable[[], Model]] = {
     "f16n2d2_thesis": partial(oleo.thermomechanical_oleo_thesis, 2),
     "f16n2d1_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 1, printed=True),
     "f16n2d2_thesis_printed": partial(oleo.thermomechanical_oleo_thesis, 2, printed=True),
-    "van_der_pol": autonomous.van_der_pol,
-    "lorenz": autonomous.lorenz,
-    "rossler": autonomous.rossler,
+    "van_der_pol": oscillators.van_der_pol,
+    "lorenz": oscillators.lorenz,
+    "rossler": oscillators.rossler,
 }
 
 

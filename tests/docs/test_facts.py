@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bayesoleo import _schema as schema
-from bayesoleo.data import _campaign_toml as declaration, _campaign_toml as declared_run
+from bayesoleo.data import _campaign_toml as declaration
 from bayesoleo.effects import FAMILIES, catalogue
 from bayesoleo.model._expressions import FUNCTIONS
 
@@ -20,7 +20,7 @@ def page(name: str) -> str:
 
 
 def test_every_key_of_a_campaign_is_described() -> None:
-    keys = (*declaration._TOP, *declaration._CHANNEL, *declared_run._RUN, *declared_run._CONDITION)
+    keys = (*declaration._TOP, *declaration._CHANNEL, *declaration._RUN, *declaration._CONDITION)
     text = page("data-format.md")
     assert [key for key in keys if key not in text] == []
 

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from bayesoleo import _schema as schema
+from bayesoleo.posterior import compare
 from bayesoleo.posterior._diagnostics import (
     autocorrelation_time,
-    compare_with_point,
     effective_size,
     nested_rhat,
     rhat_limit,
@@ -59,8 +61,17 @@ def test_ensembles_that_disagree_are_noticed():
 def test_a_point_beside_draws():
     rng = np.random.default_rng(0)
     theta = np.stack([rng.normal(3, 2, (8, 5000)), rng.exponential(1, (8, 5000))], axis=2)
-    comparison = compare_with_point(theta, np.array([1.0, 1.0]), np.array([1.0, 0.5]))
+    names = ["normal", "exponential"]
+    drawn = {n: (("chain", "draw"), theta[..., k]) for k, n in enumerate(names)}
+    point = xr.Dataset(
+        {
+            schema.ESTIMATE: ("parameter", [1.0, 1.0]),
+            schema.COVARIANCE: (("parameter", "parameter_column"), np.diag([1.0, 0.25])),
+        },
+        coords={"parameter": names, "parameter_column": names},
+    )
+    comparison = compare({"posterior": xr.Dataset(drawn), "point": point})
     # 40 000 draws: errors 0.01, 0.007 and, for the exponential's skewness, about 0.06
-    np.testing.assert_allclose(comparison.shift, [2.0, 0.0], atol=0.05)
-    np.testing.assert_allclose(comparison.sd_ratio, [2.0, 2.0], atol=0.05)
-    np.testing.assert_allclose(comparison.skewness, [0.0, 2.0], atol=0.2)
+    np.testing.assert_allclose(comparison["shift"], [2.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(comparison["sd_ratio"][0], [2.0, 2.0], atol=0.05)
+    np.testing.assert_allclose(comparison["skewness"], [0.0, 2.0], atol=0.2)

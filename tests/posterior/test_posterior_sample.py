@@ -10,7 +10,7 @@ from posterior_targets import Banana, BentRidge, Gaussian
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
-from bayesoleo.posterior._datatree import choose_draws
+from bayesoleo.posterior._datatree import choose_all
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
@@ -231,10 +231,10 @@ def test_draws_are_chosen_once_each():
     samples = sample(
         Gaussian(np.ones(2)), normal_mixture(np.ones(2)), seed=1, quick=True, progress=False
     )
-    theta, variance = choose_draws(samples, 50, seed=0)
+    theta, errors = choose_all(samples, 50, seed=0)
     assert theta.shape == (50, 2)
-    assert variance.shape == (50, 0)
-    again, _ = choose_draws(samples, 50, seed=0)
+    assert errors.shape == (50, 0)
+    again, _ = choose_all(samples, 50, seed=0)
     np.testing.assert_array_equal(theta, again)
 
 

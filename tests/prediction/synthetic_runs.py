@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from bayesoleo.model import Model
+from bayesoleo.prediction._band_limited import Smoothed
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics, Record
 
@@ -80,3 +82,10 @@ def answered(model: Model, records: list[Record], noise: float = 0.0, **options)
         samples = {**record.samples, **dict(zip(predictor.outputs, y, strict=True))}
         made.append(replace(record, samples=samples))
     return made
+
+
+def exact_signal(values: np.ndarray, step: float) -> Smoothed:
+    """The curve through samples without noise: the quintic interpolating spline."""
+    time = step * np.arange(values.size)
+    spline = make_interp_spline(time, values, k=5)
+    return Smoothed(step, np.stack([spline(time, nu=k) for k in range(3)], axis=1))

@@ -63,7 +63,8 @@ def test_displacement_to_force_and_back():
 
 def compliant(value: float) -> Model:
     base = mechanical_oleo(2).with_parameters(compliance=Parameter(value, "m/N", sd=1e-8))
-    return base.with_output("displacement", "stroke + compliance*force")
+    displacement = replace(base.outputs["displacement"], terms="stroke + compliance*force")
+    return replace(base, outputs={**base.outputs, "displacement": displacement})
 
 
 def test_without_compliance_the_added_equation_changes_nothing():

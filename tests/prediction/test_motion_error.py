@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from synthetic_runs import exact_signal
 
 from bayesoleo.model import Dof, Model, Parameter
 from bayesoleo.model._kernels import kernels
-from bayesoleo.prediction._band_limited import exact_signal
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._run_errors import motion_error, outputs_of
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from synthetic_runs import exact_signal
 
-from bayesoleo.prediction._band_limited import exact_signal, smooth_signal
+from bayesoleo.prediction._band_limited import smooth_signal
 
 STEP = 0.02
 TIME = STEP * np.arange(120)

@@ -12,7 +12,7 @@ from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import kernels
 from bayesoleo.solvers._initial_value import Dynamics, solve_initial_value
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._switching import evaluate, periodic_signal, piecewise_signal
+from bayesoleo.solvers._switching import InputSignal, evaluate, periodic_signal
 from bayesoleo.systems import system
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
@@ -52,7 +52,9 @@ def test_signals():
     expected = FORCE.evaluate(FREQUENCY * t, FREQUENCY)
     np.testing.assert_allclose(evaluate(signal, t)[0], expected, atol=1e-14)
     pieces = np.array([[[1.0, 2.0, 0.0, 0.0]], [[3.0, 0.0, 1.0, -1.0]]])
-    cubic = evaluate(piecewise_signal(np.array([0.0, 1.0, 3.0]), pieces), np.array([0.5, 2.5, 4.0]))
+    none = np.zeros((1, 0))
+    cubics = InputSignal(0.0, none, none.copy(), np.array([0.0, 1.0, 3.0]), pieces)
+    cubic = evaluate(cubics, np.array([0.5, 2.5, 4.0]))
     np.testing.assert_allclose(cubic[0], [2.0, 3 + 1.5**2 - 1.5**3, 3 + 9.0 - 27.0])
 
 
