@@ -1,4 +1,4 @@
-"""What is built in: ``systems`` and ``effects``, with formulas and units."""
+"""Lists of what is built in: ``systems`` and ``effects``, with formulas and units."""
 
 from __future__ import annotations
 

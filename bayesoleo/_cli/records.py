@@ -79,7 +79,7 @@ def reduce(
 
 
 def _runs(reduced: ReducedCampaign) -> list[dict[str, Any]]:
-    """What there is to say of every run, SI."""
+    """Facts about every run, SI."""
     return [
         {
             "run": record.label,

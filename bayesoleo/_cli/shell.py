@@ -246,7 +246,7 @@ def stoppable(folder: Path | None, quiet: bool = True) -> Iterator[dict[str, Any
 
 
 def kept_in(folder: Path | None) -> str:
-    """What a command that was stopped leaves in its folder."""
+    """A sentence on the files that a stopped command leaves in its folder."""
     if folder is None or not folder.is_dir():
         return "nothing was written"
     older, results = folder / OLDER, folder / RESULTS
@@ -331,7 +331,7 @@ def _declared_name(campaign: Path) -> str:
 
 
 def output_folder(out: Path | None, campaign: Path, ending: str = "") -> Path:
-    """Where to write results of a campaign, checked before any work is done; nothing is made yet.
+    """The folder for results of a campaign, checked before any work is done; nothing is made yet.
 
     Parameters
     ----------

@@ -87,7 +87,7 @@ class CampaignWork:
         return CampaignWork(replace(self.task, settings=settings))
 
     def text(self) -> str:
-        """What would be fitted."""
+        """Model, runs and parameters, as text."""
         about, model = self.task.about(), self.task.assembly.model()
         roles = self.task.roles
         lines = [f"model {about['model']}, driven by {about['drive']}"]
@@ -104,7 +104,7 @@ class CampaignWork:
         return "\n".join([*lines, columns(["parameter", "start", "sd of prior", "unit"], rows)])
 
     def check(self) -> dict[str, Any]:
-        """What the check of the command line says."""
+        """Facts as the command ``check`` prints them."""
         return checked(self.task)
 
     def fit(self, method: str, callback: Say) -> tuple[ModelFit, xr.DataTree]:
@@ -122,7 +122,7 @@ class CampaignWork:
         )
 
     def problem(self, fit: ModelFit) -> EstimationProblem:
-        """Of the fitted runs; each question starts from the solution at the estimate."""
+        """The problem of the fitted runs; questions start from the estimate."""
         fit.problem.freeze(fit.point.theta)
         return fit.problem
 
@@ -190,7 +190,7 @@ class CampaignSearch:
 
 
 def check_text(facts: Mapping[str, Any]) -> str:
-    """What a check says, one fact a line."""
+    """The facts of a check, one a line."""
     lines = []
     for key, value in facts.items():
         if key == "start":

@@ -345,7 +345,7 @@ class Result(LabelledResult):
 
 
 def result(shown: LabelledResult, kind: str) -> Result:
-    """What a function of the package returns, with its figure."""
+    """A labelled result of the package, with its figure."""
     return Result(shown.data, shown.text, kind)
 
 

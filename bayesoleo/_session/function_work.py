@@ -382,7 +382,7 @@ class FunctionWork:
         return replace(self, settings=settings)
 
     def text(self) -> str:
-        """What would be fitted."""
+        """Function, data and parameters, as text."""
         number = self.table[self.output].size
         terms = "".join(f" + {name}" for name in self.added)
         lines = [f"{self.output} = {self.name}({', '.join(self.inputs)}, …){terms}"]
@@ -395,7 +395,7 @@ class FunctionWork:
         return "\n".join([*lines, columns(["parameter", "start", "sd of prior", "unit"], rows)])
 
     def check(self) -> dict[str, Any]:
-        """What the data and the start are."""
+        """Facts about the data and the start."""
         problem = self.statement
         left = problem.evaluate(problem.start).residual[0]
         y = self.table[self.output]

@@ -29,7 +29,7 @@ from bayesoleo.model._model import Model
 
 
 class Check(Showing):
-    """What would be done with a problem, and what deserves a look.
+    """A summary of a problem before it is fitted, with warnings.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Problem(Showing):
         return self._work.settings
 
     def check(self) -> Check:
-        """What would be done, how far the start is from the data, and what deserves a look.
+        """Summarise the problem, compare the start with the data, and list warnings.
 
         Examples
         --------

@@ -453,7 +453,7 @@ class Explanation(Stored):
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """What was added, in this order."""
+        """Effects or terms that were added, in this order."""
         return tuple(json.loads(self.tree.attrs[schema.EFFECTS]))
 
     @property

@@ -55,7 +55,7 @@ class Term:
 
 @dataclass(frozen=True)
 class TermScore:
-    """What a term would explain.
+    """The score of a term.
 
     Parameters
     ----------

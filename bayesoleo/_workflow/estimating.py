@@ -191,7 +191,7 @@ def sample(
 
 
 def no_groups() -> dict[str, xr.Dataset]:
-    """Where a stage failed."""
+    """The groups of a stage that failed: none."""
     return {}
 
 
@@ -202,7 +202,7 @@ def drawn_groups(
     groups: Mapping[str, xr.Dataset],
     stages: Stages,
 ) -> dict[str, xr.Dataset]:
-    """Of the draws, of what they predict, and how the point compares with them."""
+    """Groups of the draws and of their predictions, and a comparison with the point."""
     samples, density = drawn
     found: dict[str, xr.Dataset] = {}
     found |= stages.attempt(

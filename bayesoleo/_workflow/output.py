@@ -34,7 +34,7 @@ PUT_ASIDE = ".put-aside"
 
 @dataclass
 class ResultFolder:
-    """Where a result goes.
+    """The folder of a result.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class ResultFolder:
 
     @property
     def checkpoints(self) -> Path | None:
-        """Where a calculation that was stopped goes on from."""
+        """Folder from which a calculation that was stopped goes on."""
         return None if self.folder is None else self.folder / CHECKPOINTS
 
     @contextmanager
@@ -177,7 +177,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 @dataclass
 class Stages:
-    """What failed so far.
+    """Stages that have failed so far.
 
     Parameters
     ----------

@@ -288,7 +288,7 @@ class Settings:
 
     @property
     def inference(self) -> Inference:
-        """What is assumed of errors and of runs."""
+        """Assumptions about errors and about runs."""
         from bayesoleo.discovery._inference import Inference
 
         return Inference(self.error_model, self.between_runs)

@@ -116,7 +116,7 @@ def _conflicts(model: Model) -> Iterator[Conflict]:
 
 
 def _remedy(model: Model, term: sp.Expr, wanted: Dimensions, found: Dimensions) -> str:
-    """What unit the first parameter of a product would have to have."""
+    """The unit that the first parameter of a product would have to have."""
     for factor in sp.Mul.make_args(term):
         if isinstance(factor, sp.Symbol) and factor.name in model.parameters:
             own = _declared(model.parameters[factor.name].unit) or {}
@@ -240,7 +240,7 @@ class _Reader:
 
 
 def _declared(unit: str) -> Known:
-    """Of a unit as declared; one that is left out is not known."""
+    """Dimensions of a declared unit; those of a unit that is left out are not known."""
     return dimensions(unit) if unit else None
 
 

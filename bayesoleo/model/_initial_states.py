@@ -33,7 +33,7 @@ WIDTH = 1.0
 
 @dataclass(frozen=True)
 class Start:
-    """Where one dof starts.
+    """The start of one dof.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def start_of(model: Model, dof: str) -> Start:
 
 
 def centre_of(model: Model, dof: str) -> Start:
-    """Where a dof probably starts: as measured if a channel is the dof itself, else at rest."""
+    """The probable start of a dof: as measured if a channel is the dof itself, else at rest."""
     for channel in model.outputs:
         if model.output(channel) == symbol(dof):
             return Start(symbol(channel), derivative_symbol(channel, 1))

@@ -328,7 +328,7 @@ class Model:
 
     @cached_property
     def structure(self) -> Hashable:
-        """What the model says without the values and priors of its parameters.
+        """The statement of the model without the values and priors of its parameters.
 
         Models of equal structure have the same equations, and so the same compiled code.
         """
@@ -446,7 +446,7 @@ def _declared(model: Model) -> Iterator[tuple[str, str, str, float | None]]:
 
 
 def _in_si(unit: Unit, value: float | None) -> str:
-    """What to write instead."""
+    """The remedy, as a hint."""
     wanted = in_si(unit.name)
     if value is None:
         return f"declare it in {wanted}"
@@ -458,7 +458,7 @@ def _in_si(unit: Unit, value: float | None) -> str:
 
 
 def unused(model: Model) -> dict[str, str]:
-    """What a model declares and nothing else in it contains.
+    """Names that a model declares and does not use.
 
     A definition counts as a use even where no equation needs it: it is a quantity that effects may
     act on.

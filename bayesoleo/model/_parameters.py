@@ -198,7 +198,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Where a force can act: a position, its velocity, and the balance to which a term is added.
+    """A place for a force: a position, its velocity, and the balance to which a term is added.
 
     Parameters
     ----------

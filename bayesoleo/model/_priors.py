@@ -38,7 +38,7 @@ _CUT = 40.0
 
 @runtime_checkable
 class Prior(Protocol):
-    """What every prior density offers; all functions take and return arrays of any shape."""
+    """Interface of prior densities; all functions take and return arrays of any shape."""
 
     @property
     def mean(self) -> float:

@@ -253,7 +253,7 @@ class Lost:
 def lost_inputs(
     rows: tuple[tuple[str, int], ...], outputs: Sequence[str], records: Sequence[Record]
 ) -> tuple[Lost, ...]:
-    """What of the inputs is left out, by run.
+    """Parts of the inputs that are left out, by run.
 
     Parameters
     ----------

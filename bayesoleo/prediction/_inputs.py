@@ -43,7 +43,7 @@ def harmonics_of(record: Record, channel: str) -> Harmonics:
 
 
 def signal_of(record: Record, channel: str, highest: int = 0) -> Signal:
-    """What a channel is as an input, periodic or not.
+    """A channel as an input, periodic or not.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ class PeriodicOrbits:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """By which derivatives are taken, length na."""
+        """Parameters by which derivatives are taken, length na."""
         return self.kernels.derived.active
 
     def rows(self, phase: ArrayLike) -> Array:

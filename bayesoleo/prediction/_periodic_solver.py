@@ -432,7 +432,7 @@ class SolvedRun(RunPredictor):
         return found
 
     def error(self) -> ErrorEstimate:
-        """Of the anchor's motion."""
+        """Error of the anchor's motion."""
         assert self.anchor is not None
         anchor, found = self._anchored
         if found is None or anchor is not self.anchor:  # of another process, or of another run
@@ -440,7 +440,7 @@ class SolvedRun(RunPredictor):
         return self.solver.judged(found, self.anchor.p)[1]
 
     def _starts(self, p: Array) -> Iterator[Motion]:
-        """Where to start from, the most promising first."""
+        """Motions to start from, the most promising first."""
         if self.anchor is not None:
             change = (p - self.anchor.p)[self.active]
             yield partial(self.rows, self.anchor.predict(change[None])[0])

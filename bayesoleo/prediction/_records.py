@@ -23,7 +23,7 @@ FEWEST_SAMPLES = 8
 
 
 class Signal(Protocol):
-    """What an input is to a model: values and derivatives at any phase of a run."""
+    """An input as a model takes it: values and derivatives at any phase of a run."""
 
     def evaluate(
         self, phase: Float[Array, " samples"], frequency: float, derivative: int = 0
@@ -171,7 +171,7 @@ class Record:
 
     @property
     def span(self) -> float:
-        """What is solved for at once, s: a period, or the length of a transient."""
+        """Duration that is solved at once, s: a period, or the length of a transient."""
         return 1.0 / self.rate
 
     @property

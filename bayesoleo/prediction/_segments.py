@@ -306,7 +306,7 @@ class SegmentedNormalEquations:
 
     @property
     def information(self) -> Array:
-        """Of the active parameters, ``(na, na)``, states eliminated."""
+        """Matrix of the active parameters, ``(na, na)``, states eliminated."""
         return self.system.information(self.hessian)
 
     def answer(self, gap: Array, y: Array) -> tuple[Array, Array]:

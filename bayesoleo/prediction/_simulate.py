@@ -57,7 +57,7 @@ def motion(mean: float, amplitudes: Sequence[float], phases: Sequence[float] = (
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What is to be simulated.
+    """A run to be simulated.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ class Spectrum:
         return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
     def _is_noise(self, first: int) -> bool:
-        """Whether what lies above a bin looks like noise: flat, or next to nothing."""
+        """Whether the spectrum above a bin looks like noise: flat, or next to nothing."""
         rest = self.density[first:] / self.floor[first:]
         if self.floor[first:].sum() * self.frequency[0] < NEGLIGIBLE * self.power:
             return True

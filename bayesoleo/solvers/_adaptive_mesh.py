@@ -147,7 +147,7 @@ def _graded(phase: Array, wanted: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveStart:
-    """Where to start from: a motion, and a mesh that suits it.
+    """The start of a search: a motion, and a mesh that suits it.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def solve_adaptive(
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Where a search ended: its best level and what else is known of it."""
+    """The end of a search: its best level and what else is known of it."""
 
     level: Level
     status: Status
@@ -361,7 +361,7 @@ def _finish(end: _End, problem: PeriodicProblem, p: Array) -> AdaptiveSolution:
 
 
 def compare(coarse: Level, fine: Level) -> MeshError:
-    """What a solution gains by halving its steps.
+    """The gain of a solution by halving its steps.
 
     States are compared at the same part of the same step, over their largest sizes, and the edges
     on kinks by their phases, in cycles: a contact that comes a little later is an error of its

@@ -251,7 +251,7 @@ class BranchPoint:
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
-    """Where a branch folds back (``fold``) or its period doubles (``doubling``)."""
+    """A point where a branch folds back (``fold``) or its period doubles (``doubling``)."""
 
     kind: str
     point: BranchPoint
@@ -421,7 +421,7 @@ class _Walk:
     def zero(
         self, before: BranchPoint, length: float, test: Callable[[BranchPoint], float]
     ) -> BranchPoint | None:
-        """Where a test function vanishes along a step."""
+        """The place along a step where a test function vanishes."""
 
         def value(part: float) -> float:
             trial = self.step(before, part)

@@ -427,7 +427,7 @@ class Collocation:
         rows(x, lanes, h, method.a, method.a @ method.a, method.c, self._orders, z)
 
     def plan(self, phase: Array, n: int, *, initial: bool = False) -> SamplePlan:
-        """Where in the mesh given phases lie; worth keeping for fixed samples.
+        """Places in the mesh of given phases; worth keeping for fixed samples.
 
         Parameters
         ----------

@@ -178,7 +178,7 @@ def _with_edges(mesh: Mesh, kinks: Crossings) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What the equations leave between the stages.
+    """Residual of the equations between the stages.
 
     Parameters
     ----------

@@ -326,7 +326,7 @@ def exchange(
 
 
 class MarchTask(NamedTuple):
-    """What one march does.
+    """The task of one march.
 
     Parameters
     ----------
@@ -393,7 +393,7 @@ class Addresses(NamedTuple):
 
 
 class System(NamedTuple):
-    """What is integrated.
+    """The initial value problem that is integrated.
 
     Parameters
     ----------

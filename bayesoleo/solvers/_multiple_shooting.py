@@ -238,7 +238,7 @@ class Segments:
 
     @property
     def length(self) -> float:
-        """Of a step, s."""
+        """Length of a step, s."""
         return self.duration / self.steps
 
     @cached_property
@@ -251,7 +251,7 @@ class Segments:
         return [int(first[j]) + k for j, o in enumerate(self.scheme.orders) for k in range(o)]
 
     def plan(self, time: Array) -> SamplePlan:
-        """Where times from 0 to the duration, shape (N,), lie in the mesh."""
+        """Place in the mesh of times from 0 to the duration, shape (N,)."""
         return self.scheme.plan(time / self.duration, self.steps, initial=True)
 
     def sample(self, columns: Array, plan: SamplePlan) -> Array:

@@ -85,7 +85,7 @@ def positive(a: Array, lanes: Integers, inside: Flags, defined: Flags) -> None:
 
 @jit
 def unit(motion: float, level: float, change: float) -> float:
-    """What a change of a state is small against: its motion about a level, not the level itself.
+    """The scale of changes of a state: its motion about a level, not the level itself.
 
     A preload or an ambient temperature says nothing of how far a solution is from its own motion.
     The change itself bounds it: there is no step longer than the motion that it makes.
@@ -160,7 +160,7 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class SweepLayout:
-    """Where the steps of a period stand while they are swept.
+    """Places of the steps of a period while they are swept.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class SweepLayout:
 
     @staticmethod
     def of(n: int, front: int, block: int) -> SweepLayout:
-        """Of a period of ``n`` steps in blocks of ``block``, with ``front`` rows before it."""
+        """For a period of ``n`` steps in blocks of ``block``, with ``front`` rows before it."""
         lengths = chunks(n)
         first = np.concatenate(([0], np.cumsum(lengths)[:-1]))
         rows = int(lengths[0])

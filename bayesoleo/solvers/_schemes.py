@@ -333,7 +333,7 @@ class Differences(_EqualSteps):
         z[lanes] = self._node_rows(x[lanes, :, :, None], step)[:, :, 0]
 
     def _stencils(self, order: int, step: float) -> list[Stencil]:
-        """Of the value and the derivatives of a dof of that order."""
+        """Stencils of the value and the derivatives of a dof of that order."""
         first, second = COMBINATIONS[self.name]
         scaled = [{k: weight / step for k, weight in first.items()}]
         scaled += [{k: weight / step**2 for k, weight in second.items()}]

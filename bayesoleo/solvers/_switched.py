@@ -125,7 +125,7 @@ def _root(values: Callable[[Array], Array], k: int, low: float, high: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Switches:
-    """Where equations in analytic pieces change their formula.
+    """Switching functions of equations in analytic pieces.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ class Level:
 
 
 def kinks_of(problem: PeriodicProblem, level: Level, p: Array) -> Crossings | None:
-    """Where along a motion the equations switch."""
+    """Phases of a motion at which the equations switch."""
     found = crossings_of(problem, level.motion, level.mesh, p)
     # Edges that were moved there are where they should be; found again, they scatter by round-off.
     same = found is not None and level.kinks is not None and level.kinks.alike(found)
