@@ -59,3 +59,8 @@ from ._state import (
     State as State,
     fit_state as fit_state,
 )
+from ._structures import (
+    Structure as Structure,
+    StructurePosterior as StructurePosterior,
+    StructurePrior as StructurePrior,
+)

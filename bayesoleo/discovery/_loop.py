@@ -29,6 +29,8 @@ from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import Progress, Round, examine
 from bayesoleo.discovery._state import State, better_start, fit_state
+from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
+from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -140,6 +142,9 @@ class ClosedLoop:
         Whether the search was not stopped early.
     policy : SearchPolicy
         The numbers by which the search decided.
+    structures : StructurePosterior or None
+        Probabilities of what the declared model lacks; None where no candidate was scored, or the
+        search was stopped early.
     """
 
     rounds: tuple[Round, ...]
@@ -149,6 +154,7 @@ class ClosedLoop:
     notes: tuple[str, ...]
     complete: bool = True
     policy: SearchPolicy = SearchPolicy()
+    structures: StructurePosterior | None = None
 
     @property
     def added(self) -> tuple[tuple[str, str], ...]:
@@ -214,6 +220,7 @@ def close_loop(
     max_effects: int = 4,
     nonparametric: bool = True,
     known: Progress | None = None,
+    prior: StructurePrior = DEFAULT_PRIOR,
     keep: Callable[[Progress], None] = lambda _: None,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
@@ -237,6 +244,8 @@ def close_loop(
         Whether a smooth function may be added where no named effect explains the residual.
     known : Progress, optional
         Progress of the same search, stopped before, from which it resumes.
+    prior : StructurePrior, optional
+        Prior probabilities of what may be missing.
     keep : callable
         Receives the progress once the model is estimated, and after each round.
     callback : callable
@@ -260,7 +269,37 @@ def close_loop(
 
     roles = _with_noise(roles, known)
     known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
-    return loop_of(known, roles)
+    structures = probabilities(known, numerics, prior, callback)
+    return replace(loop_of(known, roles), structures=structures)
+
+
+def probabilities(
+    progress: Progress, numerics: Numerics, prior: StructurePrior, callback: ProgressCallback
+) -> StructurePosterior | None:
+    """Probabilities of what the declared model lacks, by a search that has ended.
+
+    None where no candidate of the first round was scored.
+    """
+    first, final = progress.first, progress.state
+    ranking = progress.rounds[0].ranking if progress.rounds else ()
+    if not ranking or not all(item.score.signature.size for item in ranking):
+        return None
+    callback("compare structures")
+    refits = [item.refit for entry in progress.rounds for item in entry.ranking if item.refit]
+    known = [(one.assembly, one.fit) for one in refits if np.isfinite(one.share)]
+    known += [(final.assembly, final.fit)] if final.assembly.steps else []
+    # The noise is that which the best model has left.
+    errors = {(entry.run, entry.output): entry for entry in final.fit_errors.entries}
+    return structure_posterior(
+        first.base(),
+        first.assembly,
+        [item.score for item in ranking],
+        errors,
+        numerics,
+        prior=prior,
+        known=known,
+        callback=callback,
+    )
 
 
 @dataclass(frozen=True)

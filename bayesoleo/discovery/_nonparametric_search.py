@@ -333,7 +333,7 @@ def _tried(
     products = [run.products(new) for run, new in zip(base.runs, columns, strict=True)]
     cross, own, score = (sum(parts) for parts in zip(*products, strict=True))
     for count in pieces:
-        coarse = _coarser(len(axes), count, finest)
+        coarse = coarser(len(axes), count, finest)
         found = known_beside(base, coarse.T @ own @ coarse, cross @ coarse, coarse.T @ score)
         if found is not None:
             yield _judged(base, target, axes, count, columns, coarse, found)
@@ -346,7 +346,7 @@ def _courses(
 
 
 @cache
-def _coarser(quantities: int, pieces: int, finest: int) -> Array:
+def coarser(quantities: int, pieces: int, finest: int) -> Array:
     """Splines of one fineness in those of the finest, shape (K_fine, K)."""
     values = np.linspace(0.0, 1.0, _DENSE)
     fine, coarse = (UNIT.basis(values, count).T for count in (finest, pieces))

@@ -23,6 +23,7 @@ from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, counted, weights
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import measured_of
 from bayesoleo.model._model import Model
@@ -360,6 +361,8 @@ class Base:
         that of the noise, which is measured too.
     policy : SearchPolicy
         By which scores and estimates are judged.
+    data : SpectralData, optional
+        Lines on which changes of the outputs are kept to compare structures.
     """
 
     fit: ModelFit
@@ -370,6 +373,7 @@ class Base:
     excess: float
     doubt: float
     policy: SearchPolicy = SearchPolicy()
+    data: SpectralData | None = None
 
     @property
     def fall_back(self) -> float:
@@ -409,7 +413,8 @@ def base_of(fit: ModelFit, errors: Mapping[tuple[str, str], RunError]) -> Base:
             excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(run)
     doubt = float(np.sqrt(variance))
-    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy)
+    data = SpectralData.of(fit)
+    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy, data)
 
 
 def _prior_terms(fit: ModelFit) -> tuple[Array, Array]:

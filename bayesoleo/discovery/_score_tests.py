@@ -177,6 +177,9 @@ class Score:
         Degrees of freedom that the inflation was measured with; zero where none was.
     information : ndarray, shape (k, k)
         ``C_perp' W C_perp`` of the new unknowns, SI, at the shapes that score best.
+    signature : ndarray, shape (shapes * k, lines)
+        Change of the outputs per unit of each unknown on the lines of :class:`SpectralData`, SI,
+        for one set of shapes after the other.
     """
 
     option: Option
@@ -192,6 +195,7 @@ class Score:
     rank: int = 1
     freedom: int = 0
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    signature: Array = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
 
     @property
     def size(self) -> int:
@@ -241,19 +245,27 @@ def _attempt(base: Base, option: Option) -> Score | Status | str:
     columns = _columns(base, option, shapes)
     if isinstance(columns, Status):
         return columns
-    best, used, thinned = None, columns[0], []
+    best, used, thinned, signatures = None, columns[0], [], []
     for values, block in zip(shapes, columns, strict=True):
         score = _evaluate(base, option, values, block)
         if score is None:
             continue
         thinned.append(score.columns)
+        if base.data is not None:
+            signatures.append(base.data.columns(block.by_run).astype(np.float32))
         if best is None or score.fall > best.fall:
             best, used = score, block
     if best is None:
         seen = any(item.any() for block in columns for item in block.by_run)
         return SPANNED if seen else UNRESOLVED
     inflation, freedom = inflation_of(base, _directions(base, used, best.expected))
-    return replace(best, columns=np.concatenate(thinned), inflation=inflation, freedom=freedom)
+    return replace(
+        best,
+        columns=np.concatenate(thinned),
+        inflation=inflation,
+        freedom=freedom,
+        signature=np.concatenate(signatures) if signatures else best.signature,
+    )
 
 
 def _columns(

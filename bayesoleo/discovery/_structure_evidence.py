@@ -1,0 +1,339 @@
+r"""Marginal likelihoods of structures, linearised about an estimate.
+
+A structure is a set of effects that act, with or without something outside the catalogue. About an
+estimate the residual of all runs is
+
+.. math:: e = J \delta + \sum_{k \in S} C_k b_k + \sum_k c_k \beta_k + g + \varepsilon
+
+with the sensitivities :math:`J` of the present unknowns, whose priors are those of the model; the
+changes :math:`C_k` of the outputs by each effect that acts, scaled to unit root mean square in
+units of the noise, with :math:`b_k \sim N(0, \tau^2)`; and what lies outside the catalogue: a law
+that resembles many effects a little, :math:`\beta_k \sim N(0, a^2 w_k)`, and a smooth function of
+phase :math:`g` of each run. Sizes :math:`\tau`, :math:`a` and that of :math:`g` are integrated over
+a grid, with equal weight by decade from the smallest change that could be seen to the size of the
+signal itself. The measured noise is itself uncertain, which makes the density Student's.
+
+References
+----------
+Kennedy and O'Hagan (2001), *J. R. Statist. Soc.* B 63, section 4; Kass and Raftery (1995), *JASA*
+90, 773-795, for marginal likelihoods; Rasmussen and Williams (2006), *Gaussian Processes for
+Machine Learning*, eqs. A.9-A.10 for the lemma by which unknowns are integrated out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr, logsumexp
+
+from bayesoleo._types import Array, Integers
+
+#: Sizes of one effect, of the law outside the catalogue, and of the remainder over phase.
+SIZES, LAW_SIZES, SMOOTH_SIZES = 10, 5, 5
+#: Standard deviations by which the smallest change of interest differs from nothing.
+VISIBLE = 3.0
+_LOG_2 = float(np.log(2.0))
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Noise with a remainder over phase of several sizes, or none: the first is noise alone.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (n,)
+        Of the noise.
+    smooth : ndarray, shape (n,)
+        Of a remainder of unit mean square, in units of the noise's mean square of each output.
+    output_of : ndarray of int, shape (n,)
+    levels : ndarray, shape (outputs, SMOOTH_SIZES)
+        Mean squares of the remainder.
+    patterns : tuple of tuple of int
+        By pattern and output: which of the levels, zero for none.
+    """
+
+    variance: Array
+    smooth: Array
+    output_of: Integers
+    levels: Array
+    patterns: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(
+        cls, variance: Array, smooth: Array, output_of: Integers, reach: Array, samples: int
+    ) -> Covariances:
+        """Remainders of all outputs together, and of each alone.
+
+        Parameters
+        ----------
+        variance, smooth : ndarray, shape (n,)
+            Of the noise, and of a remainder of unit mean square.
+        output_of : ndarray of int, shape (n,)
+        reach : ndarray, shape (outputs,)
+            Root mean square of the signal, SI.
+        samples : int
+            Of one output.
+        """
+        outputs = reach.size
+        unit = np.array([variance[output_of == b].mean() for b in range(outputs)])
+        largest = np.maximum(reach / np.sqrt(unit), 1.0)
+        least = VISIBLE / np.sqrt(samples)
+        levels = np.array([np.geomspace(least, top, SMOOTH_SIZES) ** 2 for top in largest])
+        sets = [tuple(range(outputs))]
+        sets += [(b,) for b in range(outputs)] if outputs > 1 else []
+        patterns = [(0,) * outputs]
+        patterns += [
+            tuple(k + 1 if b in one else 0 for b in range(outputs))
+            for one in sets
+            for k in range(SMOOTH_SIZES)
+        ]
+        return cls(variance, smooth * unit[output_of], output_of, levels, tuple(patterns))
+
+    def products(self, rows: Array) -> tuple[Array, Array]:
+        """``X V^-1 X'`` of rows ``X (p, n)`` for each pattern (patterns, p, p), and ``ln det V``
+        (patterns,)."""
+        outputs, sizes = self.levels.shape
+        grams: list[list[Array]] = [[] for _ in range(outputs)]
+        logs = np.zeros((outputs, sizes + 1))
+        for b in range(outputs):
+            own = self.output_of == b
+            chosen = rows[:, own]
+            for k in range(sizes + 1):
+                level = self.levels[b, k - 1] if k else 0.0
+                variance = self.variance[own] + level * self.smooth[own]
+                white = chosen / np.sqrt(variance)
+                grams[b].append(white @ white.T)
+                logs[b, k] = np.log(variance).sum()
+        found = np.zeros((len(self.patterns), len(rows), len(rows)))
+        for q, pattern in enumerate(self.patterns):
+            for b, k in enumerate(pattern):
+                found[q] += grams[b][k]
+        total = [sum(logs[b, k] for b, k in enumerate(pattern)) for pattern in self.patterns]
+        return found, np.array(total)
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Columns after the unknowns are integrated out, for ``P`` covariances.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (P, k, k)
+        ``C' V^-1 C`` with ``V`` the covariance of noise, remainder and unknowns.
+    slope : ndarray, shape (P, k)
+        ``C' V^-1 e``.
+    square, log_det : ndarray, shape (P,)
+        ``e' V^-1 e`` and ``ln det V``.
+    """
+
+    gram: Array
+    slope: Array
+    square: Array
+    log_det: Array
+
+    @classmethod
+    def of(cls, products: Array, log_det: Array, unknowns: int, offset: Array) -> Reduced:
+        """Integrate unknowns out.
+
+        Parameters
+        ----------
+        products : ndarray, shape (P, 1 + l + k, 1 + l + k)
+            Of the residual, the ``l`` unknowns in units of their priors, and the columns.
+        log_det : ndarray, shape (P,)
+        unknowns : int
+        offset : ndarray, shape (l,)
+            Centres of the priors, from the estimate.
+        """
+        inner, rest = slice(1, 1 + unknowns), slice(1 + unknowns, None)
+        first = products[:, 0, inner]
+        at_centre = first - products[:, inner, inner] @ offset
+        # The residual with the unknowns at the centres of their priors.
+        square = products[:, 0, 0] - (first + at_centre) @ offset
+        slope = products[:, rest, 0] - products[:, rest, inner] @ offset
+        every = cls(
+            products[:, 1:, 1:],
+            np.concatenate([at_centre, slope], axis=1),
+            square,
+            np.asarray(log_det, dtype=float),
+        )
+        return every.with_columns(range(unknowns), np.ones(unknowns), range(unknowns, every.size))
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return int(self.slope.shape[1])
+
+    def of_some(self, parts: Sequence[int] | Integers, columns: Sequence[int]) -> Reduced:
+        """The same for some covariances and columns, in this order."""
+        chosen, kept = np.asarray(columns, dtype=int), np.asarray(parts, dtype=int)
+        return Reduced(
+            self.gram[np.ix_(kept, chosen, chosen)],
+            self.slope[np.ix_(kept, chosen)],
+            self.square[kept],
+            self.log_det[kept],
+        )
+
+    def with_columns(
+        self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
+    ) -> Reduced:
+        """The same with independent multiples of some columns in the covariance.
+
+        Parameters
+        ----------
+        columns : sequence of int, length m
+        power : ndarray, shape (m,) or (P, m)
+            Their variances.
+        keep : sequence of int, optional
+            Columns of the result; by default all.
+        """
+        chosen = np.asarray(columns, dtype=int)
+        kept = np.arange(self.size) if keep is None else np.asarray(keep, dtype=int)
+        root = np.broadcast_to(np.sqrt(power), (len(self.square), chosen.size))
+        inner = root[:, :, None] * self.gram[:, chosen[:, None], chosen] * root[:, None, :]
+        lower = np.linalg.cholesky(np.eye(chosen.size) + inner)
+        cross = self.gram[:, chosen[:, None], kept]
+        rows = np.concatenate([self.slope[:, chosen, None], cross], axis=2) * root[:, :, None]
+        white = np.linalg.solve(lower, rows)
+        first, others = white[:, :, 0], white[:, :, 1:]
+        turned = np.swapaxes(others, 1, 2)
+        logs = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        return Reduced(
+            self.gram[:, kept[:, None], kept] - turned @ others,
+            self.slope[:, kept] - (turned @ first[:, :, None])[:, :, 0],
+            self.square - np.sum(first**2, axis=1),
+            self.log_det + 2.0 * logs,
+        )
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Student's density of a residual whose noise is known to some degrees of freedom.
+
+    Parameters
+    ----------
+    count : int
+        Number of coefficients.
+    freedom : float
+        Of the measured noise.
+    """
+
+    count: int
+    freedom: float
+
+    def __call__(self, square: Array, log_det: Array) -> Array:
+        """Log density but for a constant, of any shape."""
+        exponent = 0.5 * (self.freedom + self.count)
+        spread = np.maximum(square, 0.0) / self.freedom
+        return np.asarray(-0.5 * log_det - exponent * np.log1p(spread))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns of one effect at one set of its shapes.
+
+    Parameters
+    ----------
+    columns : tuple of int
+    sign : int
+        Side of the null that is physical; zero for both.
+    """
+
+    columns: tuple[int, ...]
+    sign: int = 0
+
+
+def effect_evidence(
+    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
+) -> Array:
+    """Log evidence of one effect at each size, shape (P, groups, sizes).
+
+    Parameters
+    ----------
+    parts : Reduced
+    likelihood : Likelihood
+    groups : sequence of Group
+        Effects, each as the only one.
+    sizes : ndarray, shape (T,)
+        ``tau``, in units of the columns.
+    """
+    found = np.empty((len(parts.square), len(groups), sizes.size))
+    single = [k for k, group in enumerate(groups) if len(group.columns) == 1]
+    index = np.array([groups[k].columns[0] for k in single], dtype=int)
+    square, logs = parts.square[:, None, None], parts.log_det[:, None, None]
+    if single:
+        signs = np.array([groups[k].sign for k in single])[:, None]
+        slope = parts.slope[:, index, None]
+        grown = 1.0 + sizes**2 * np.maximum(parts.gram[:, index, index, None], 0.0)
+        value = likelihood(square - sizes**2 * slope**2 / grown, logs + np.log(grown))
+        found[:, single] = value + _one_side(signs, slope * sizes / np.sqrt(grown))
+    for k, group in enumerate(groups):
+        if len(group.columns) > 1:
+            found[:, k] = _together(parts, likelihood, group, sizes)
+    return found
+
+
+def _one_side(signs: Array, distance: Array) -> Array:
+    """What a prior on one side of zero adds, which is twice as high there."""
+    return np.where(signs != 0, _LOG_2 + log_ndtr(signs * distance), 0.0)
+
+
+def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array) -> Array:
+    """Log evidence of an effect with several unknowns, shape (P, sizes)."""
+    index = np.array(group.columns)
+    values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
+    turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0] ** 2
+    power = (sizes**2 / index.size)[:, None]
+    grown = 1.0 + power * np.maximum(values, 0.0)[:, None]
+    gain = np.sum(power * turned / grown, axis=2)
+    logs = parts.log_det[:, None] + np.log(grown).sum(axis=2)
+    return likelihood(parts.square[:, None] - gain, logs)
+
+
+def pair_evidence(
+    parts: Reduced, likelihood: Likelihood, one: Group, other: Group, sizes: Array
+) -> Array:
+    """Log evidence of two effects of one unknown each, shape (P, sizes, sizes)."""
+    (i,), (j,) = one.columns, other.columns
+    # Slopes and products in units of the prior: rows for the sizes of one, columns for the other.
+    first = sizes[:, None] * parts.slope[:, i, None, None]
+    second = sizes * parts.slope[:, j, None, None]
+    own = 1.0 + sizes[:, None] ** 2 * np.maximum(parts.gram[:, i, i], 0.0)[:, None, None]
+    its = 1.0 + sizes**2 * np.maximum(parts.gram[:, j, j], 0.0)[:, None, None]
+    mixed = np.multiply.outer(sizes, sizes) * parts.gram[:, i, j, None, None]
+    det = np.maximum(own * its - mixed**2, 1e-12 * own * its)
+    gain = (its * first**2 + own * second**2 - 2.0 * mixed * first * second) / det
+    logs = parts.log_det[:, None, None] + np.log(det)
+    found = likelihood(parts.square[:, None, None] - gain, logs)
+    # Each side by itself: the two are nearly independent where both are seen.
+    here = (its * first - mixed * second) / np.sqrt(its * det)
+    there = (own * second - mixed * first) / np.sqrt(own * det)
+    both = _one_side(np.array(one.sign), here) + _one_side(np.array(other.sign), there)
+    return np.asarray(found + both)
+
+
+def mean_of(logs: Array) -> float:
+    """Logarithm of the mean of what logarithms are given of."""
+    flat = np.ravel(logs)
+    return float(logsumexp(flat) - np.log(flat.size))
+
+
+def sizes_between(largest: float, samples: int, count: int = SIZES) -> Array:
+    """Sizes, equally many in each decade, from the smallest visible change to the signal's.
+
+    Parameters
+    ----------
+    largest : float
+        Root mean square of the signal in units of the noise of a sample.
+    samples : int
+        Of all runs and outputs.
+    count : int
+    """
+    least = VISIBLE / np.sqrt(samples)
+    return np.geomspace(least, max(largest, 10 * least), count)
+
+
+def fewer(sizes: Array, count: int = LAW_SIZES) -> Array:
+    """Fewer sizes over the same range."""
+    return np.geomspace(sizes[0], sizes[-1], count)

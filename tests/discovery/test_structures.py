@@ -1,0 +1,150 @@
+"""Probabilities of structures on campaigns whose truth is known, and the evidence they rest on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from discovery.fitted_states import NUMERICS, fitted
+from scipy import stats
+from scipy.special import logsumexp
+from small_campaigns import damper, damper_campaign, spring_damper_force
+
+from bayesoleo.discovery import StructurePosterior, StructurePrior
+from bayesoleo.discovery._ranking import score_candidates
+from bayesoleo.discovery._state import State
+from bayesoleo.discovery._structure_evidence import Likelihood, fewer
+from bayesoleo.discovery._structure_search import _extended, structure_posterior
+from bayesoleo.discovery._structures import (
+    Anchor,
+    Comparison,
+    Evidence,
+    _grids,
+    scan_prior,
+)
+from bayesoleo.effects import find_effect
+
+FEW = ("coulomb_friction", "quadratic_damping", "preload", "quadratic_stiffness", "sensor_gain")
+FRICTION = ("coulomb_friction", "force")
+
+
+def with_soft_friction(x, v, t):
+    """Friction that changes its direction over a twentieth of the largest velocity."""
+    return spring_damper_force(x, v, t) + 5.0 * 2 / np.pi * np.arctan(v / 0.004)
+
+
+def compared(state: State, names=FEW, prior: StructurePrior | None = None) -> StructurePosterior:
+    base = state.base()
+    effects = [find_effect(name) for name in names]
+    scores, _ = score_candidates(base, state.assembly, effects, 1)
+    errors = {(entry.run, entry.output): entry for entry in state.fit_errors.entries}
+    return structure_posterior(
+        base, state.assembly, scores, errors, NUMERICS, prior=prior or StructurePrior()
+    )
+
+
+@pytest.fixture(scope="module")
+def rubbing(tmp_path_factory) -> State:
+    return fitted(damper_campaign(tmp_path_factory.mktemp("rubbing")), damper())
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> State:
+    folder = tmp_path_factory.mktemp("plain")
+    return fitted(damper_campaign(folder, spring_damper_force), damper())
+
+
+def test_probabilities_are_of_all_structures(rubbing):
+    found = compared(rubbing)
+    assert sum(item.probability for item in found.structures) == pytest.approx(1.0)
+    falling = [item.probability for item in found.structures]
+    assert falling == sorted(falling, reverse=True)
+    assert set(found.effects) <= {(name, target) for name, target in found.effects}
+
+
+def test_what_is_missing_is_probable(rubbing):
+    found = compared(rubbing)
+    assert found.effects[FRICTION] > 0.95
+    assert found.nothing < 1e-6
+    assert found.structures[0].effects == (FRICTION,)
+    assert found.structures[0].estimated
+
+
+def test_nothing_is_probable_where_nothing_is_missing(plain):
+    found = compared(plain)
+    # The prior of nothing is a half: data that show nothing raise it.
+    assert found.nothing > 0.6
+    assert max(found.effects.values()) < 0.2
+
+
+def test_without_the_true_effect_something_outside_is_probable(rubbing):
+    found = compared(rubbing, ("quadratic_stiffness", "sensor_gain"))
+    assert found.outside > 0.9
+
+
+def test_odds_of_two_structures_follow_their_prior(plain):
+    """The evidence does not depend on the prior of structures."""
+    odds = []
+    for prior in (StructurePrior(), StructurePrior(nothing=0.2, catalogue=0.4, outside=0.4)):
+        found = compared(plain, prior=prior)
+        odds.append(found.nothing / found.only_outside * prior.outside / prior.nothing)
+    assert odds[0] == pytest.approx(odds[1], rel=1e-9)
+
+
+def test_evidence_about_an_estimate_is_that_of_importance_sampling(tmp_path):
+    """The model is nonlinear in no parameter but the shape of friction, which is well known here.
+
+    Where friction switches at once, its shape is only bounded on one side and the two differ by
+    some two units.
+    """
+    rubbing = fitted(damper_campaign(tmp_path, with_soft_friction), damper())
+    base = rubbing.base()
+    scores, _ = score_candidates(base, rubbing.assembly, [find_effect(FRICTION[0])], 1)
+    errors = {(entry.run, entry.output): entry for entry in rubbing.fit_errors.entries}
+    evidence = Evidence(Comparison.of(base.data, errors, scores, StructurePrior()))
+    evidence.add(Anchor(base.fit, {}))
+    (score,) = scores
+    anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)((FRICTION,))
+    evidence.add(anchor)
+    found = evidence.found[frozenset({FRICTION}), False]
+    assert found == pytest.approx(_sampled(evidence.comparison, anchor), abs=0.3)
+
+
+def _sampled(comparison: Comparison, anchor) -> float:
+    """Log evidence by importance sampling of the model itself, sizes of the effect included."""
+    rng, fit, data = np.random.default_rng(4), anchor.fit, comparison.data
+    names, theta = list(fit.problem.names), fit.point.theta
+    likelihood = Likelihood(comparison.variance.size, comparison.freedom)
+    _, sizes = _grids(comparison, data.signal(fit))
+    columns = data.columns([p.sensitivity for p in fit.predictions])
+    amplitude = names.index("coulomb_friction")
+    unit = comparison.unit(columns[[amplitude]])[0]
+    # Shapes are positive: they are drawn in their logarithm.
+    scale = np.array([theta[k] if n in anchor.shapes else 1.0 for k, n in enumerate(names)])
+    root = np.linalg.cholesky(1.44 * fit.point.covariance / np.outer(scale, scale))
+    white = rng.standard_t(8, (400, theta.size))
+    moved = white @ root.T
+    shape = np.array([name in anchor.shapes for name in names])
+    draws = np.where(shape, theta * np.exp(np.minimum(moved, 5.0)), theta + moved)
+    proposal = stats.t.logpdf(white, 8).sum(axis=1) - np.log(np.diag(root)).sum()
+    logs = np.full(len(draws), -np.inf)
+    for n, draw in enumerate(draws):
+        predictions = fit.predictor.predict(fit.problem.full(draw[None])[0])
+        residual = data.columns(
+            [
+                (run.measured - p.y)[:, None]
+                for run, p in zip(fit.predictor.runs, predictions, strict=True)
+            ]
+        )[0]
+        square = np.sum(residual**2 / comparison.variance)
+        logs[n] = likelihood(square, np.log(comparison.variance).sum())
+        for k, name in enumerate(names):
+            if k == amplitude:
+                # At the mean of the grid that the package uses for its own effects.
+                each = stats.norm.logpdf(draw[k], scale=fewer(sizes) * unit)
+                logs[n] += logsumexp(each) - np.log(each.size)
+            elif name in anchor.shapes:
+                centre, width = scan_prior(anchor.shapes[name])
+                logs[n] += stats.norm.logpdf(np.log(draw[k]), centre, width)
+            else:
+                logs[n] += fit.problem.priors[k].log_density(draw[None, k])[0]
+    return float(logsumexp(logs - proposal) - np.log(len(draws)))
