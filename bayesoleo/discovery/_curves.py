@@ -20,7 +20,13 @@ from bayesoleo._types import Array, Float
 from bayesoleo.discovery._assembly import AddedEffect
 from bayesoleo.discovery._hold_out_error import Prediction
 from bayesoleo.discovery._loop import ClosedLoop
-from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
+from bayesoleo.discovery._nonparametric_quantities import (
+    Forced,
+    ModelQuantity,
+    Motions,
+    quantities_of,
+    times_direction,
+)
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._state import State
@@ -171,9 +177,12 @@ def _products(base: Base, state: State, curve: Curve) -> tuple[Array, Array] | N
         forced = Forced(fit, assembly, spline.target)
     except ModelError:
         return None
+    turn = None
+    if spline.direction is not None:
+        turn = Motions(fit, assembly, [ModelQuantity("direction", spline.direction, "")])
     parts = []
     for r, run in enumerate(base.runs):
-        answer = forced.responses(r, partial(_courses, motions, r, numbers, spline))
+        answer = forced.responses(r, partial(_courses, motions, turn, r, numbers, spline))
         if isinstance(answer, Status):
             return None
         flat = np.moveaxis(answer, 1, 0).reshape(answer.shape[1], -1)
@@ -188,9 +197,17 @@ def _numbers(motions: Motions, spline: Spline) -> list[int] | None:
     return known if len(known) == len(spline.axes) else None
 
 
-def _courses(motions: Motions, r: int, numbers: list[int], spline: Spline, phase: Array) -> Array:
+def _courses(
+    motions: Motions,
+    turn: Motions | None,
+    r: int,
+    numbers: list[int],
+    spline: Spline,
+    phase: Array,
+) -> Array:
     parts = zip(spline.axes, numbers, spline.pieces, strict=True)
-    return tensor([axis.basis(motions.at(r, k, phase), pieces) for axis, k, pieces in parts])
+    values = tensor([axis.basis(motions.at(r, k, phase), pieces) for axis, k, pieces in parts])
+    return times_direction(turn, r, phase, values)
 
 
 def _range(low: float, high: float, unit: str) -> str:

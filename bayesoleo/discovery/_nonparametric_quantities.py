@@ -21,6 +21,7 @@ from scipy import stats
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.effects._force_effect import FRICTION_SLOPE
 from bayesoleo.effects._nonparametric import Axis, balance_places, bspline_values
 from bayesoleo.effects._places import parse_unit, unit_of, unit_text
 from bayesoleo.errors import ModelError
@@ -42,6 +43,8 @@ _PREFIX = "quantity_"
 Courses = Callable[[Array], Array]
 #: Terms that one model takes at a time.
 TOGETHER = 36
+#: Velocity at which a direction has half its size, over the largest one.
+TRANSITION = 1 / 200
 #: Step in phase for derivatives of a course.
 NEARBY = 1e-6
 _AMPLITUDE, _INPUT = "nonparametric_amplitude_", "nonparametric_course_"
@@ -189,6 +192,36 @@ def ranges(fit: ModelFit, assembly: Assembly, model: Model) -> dict[str, Axis]:
         In its own drive.
     """
     return {axis.name: axis for _, axis in Motions(fit, assembly, quantities_of(model)).axes({})}
+
+
+def direction_at(fit: ModelFit, assembly: Assembly, target: str) -> ModelQuantity | None:
+    r"""A smooth sign of the velocity at a place, :math:`\frac{2}{\pi}\arctan(v/v_0)`; None where
+    the place has no velocity.
+
+    The transition is the model's own where it declares a ``friction_slope``, else a part of the
+    largest velocity.
+    """
+    model = assembly.native
+    velocity = balance_places(model)[target].velocity
+    if velocity is None:
+        return None
+    if FRICTION_SLOPE in model.parameters:
+        slope: sp.Expr = symbol(FRICTION_SLOPE)
+    else:
+        motions = Motions(fit, assembly, [ModelQuantity("velocity", velocity, "")])
+        if not motions.quantities:
+            return None
+        along = [motions.at(r, 0, record.position) for r, record in enumerate(fit.records)]
+        largest = float(np.abs(np.concatenate(along)).max())
+        if not np.isfinite(largest) or largest == 0.0:
+            return None
+        slope = sp.Float(float(f"{1.0 / (TRANSITION * largest):.6g}"))
+    return ModelQuantity(f"direction at {target}", 2 / sp.pi * sp.atan(slope * velocity), "")
+
+
+def times_direction(turns: Motions | None, r: int, phase: Array, values: Array) -> Array:
+    """Courses ``(K, N)`` of run number ``r``, times the direction if there is one."""
+    return values if turns is None else values * turns.at(r, 0, phase)
 
 
 def _rank_correlation(values: Array, other: Array) -> float:

@@ -12,8 +12,8 @@ to depend on them, so that no prior has to separate directions that the data can
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -24,7 +24,13 @@ from scipy import linalg, stats
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
+from bayesoleo.discovery._nonparametric_quantities import (
+    Forced,
+    Motions,
+    direction_at,
+    quantities_of,
+    times_direction,
+)
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._score_basis import Base, coefficients
 from bayesoleo.discovery._score_tests import Score, inflation_of
@@ -36,7 +42,8 @@ from bayesoleo.solvers._orbit import Status
 #: Samples at which splines of one fineness are expressed in those of another.
 _DENSE = 400
 UNIT = Axis("", sp.Integer(0), "", 0.0, 1.0)
-Place = tuple[str, tuple[tuple[int, Axis], ...]]
+#: Balance, quantities with their numbers, and whether the function is multiplied by the direction.
+Place = tuple[str, tuple[tuple[int, Axis], ...], bool]
 
 
 @dataclass(frozen=True)
@@ -156,6 +163,8 @@ class Tried:
         Of the free coefficients.
     contribution : ndarray
         As of :class:`~bayesoleo.discovery.Score`.
+    direction : sympy.Expr, optional
+        By which the function is multiplied.
     """
 
     target: str
@@ -169,16 +178,18 @@ class Tried:
     weights: Array
     expected: Array
     contribution: Array
+    direction: sp.Expr | None = None
 
     @property
     def key(self) -> tuple[str, ...]:
-        """Balance and quantities."""
-        return (self.target, *(axis.name for axis in self.axes))
+        """Balance and quantities, and whether the direction counts."""
+        turned = () if self.direction is None else ("direction",)
+        return (self.target, *(axis.name for axis in self.axes), *turned)
 
     @property
     def spline(self) -> Spline:
         """The function as an effect's."""
-        return Spline(self.target, self.axes, self.pieces, self.weights)
+        return Spline(self.target, self.axes, self.pieces, self.weights, self.direction)
 
     def score(self, base: Base, assembly: Assembly, scales: Scales) -> Score:
         """The same as the score of a candidate, which can be refitted and confirmed."""
@@ -288,43 +299,76 @@ def search(
             forced[target] = Forced(base.fit, assembly, target)
         except ModelError:
             continue  # nothing is left to solve for with a term there
-    single = [(target, (item,)) for target in forced for item in axes]
-    found = _all(base, motions, forced, single, base.policy.pieces, jobs)
-    pairs = [
-        (best.target, (item, other))
-        for best in found[: base.policy.paired]
+    turns = _directions(base, assembly, forced)
+    single: list[Place] = [(target, (item,), False) for target in forced for item in axes]
+    # A function of the velocity has the direction in it.
+    single += [
+        (target, (item,), True)
+        for target, (velocity, _) in turns.items()
+        for item in axes
+        if item[1].expression != velocity
+    ]
+    found = _all(base, motions, forced, turns, single, base.policy.pieces, jobs)
+    plain = [best for best in found if best.direction is None]
+    pairs: list[Place] = [
+        (best.target, (item, other), False)
+        for best in plain[: base.policy.paired]
         for item in axes
         if item[1] is best.axes[0]
         for other in axes
         if other is not item
     ]
-    found += _all(base, motions, forced, pairs, base.policy.pieces_of_two, jobs)
+    found += _all(base, motions, forced, turns, pairs, base.policy.pieces_of_two, jobs)
     return CurveSearch(tuple(sorted(found, key=lambda item: item.log_p)), base.policy)
+
+
+#: By balance the velocity there, and the direction along the motion.
+Turns = dict[str, tuple[sp.Expr, Motions]]
+
+
+def _directions(base: Base, assembly: Assembly, targets: Iterable[str]) -> Turns:
+    found: Turns = {}
+    for target in targets:
+        direction = direction_at(base.fit, assembly, target)
+        motions = Motions(base.fit, assembly, [] if direction is None else [direction])
+        velocity = balance_places(assembly.native)[target].velocity
+        if motions.quantities and velocity is not None:
+            found[target] = velocity, motions
+    return found
 
 
 def _all(
     base: Base,
     motions: Motions,
     forced: dict[str, Forced],
+    turns: Turns,
     places: Sequence[Place],
     pieces: Sequence[int],
     jobs: int | None,
 ) -> list[Tried]:
     results = thread_map(
-        lambda place: list(_tried(base, motions, forced[place[0]], place, pieces)), places, jobs
+        lambda place: list(_tried(base, motions, forced[place[0]], turns, place, pieces)),
+        places,
+        jobs,
     )
     return sorted((item for found in results for item in found), key=lambda item: item.log_p)
 
 
 def _tried(
-    base: Base, motions: Motions, forced: Forced, place: Place, pieces: Sequence[int]
+    base: Base,
+    motions: Motions,
+    forced: Forced,
+    turns: Turns,
+    place: Place,
+    pieces: Sequence[int],
 ) -> Iterator[Tried]:
     """One function of some quantities, at each fineness."""
-    target, items = place
+    target, items, turned = place
+    turn = turns[target][1] if turned else None
     finest = pieces[-1]
     columns = []
     for r, run in enumerate(base.runs):
-        answer = forced.responses(r, partial(_courses, motions, r, items, finest))
+        answer = forced.responses(r, partial(_courses, motions, turn, r, items, finest))
         if isinstance(answer, Status):
             return
         flat = np.moveaxis(answer, 1, 0).reshape(answer.shape[1], -1)
@@ -336,13 +380,20 @@ def _tried(
         coarse = coarser(len(axes), count, finest)
         found = known_beside(base, coarse.T @ own @ coarse, cross @ coarse, coarse.T @ score)
         if found is not None:
-            yield _judged(base, target, axes, count, columns, coarse, found)
+            tried = _judged(base, target, axes, count, columns, coarse, found)
+            yield tried if turn is None else replace(tried, direction=turn.quantities[0].expression)
 
 
 def _courses(
-    motions: Motions, r: int, items: Sequence[tuple[int, Axis]], pieces: int, phase: Array
+    motions: Motions,
+    turn: Motions | None,
+    r: int,
+    items: Sequence[tuple[int, Axis]],
+    pieces: int,
+    phase: Array,
 ) -> Array:
-    return tensor([axis.basis(motions.at(r, k, phase), pieces) for k, axis in items])
+    values = tensor([axis.basis(motions.at(r, k, phase), pieces) for k, axis in items])
+    return times_direction(turn, r, phase, values)
 
 
 @cache

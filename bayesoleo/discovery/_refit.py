@@ -95,6 +95,8 @@ class Refit:
         Price of an unknown in the sum of squares: the logarithm of the number of samples (Schwarz
         1978).
     policy : SearchPolicy
+    feigned : float
+        Excess that noise alone can cause.
     """
 
     score: Score
@@ -109,6 +111,7 @@ class Refit:
     reached: bool
     price: float
     policy: SearchPolicy = SearchPolicy()
+    feigned: float = 0.0
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot distinguish two estimated effects.
@@ -119,6 +122,8 @@ class Refit:
         the evidence, and similar effects count as indistinguishable too.
         """
         if not (np.isfinite(self.share) and np.isfinite(other.share)):
+            return False
+        if self._leaves_clearly_less(other):
             return False
         gap = self.worth - other.worth
         policy = self.policy
@@ -132,6 +137,17 @@ class Refit:
         low, high = sorted((self.remaining, other.remaining))
         alike = cosine > 0 and cosine**2 > policy.same_cosine
         return alike and high < policy.equal_remainder * low
+
+    def _leaves_clearly_less(self, other: Refit) -> bool:
+        """Whether noise explains what the effect leaves, and not what another one leaves.
+
+        The difference must exceed the excess that noise alone can cause. Coloured noise makes
+        likelihoods of effects equal, but it does not change what a model leaves of a residual that
+        repeats.
+        """
+        if not self.reached or other.reached:
+            return False
+        return other.remaining - self.remaining > self.feigned
 
     @property
     def unusual(self) -> bool:
@@ -220,7 +236,7 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     price = schwarz_price(base)
     return Refit(
         score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price,
-        base.policy,
+        base.policy, base.feigned,
     )  # fmt: skip
 
 

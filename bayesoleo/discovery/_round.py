@@ -114,6 +114,9 @@ def examine(
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
+    if accepted is not None and after is not None and np.isnan(after.worst_ratio):
+        reason = f"with {accepted.effect} a run has no solution at the estimate"
+        accepted, after = None, None
     return Round(state, ranking, failed, accepted, after, reason, tests)
 
 

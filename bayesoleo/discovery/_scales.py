@@ -10,6 +10,7 @@ in a thousand. Without one no periodic force is scored, and the search needs no 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +20,7 @@ from bayesoleo._types import Array
 from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._fit import ModelFit, weights
 from bayesoleo.effects._parts import Scales
+from bayesoleo.effects._places import BETWEEN
 from bayesoleo.prediction._records import Record
 
 #: Lines on either side whose median is the level beside a line; cycles over the record below which
@@ -122,16 +124,23 @@ def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) ->
 
     for run, record in zip(fit.predictor.runs, fit.records, strict=True):
         phase = _places(record)
+        rows_of: dict[str, tuple[Array, Array]] = {}
         for dof, motion in run.known_motions().items():
             rows = motion(phase)
+            rows_of[dof] = rows[0], rows[1]
             add(dof, rows[0], rows[1])
         for channel, item in record.signals.items():
             values, rates = (item.evaluate(phase, record.rate, k) for k in (0, 1))
+            rows_of[channel] = values, rates
             add(channel, values, rates)
             if channel == drive:
                 for dof in native_dofs:
                     if dof not in run.known_motions():
+                        rows_of[dof] = values, rates
                         add(dof, values, rates)
+        for (one, here), (other, there) in itertools.permutations(rows_of.items(), 2):
+            if one in native_dofs:
+                add(f"{one}{BETWEEN}{other}", here[0] - there[0], here[1] - there[1])
     outputs = {
         name: max(
             float(np.ptp(run.measured[k][weights(run.record) > 0])) for run in fit.predictor.runs

@@ -35,12 +35,16 @@ from bayesoleo.discovery._score_basis import (
     remains,
     sensitivities_of,
 )
+from bayesoleo.effects._places import balance_of
+from bayesoleo.effects._terms import FAMILY as TERMS
 from bayesoleo.solvers._orbit import Status
 
 if TYPE_CHECKING:
     from bayesoleo.discovery._score_basis import RunBase
 
 
+#: Families that a change of a term may be one of, in other words.
+FORCES = frozenset({TERMS, "damping", "friction", "stiffness"})
 #: Degrees of freedom of a variance that is not measured.
 ASSUMED = 1e9
 
@@ -387,8 +391,9 @@ def without_twins(
     """Scores without effects that are another one in other words, and which those are.
 
     Where damping is a parameter of the model, more of it in extension is less of it in compression:
-    beside the model's own terms both do the same, whatever the data. Effects of different causes
-    that do the same are no twins, but a class.
+    beside the model's own terms both do the same, whatever the data. So does a friction that the
+    model declares and that grows with pressure, and a further friction in proportion to pressure.
+    Effects of different causes that do the same are no twins, but a class.
 
     Parameters
     ----------
@@ -416,7 +421,11 @@ def without_twins(
 
 def _are_twins(one: Score, other: Score, policy: SearchPolicy) -> bool:
     here, there = one.option.candidate, other.option.candidate
-    if (here.family, here.target) != (there.family, there.target):
+    families = {here.family, there.family}
+    dependent = TERMS in families and families <= FORCES
+    if dependent and balance_of(here.target) != balance_of(there.target):
+        return False
+    if not dependent and (here.family, here.target) != (there.family, there.target):
         return False
     if len(one.columns) != 1 or len(other.columns) != 1:
         return False  # effects with shapes, or with several unknowns

@@ -10,7 +10,16 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
-from bayesoleo.effects import _damping, _end_stop, _forces, _friction, _gas, _heat, _sensors
+from bayesoleo.effects import (
+    _damping,
+    _end_stop,
+    _forces,
+    _friction,
+    _gas,
+    _heat,
+    _sensors,
+    _terms,
+)
 from bayesoleo.effects._effect import Candidate, Effect
 from bayesoleo.effects._parts import Amplitude, Constant, Scales, ShapeParameter
 from bayesoleo.errors import InputError, choose
@@ -23,6 +32,7 @@ _EFFECTS = (
     _friction.DYNAMIC_FRICTION_EFFECTS,
     _damping.STIFFNESS_EFFECTS,
     _end_stop.CONTACT_EFFECTS,
+    _terms.EFFECTS,
     _forces.EFFECTS,
     _gas.EFFECTS,
     _heat.EFFECTS,
@@ -192,7 +202,7 @@ def with_titles(text: str, titles: Mapping[str, str]) -> str:
     if not titles:
         return text
     ids = "|".join(map(re.escape, sorted(titles, key=len, reverse=True)))
-    pattern = rf"(?<![\w.'-])({ids})(?: @ ([\w.]+(?:\[[^\]]*\])?))?(?![\w\[])"
+    pattern = rf"(?<![\w.'-])({ids})(?: @ ([\w.]+(?:[/-][\w.]+)*(?:\[[^\]]*\])?))?(?![\w\[])"
 
     def words(found: re.Match[str]) -> str:
         return called(f"{found[1]} @ {found[2]}" if found[2] else found[1], titles)

@@ -165,6 +165,7 @@ FAMILIES = (
     "friction",
     "stiffness",
     "contact",
+    "dependence",
     "force",
     "gas",
     "thermal",

@@ -27,11 +27,16 @@ from bayesoleo.effects._parts import (
     velocity_grid,
 )
 from bayesoleo.effects._places import (
+    Between,
     acceleration,
+    balance_terms,
+    between_places,
     force_places,
     is_quantity,
     moving_places,
+    place_at,
     spring_force,
+    with_force,
 )
 from bayesoleo.errors import InputError
 from bayesoleo.model._expressions import parse, symbol
@@ -44,6 +49,10 @@ FRICTION_SLOPE = "friction_slope"
 #: Names under which a model may declare the absolute pressure that seals and glands feel.
 PRESSURES = ("gas_pressure", "pressure")
 
+#: Words of an expression that a motion between two bodies has, and those that it has not: inertia
+#: is that of a body.
+_OF_A_DIFFERENCE = {"position", "velocity", "direction"}
+_OF_A_BODY = {"acceleration", "spring_force"}
 _NEED_VELOCITY = {"velocity", "acceleration", "direction", "largest_velocity"}
 
 
@@ -83,7 +92,8 @@ def force_effect(
     r"""An effect that adds a resisting force to the balance of forces.
 
     It acts in the equations of second-order dofs, or on the output of a force law. In a system of
-    first-order dofs an effect that needs no velocity acts in every equation.
+    first-order dofs an effect that needs no velocity acts in every equation. Between two dofs it
+    acts on both, with opposite signs (:func:`between_places`).
 
     Parameters
     ----------
@@ -221,6 +231,8 @@ def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], 
         found = moving_places(model) if used & _NEED_VELOCITY else force_places(model)
         if "spring_force" in used:
             found = {k: item for k, item in found.items() if spring_force(model, item) != 0}
+        elif used & _OF_A_DIFFERENCE and not used & _OF_A_BODY:
+            found = {**found, **between_places(model)}
         return tuple(found)
 
     return places
@@ -228,6 +240,8 @@ def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], 
 
 def _applies_to(used: set[str], requires: tuple[str, ...]) -> str:
     base = "equations of motion and force laws"
+    if used & _OF_A_DIFFERENCE and not used & _OF_A_BODY:
+        base += ", between two dofs"
     if not used & _NEED_VELOCITY:
         base += ", first-order systems"
     needed = [*requires, *(["gas_pressure"] if "pressure" in used else [])]
@@ -247,7 +261,7 @@ def _adding_term(
     """The change that adds the states and the force."""
 
     def change(model: Model, target: str, names: Names) -> Model:
-        place = force_places(model)[target]
+        place = place_at(model, target)
         dofs = {own: free_name(f"{effect}_{own}", model) for own in states}
         known = _vocabulary(model, place, names) | {own: symbol(n) for own, n in dofs.items()}
         dynamic = (*model.dofs, *model.inputs, *dofs.values())
@@ -258,9 +272,17 @@ def _adding_term(
             model = model.with_dof(dofs[own], dof, equation)
         force = parse(expression, known, dynamic, where)
         # An output shows the force itself; in an equation the force has the sign of the inertia.
-        return model.with_term(place.kind, place.target, effect, place.sign * force)
+        return with_force(model, place, _free_term(effect, model, place), force)
 
     return change
+
+
+def _free_term(name: str, model: Model, place: Coordinate) -> str:
+    """A name that no term of the balance has: an effect may act on a body and between bodies."""
+    taken = set(balance_terms(model, place))
+    if isinstance(place, Between):
+        taken |= set(model.equations.get(place.other, {}))
+    return name if name not in taken else f"{name} {place.name}"
 
 
 def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.Expr]:
@@ -268,7 +290,9 @@ def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.E
     own: tuple[str, ...] = (*model.inputs, *model.dofs, *model.parameters)
     own += (*model.conditions, *model.definitions)
     known: dict[str, sp.Expr] = {name: symbol(name) for name in own}
-    known |= {"position": place.position, "spring_force": place.sign * spring_force(model, place)}
+    known |= {"position": place.position}
+    if not isinstance(place, Between):
+        known["spring_force"] = place.sign * spring_force(model, place)
     pressure = _pressure(model)
     if pressure is not None:
         known["pressure"] = pressure

@@ -19,6 +19,7 @@ from bayesoleo.effects._parts import (
     Scan,
     ShapeParameter,
     range_grid,
+    range_once,
     velocity_grid,
     velocity_once,
 )
@@ -147,4 +148,35 @@ LUGRE = _with_memory(
     source="Canudas de Wit et al. (1995), IEEE Trans. Automatic Control 40(3), 419-425",
 )
 
-DYNAMIC_FRICTION_EFFECTS = (DAHL, BOUC_WEN, LUGRE)
+# The slider gives a little more than its friction while it slides, by one over _CORNER, lest the
+# corner between sticking and sliding be a jump. Within the gap an element would remember any course
+# for ever: a thousandth of the memory is lost, so that a motion inside the gap has one answer.
+_CORNER = 16
+_SPRING = "((max(memory - 1, 0) + min(memory + 1, 0))*gap/rise)"
+_SLIDING = f"{_CORNER}*(max({_SPRING} - 1, 0) + min({_SPRING} + 1, 0))"
+BACKLASH = single_force(
+    Amplitude("backlash_friction", "force", "F_g", "sliding friction behind the gap", 1),
+    "friction",
+    f"backlash_friction*{_SPRING}*{_CORNER}/{_CORNER + 1}",
+    shapes=(
+        ShapeParameter("gap", "position", "g", "half the gap", range_grid(1 / 64, 1 / 4)),
+        ShapeParameter(
+            "rise",
+            "position",
+            r"\delta",
+            "displacement over which friction builds up behind the gap",
+            range_once(1 / 16),
+        ),
+    ),
+    states={
+        "memory": InternalState(
+            f"dot(memory) - (velocity - abs(velocity)*({_SLIDING} + memory/1000))/gap",
+            description="deflection of the gap and the friction element over half the gap",
+        )
+    },
+    formula=r"F_g (w - \operatorname{clip}(w, -g, g))/\delta, \quad \dot w = \dot q \,[|F| < F_g]",
+    title="Backlash: friction behind a gap, in series",
+    source="Nordin and Gutman (2002), Automatica 38(10), 1633-1649, in series with Dahl (1968)",
+)
+
+DYNAMIC_FRICTION_EFFECTS = (DAHL, BOUC_WEN, LUGRE, BACKLASH)

@@ -2,8 +2,9 @@
 
 The function is a sum of cubic B-splines on equal pieces of the range that the motion covers. Beyond
 that range the function is unknown and fades to zero within three pieces. In two quantities it is a
-sum over products. Directions that the present model can produce are removed: some coefficients
-depend on the others, so that both keep their meaning.
+sum over products. A function may be multiplied by the direction of the motion, as a friction is.
+What the present model can produce already is removed: some coefficients depend on the others, so
+that both keep their meaning.
 
 References
 ----------
@@ -124,22 +125,27 @@ class Spline:
     weights : ndarray, shape (K, r)
         Coefficients of all splines from the free ones, which are the new parameters: column ``i``
         has a one where its own stands.
+    direction : sympy.Expr, optional
+        By which the function is multiplied: a smooth sign of the velocity there.
     """
 
     target: str
     axes: tuple[Axis, ...]
     pieces: tuple[int, ...]
     weights: Array
+    direction: sp.Expr | None = None
 
     @property
     def id(self) -> str:
         """Canonical id of the effect, an identifier."""
-        return "_and_".join([f"{FAMILY}_{self.axes[0].word}", *(a.word for a in self.axes[1:])])
+        name = "_and_".join([f"{FAMILY}_{self.axes[0].word}", *(a.word for a in self.axes[1:])])
+        return name if self.direction is None else f"{name}_by_direction"
 
     @property
     def quantities(self) -> str:
         """What it follows, in words."""
-        return " and ".join(axis.name for axis in self.axes)
+        names = " and ".join(axis.name for axis in self.axes)
+        return names if self.direction is None else f"{names}, times the direction"
 
     def basis(self, *values: Array) -> Array:
         """What each new parameter adds at some values of the quantities, shape (r, N)."""
@@ -155,7 +161,10 @@ class Spline:
             id=self.id,
             family=FAMILY,
             title=f"Nonparametric: a smooth function of {self.quantities}",
-            formula=r"\sum_k a_k B_k(" + ", ".join(map(_latex, self.axes)) + ")",
+            formula=r"\sum_k a_k B_k("
+            + ", ".join(map(_latex, self.axes))
+            + ")"
+            + ("" if self.direction is None else r" \, s(\dot q)"),
             amplitudes=tuple(
                 Amplitude(f"{self.id}_{k}", unit, f"a_{{{k}}}", f"{COEFFICIENT}, {self.id}")
                 for k in range(1, size + 1)
@@ -180,7 +189,8 @@ class Spline:
             weighted = [_number(w) * a for w, a in zip(row, amplitudes, strict=True) if w]
             terms.append(spline * sp.Add(*weighted))
         name = free_name(self.id, model)
-        extended = model.with_definition(name, sp.Add(*terms))
+        turned = sp.Integer(1) if self.direction is None else self.direction
+        extended = model.with_definition(name, turned * sp.Add(*terms))
         return extended.with_term(place.kind, place.target, name, place.sign * symbol(name))
 
 

@@ -11,7 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from bayesoleo.effects._places import force_places
+from bayesoleo.effects._places import place_at
 from bayesoleo.errors import ModelError
 from bayesoleo.model._model import Model
 
@@ -142,7 +142,7 @@ def geometric(low: float, high: float, ratio: float = 2.0) -> tuple[float, ...]:
 
 def coordinate_of(model: Model, target: str) -> str:
     """Name of the coordinate at a target."""
-    return force_places(model)[target].name
+    return place_at(model, target).name
 
 
 def stroke_range(model: Model, target: str, scales: Scales) -> float:
@@ -189,6 +189,15 @@ def velocity_once(fraction: float) -> Scan:
         return (fraction * scales.velocity[coordinate_of(model, target)],)
 
     return Scan(grid, f"{_part(fraction)} of the largest velocity, not scanned")
+
+
+def range_once(fraction: float) -> Scan:
+    """One fraction of the stroke's range, which is estimated without a scan."""
+
+    def grid(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+        return (fraction * stroke_range(model, target, scales),)
+
+    return Scan(grid, f"{_part(fraction)} of the range of the stroke, not scanned")
 
 
 def values(*numbers: float) -> Scan:

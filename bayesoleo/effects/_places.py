@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -135,14 +135,14 @@ class TargetUnits:
     words: dict[str, str]
 
     def resolve(self, text: str) -> str:
-        """Replace the words ``force``, ``position``, ``channel`` and ``parameter``."""
+        """Replace the words ``force``, ``position``, ``channel``, ``parameter``, ``quantity``."""
 
         def unit(match: re.Match[str]) -> str:
             word = self.words.get(match.group(), "") or "dimensionless"
             alone = word.isidentifier() or match.group() == text
             return word if alone else f"({word})"
 
-        composed = re.sub(r"\b(force|position|channel|parameter)\b", unit, text)
+        composed = re.sub(r"\b(force|position|channel|parameter|quantity)\b", unit, text)
         if parse_unit(composed) == parse_unit(""):
             return ""
         if "dimensionless" in composed:
@@ -151,8 +151,12 @@ class TargetUnits:
 
 
 def target_units(model: Model, target: str) -> TargetUnits:
-    """Units at a target: of the balance and the position, of the channel, of the parameter."""
+    """Units at a target: of the balance and the position, of the channel, of the parameter, and of
+    the quantity that a term of the balance follows."""
     words: dict[str, str] = {}
+    between = between_places(model).get(balance_of(target)) if BETWEEN in target else None
+    words |= _unit_of_quantity(model, target, between)
+    target = balance_of(target) if between is None else between.target
     name, _, coordinate = target.partition("/")
     if name in model.dofs:
         words |= {"force": balance_unit(model, name), "position": model.dofs[name].unit}
@@ -168,6 +172,20 @@ def target_units(model: Model, target: str) -> TargetUnits:
         if name not in model.dofs:
             words |= {"force": unit, "position": _unit_of_motion(model, name, coordinate)}
     return TargetUnits(words)
+
+
+def _unit_of_quantity(model: Model, target: str, between: Between | None) -> dict[str, str]:
+    """Unit of the quantity of ``place.term.quantity`` under its word, where it is known."""
+    name = target.rsplit(PART, 1)[1] if PART in target else ""
+    if between is not None and name == between.name:
+        return {"quantity": model.dofs[between.dof].unit}
+    if name in model.definitions:
+        try:
+            return {"quantity": unit_text(unit_of(symbol(name), model))}
+        except ModelError:
+            return {}  # bare numbers in a definition leave it without one
+    declared = _declared_units(model)
+    return {"quantity": declared[name]} if name in declared else {}
 
 
 def _unit_of_motion(model: Model, output: str, coordinate: str) -> str:
@@ -199,6 +217,191 @@ def force_places(model: Model) -> dict[str, Coordinate]:
         if item.kind == "equation" or _is_motion(model, item):
             places[item.target if alone else f"{item.target}/{item.name}"] = item
     return places
+
+
+#: In a target: between the names of two bodies.
+BETWEEN = "-"
+#: Between the parts of a target: a term of a balance, and the quantity that the term follows.
+PART = "."
+
+
+def balance_of(target: str) -> str:
+    """The balance of a target, without the term of it that an effect changes."""
+    return target.split(PART)[0]
+
+
+@dataclass(frozen=True)
+class Between(Coordinate):
+    """A place between two bodies: a force acts on both, with opposite signs.
+
+    Its position is the difference of two coordinates. A resisting force does the work that the
+    difference's rate takes out, so that it enters the other balance with the opposite sign, scaled
+    as that balance is.
+
+    Parameters
+    ----------
+    dof, other : str
+        The coordinates: the position is ``dof - other``.
+    share : sympy.Expr
+        What is added to the balance of ``other`` for a unit force; zero where that is an input.
+    """
+
+    dof: str = ""
+    other: str = ""
+    share: sp.Expr = sp.S.Zero
+
+    def seen(self, expression: sp.Expr) -> sp.Expr:
+        """An expression with ``dof`` in terms of the difference, which stands in its symbols."""
+        table = {
+            derivative_symbol(self.dof, n): derivative_symbol(self.name, n)
+            + derivative_symbol(self.other, n)
+            for n in range(2)
+        }
+        return expression.xreplace(table)
+
+
+#: Places between two dofs that no term of the model joins, at most.
+UNJOINED = 3
+
+
+def between_places(model: Model) -> dict[str, Between]:
+    """Places between two dofs of second order, or between one and an input, by target
+    ``dof-other``.
+
+    They are the differences that the model's own terms follow. Where there are at most
+    :data:`UNJOINED` of them, differences of any two dofs of one unit that have an inertia of their
+    own follow, up to that number.
+    Balances of two dofs that a term of the model joins may be scaled differently, as if each was
+    divided by its mass: by reciprocity the ratio of the joining terms is that of the scales.
+    Without such a term both must be in one unit, and in no unit of acceleration.
+    """
+    return dict(_between(Structure(model)))
+
+
+class Structure:
+    """A model as the key of a cache: equal where equations and signs are."""
+
+    def __init__(self, model: Model):
+        self.model = model
+        self._signs = tuple((c.target, c.sign) for c in model.coordinates())
+
+    def __hash__(self) -> int:
+        return hash(self.model.structure)
+
+    def __eq__(self, other: object) -> bool:
+        same = isinstance(other, Structure) and self._signs == other._signs
+        return same and self.model.structure == other.model.structure  # type: ignore[attr-defined]
+
+
+@lru_cache(maxsize=256)
+def _between(like: Structure) -> tuple[tuple[str, Between], ...]:
+    model = like.model
+    bodies = {
+        item.name: item
+        for item in model.coordinates()
+        if item.kind == "equation" and item.velocity is not None and WITHIN not in item.name
+    }
+    others = [*bodies, *(name for name in drives(model) if name not in bodies)]
+    found: dict[str, Between] = {}
+    apart: list[tuple[Coordinate, str]] = []
+    for one in bodies.values():
+        for other in others[others.index(one.name) + 1 :]:
+            if _joins(model, one, other):
+                found |= _made(model, one, bodies.get(other), other)
+            elif other in bodies and _alike(model, one, bodies[other]):
+                apart.append((one, other))
+    for one, other in apart[: max(UNJOINED - len(found), 0)]:
+        found |= _made(model, one, bodies[other], other)
+    return tuple(found.items())
+
+
+def _alike(model: Model, one: Coordinate, other: Coordinate) -> bool:
+    """Whether two coordinates are of one kind: in one unit, each with an inertia of its own.
+
+    Where the inertia of one body moves with both, one coordinate is a difference already.
+    """
+    mixed = model.expand(model.equation(one.target)).has(acceleration(other))
+    mixed |= model.expand(model.equation(other.target)).has(acceleration(one))
+    return not mixed and model.dofs[one.name].unit == model.dofs[other.name].unit
+
+
+def _joins(model: Model, one: Coordinate, other: str) -> bool:
+    """Whether a term of a balance follows the difference of two coordinates and neither alone."""
+    parts = [
+        part
+        for term in model.equations[one.target].values()
+        for part in sp.Add.make_args(model.expand(term))
+    ]
+    orders = range(2)
+    for part in parts:
+        pairs = [[derivative_symbol(name, n) for name in (one.name, other)] for n in orders]
+        pairs = [pair for pair in pairs if part.has(*pair)]
+        if pairs and all(
+            part.has(a) and part.has(b) and sp.expand(sp.diff(part, a) + sp.diff(part, b)) == 0
+            for a, b in pairs
+        ):
+            return True
+    return False
+
+
+def _made(model: Model, one: Coordinate, other: Coordinate | None, name: str) -> dict[str, Between]:
+    """The place between two coordinates; none where the scales of their balances are unknown."""
+    share = sp.Integer(0) if other is None else _share(model, one, other)
+    if share is None:
+        return {}
+    target = f"{one.name}{BETWEEN}{name}"
+    position, velocity = (
+        derivative_symbol(one.name, n) - derivative_symbol(name, n) for n in range(2)
+    )
+    return {
+        target: Between(
+            target, position, velocity, "equation", one.target, one.sign, one.name, name, share
+        )
+    }
+
+
+def _share(model: Model, one: Coordinate, other: Coordinate) -> sp.Expr | None:
+    """What a unit force between two bodies adds to the second balance; None where unknown."""
+    here, there = (model.expand(model.equation(item.target)) for item in (one, other))
+    for order in range(2):
+        forth = sp.diff(here, derivative_symbol(other.name, order))
+        back = sp.diff(there, derivative_symbol(one.name, order))
+        if forth != 0 and back != 0:
+            ratio = sp.simplify(back / forth)
+            if not _moving_names(model, ratio):
+                return -one.sign * ratio
+    units = [balance_unit(model, item.target) for item in (one, other)]
+    moved = model.dofs[one.name].unit
+    if units[0] != units[1] or (
+        units[0] and moved and parse_unit(units[0]) == parse_unit(moved) / parse_unit("s") ** 2
+    ):
+        return None
+    return sp.Integer(-other.sign)
+
+
+def _moving_names(model: Model, expression: sp.Expr) -> set[str]:
+    names = {split_derivative(item)[0] for item in expression.free_symbols}
+    return names & {*model.dofs, *model.inputs}
+
+
+def all_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` and of :func:`between_places`."""
+    return {**force_places(model), **between_places(model)}
+
+
+def place_at(model: Model, target: str) -> Coordinate:
+    """The place of a target, or of the balance whose term it is."""
+    found = force_places(model)
+    name = balance_of(target)
+    return found[name] if name in found else between_places(model)[name]
+
+
+def with_force(model: Model, place: Coordinate, name: str, force: sp.Expr) -> Model:
+    """Add a resisting force at a place: in a balance, or with opposite signs in two."""
+    model = model.with_term(place.kind, place.target, name, place.sign * force)
+    if isinstance(place, Between) and place.share != 0:
+        model = model.with_term("equation", place.other, name, place.share * force)
+    return model
 
 
 def _is_motion(model: Model, place: Coordinate) -> bool:

@@ -11,13 +11,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects._effect import BY_RUN, Effect, Names
+from bayesoleo.effects._effect import BY_RUN, Effect, Names, free_name
 from bayesoleo.effects._nonparametric import COEFFICIENT
-from bayesoleo.effects._parts import Amplitude, Constant, Scales, Scan, ShapeParameter, geometric
-from bayesoleo.effects._places import substitute
+from bayesoleo.effects._parts import (
+    Amplitude,
+    Constant,
+    Scales,
+    Scan,
+    ShapeParameter,
+    geometric,
+    period_grid,
+)
+from bayesoleo.effects._places import is_quantity, substitute
 from bayesoleo.model._drive import possible_drives
 from bayesoleo.model._expressions import (
     TIME,
@@ -29,6 +38,7 @@ from bayesoleo.model._expressions import (
     total_derivative,
 )
 from bayesoleo.model._model import Model
+from bayesoleo.model._parameters import Dof
 
 
 def _shared(model: Model) -> Sequence[str]:
@@ -109,6 +119,23 @@ def _gain(model: Model, channel: str, names: Names) -> Model:
     return model.with_term("output", channel, "sensor_gain", gain * whole)
 
 
+def _gauges(model: Model) -> Sequence[str]:
+    """Outputs that show a pressure above the declared ambient one."""
+    ambient = symbol("ambient_pressure")
+    if not is_quantity(model, ambient.name):
+        return ()
+    shown = {name: model.expand(model.output(name)) for name in model.outputs}
+    return tuple(name for name, expression in shown.items() if sp.diff(expression, ambient) == -1)
+
+
+def _absolute_gain(model: Model, channel: str, names: Names) -> Model:
+    """The sensor amplifies the absolute pressure, of whose reading the ambient one is taken off."""
+    whole = sp.Add(*model.output_terms(channel).values()) + symbol("ambient_pressure")
+    return model.with_term(
+        "output", channel, "absolute_pressure_gain", names["absolute_pressure_gain"] * whole
+    )
+
+
 def _lag(model: Model, channel: str, names: Names) -> Model:
     lag = names["sensor_lag"]
     if channel in model.inputs:
@@ -160,6 +187,23 @@ def _later(name: str, order: int, ahead: sp.Expr, known: int) -> sp.Expr:
     return sp.Add(
         *(ahead**k / math.factorial(k) * derivative_symbol(name, order + k) for k in terms)
     )
+
+
+def _follow(model: Model, channel: str, names: Names) -> Model:
+    """A part of what the sensor shows follows its input: tau ds/dt + s = y."""
+    shown, dof = model.output(channel), free_name(f"{channel}_reading", model)
+    late = symbol(dof)
+    equation = {
+        "storage": names["time_constant"] * derivative_symbol(dof, 1),
+        "reading": late,
+        "input": -shown,
+    }
+    state = Dof(
+        model.outputs[channel].unit, 0.0, "what the sensor shows of the channel", "equilibrium"
+    )
+    term = names["first_order_lag"] * (late - shown)
+    model = model.with_dof(dof, state, equation)
+    return model.with_term("output", channel, "first_order_lag", term)
 
 
 def _rate(model: Model, channel: str) -> sp.Expr:
@@ -236,13 +280,46 @@ GAIN = _sensor(
 )
 LAG = _sensor(
     "sensor_lag",
-    "Lag of a sensor, channels misaligned in time",
+    "Lag of a sensor, channels misaligned in time (a short delay)",
     r"m(t) = y(x(t - \tau)), x(t - \tau) \approx x - \tau \dot x + \frac{1}{2} \tau^2 \ddot x",
     "s",
     r"\tau",
     _laggable,
     _lag,
     "4.23: step response time",
+)
+# The time constant is a shape: at the null of a time constant a long lag looks like a short delay.
+FIRST_ORDER_LAG = Effect(
+    id="first_order_lag",
+    family="sensor",
+    title="First-order lag of a sensor (of any length)",
+    formula=r"m = y + a (w - y), \quad \tau \dot w + w = y",
+    amplitudes=(
+        Amplitude("first_order_lag", "", "a", "part that lags; one where the whole sensor does"),
+    ),
+    places=lambda model: tuple(model.outputs),
+    change=_follow,
+    shapes=(
+        ShapeParameter(
+            "time_constant", "s", r"\tau", "time constant of the lag", period_grid(1 / 16, 1 / 2)
+        ),
+    ),
+    source=f"{VOCABULARY}, 4.23: step response time",
+    applies_to="outputs",
+    own_name_per_target=True,
+)
+ABSOLUTE_GAIN = replace(
+    _sensor(
+        "absolute_pressure_gain",
+        "Gain error of a gauge that senses the absolute pressure",
+        "m + p_a = (1 + g) (y + p_a)",
+        "",
+        "g",
+        _gauges,
+        _absolute_gain,
+        "4.12: sensitivity",
+    ),
+    applies_to="outputs that show a pressure above ``ambient_pressure``",
 )
 DRIFT = _sensor(
     "sensor_drift",
@@ -320,4 +397,13 @@ def _saturation(side: str) -> Effect:
     )
 
 
-EFFECTS = (OFFSET, GAIN, LAG, DRIFT, _saturation("upper"), _saturation("lower"))
+EFFECTS = (
+    OFFSET,
+    GAIN,
+    ABSOLUTE_GAIN,
+    LAG,
+    FIRST_ORDER_LAG,
+    DRIFT,
+    _saturation("upper"),
+    _saturation("lower"),
+)

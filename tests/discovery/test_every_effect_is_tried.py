@@ -11,7 +11,8 @@ from bayesoleo.effects import catalogue
 ALONE = {
     "periodic_force", "humming_force", "drifting_force", "gravity_error", "extra_volume",
     "direction_dependent_damping", "compression_damping", "pressure_dependent_friction",
-    "gas_solubility", "heat_exchange",
+    "gas_solubility", "heat_exchange", "input_dependent_term",
+    "first_order_lag",  # in tests/benchmarks/structure_cases.py
 }  # fmt: skip
 
 

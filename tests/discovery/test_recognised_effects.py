@@ -11,11 +11,14 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
 
+from bayesoleo import Campaign
+from bayesoleo.data import load_campaign, reduce_campaign
 from bayesoleo.discovery._assembly import assign
 from bayesoleo.discovery._loop import close_loop
 from bayesoleo.discovery._score_tests import classes, score_all
 from bayesoleo.effects import catalogue
 from bayesoleo.model import Model, Output, Parameter
+from bayesoleo.prediction import RunPlan, motion
 
 
 def preload(x, v, t):
@@ -114,6 +117,16 @@ def late(x, v, t):
     return old(t - 0.01)
 
 
+def behind_a_gap(x, v, t, gap=0.003, give=3e-4):
+    """A slider that moves once gap and spring are taken up: a march from sample to sample."""
+    z, deflection = 0.0, np.zeros(x.size)
+    for _ in range(2):
+        for k in range(x.size):
+            z = float(np.clip(z + x[k] - x[k - 1], -gap - give, gap + give))
+            deflection[k] = z
+    return 5.0 * (deflection - np.clip(deflection, -gap, gap)) / give
+
+
 def accelerated(x, v, t):
     return spring_damper_force(x, v, t) + 4.0 * CubicSpline(t, v).derivative()(t)
 
@@ -151,6 +164,7 @@ LAWS = {
     "dahl_friction": plus(dahl),
     "bouc_wen_friction": plus(bouc_wen),
     "lugre_friction": plus(lugre),
+    "backlash_friction": plus(behind_a_gap),
     "quadratic_stiffness": plus(lambda x, v, t: 3e4 * x**2),
     "quintic_stiffness": plus(lambda x, v, t: 1e10 * x**5),
     "constant_force": plus(lambda x, v, t: 3.0),
@@ -211,6 +225,44 @@ def test_damping_that_differs_by_direction(side, tmp_path):
 
     state = fitted(damper_campaign(tmp_path, law, noise=0.1), damper())
     assert first_class(state) & {"direction_dependent_damping", "compression_damping"}
+
+
+@pytest.mark.slow
+def test_friction_that_a_current_changes(tmp_path):
+    """A magnetorheological damper: the current is an input that is neither motion nor force."""
+
+    def damper_with(friction, **more):
+        terms = {"damping": "damping*current*dot(displacement)", "friction": friction}
+        return Model(
+            "magnetorheological",
+            inputs={"displacement": "m", "current": "A"},
+            parameters={
+                "damping": Parameter(200.0, "N*s/(m*A)", sd=100.0),
+                "coulomb": Parameter(6.0, "N", sd=3.0),
+                **more,
+            },
+            outputs={"force": Output(terms, "N")},
+        )
+
+    law = "coulomb*tanh(dot(displacement)/0.002)"
+    plans = [
+        RunPlan(
+            f"run {k}",
+            frequency,
+            {
+                "displacement": motion(0.0, [amplitude, 0.05 * amplitude]),
+                "current": motion(1.0, [0.0, 0.4], [0.0, 0.7 * k]),
+            },
+            periods=6,
+            samples_per_period=120.3,
+        )
+        for k, (frequency, amplitude) in enumerate([(1.0, 0.01), (2.0, 0.006), (0.5, 0.012)])
+    ]
+    share = Parameter(0.4, "1/A", fixed=True)
+    true = damper_with(f"(1 + share*current)*{law}", share=share)
+    Campaign.simulate(tmp_path, true, plans, noise={"force": 0.1})
+    state = fitted(reduce_campaign(load_campaign(tmp_path), jobs=1), damper_with(law))
+    assert "input_dependent_term" in first_class(state)
 
 
 @pytest.mark.slow

@@ -48,6 +48,8 @@ class Oleo:
     friction: float = MU1
     exchange: float = 1.0
     shown: Callable = lambda t, force, pressure: (force, pressure)
+    #: Of stroke, velocity, temperature and pressure: factors of damping and friction.
+    factors: Callable = lambda x, v, t, p: (1.0, 1.0)
 
     def gas(self, x, t, p0):
         """Absolute pressure and volume ratio at a stroke and a temperature."""
@@ -107,7 +109,8 @@ def run_of(oleo, k, rng):
     p = oleo.gas(x, t, true)[0]
     damping = C3 * v * np.abs(v) * (1 + oleo.damping_by_temperature * (t / T0 - 1))
     friction = (MU0 + oleo.friction * p) * np.arctan(SLOPE * v)
-    force = M * (a + G) + damping + A * (p - PA) + friction
+    more_damping, more_friction = oleo.factors(x, v, t, p)
+    force = M * (a + G) + damping * more_damping + A * (p - PA) + friction * more_friction
     force, p = oleo.shown(time, force, p - PA)
     samples = {"displacement": x, "force": force, "pressure": p}
     samples = {n: y + NOISE[n] * rng.standard_normal(time.size) for n, y in samples.items()}
@@ -159,6 +162,17 @@ EFFECTS = {
     "sensor_gain": Oleo(shown=lambda t, force, pressure: (force, 1.02 * pressure)),
     "sensor_offset": Oleo(shown=lambda t, force, pressure: (force, pressure + 2e4)),
     "sensor_lag": Oleo(shown=late_pressure),
+    "absolute_pressure_gain": Oleo(
+        shown=lambda t, force, pressure: (force, 1.02 * (pressure + PA) - PA)
+    ),
+    "direction_dependent_term": Oleo(
+        friction=1e-4, factors=lambda x, v, t, p: (1.0, 1 + 0.3 * np.sign(v))
+    ),
+    "stroke_dependent_term": Oleo(friction=1e-4, factors=lambda x, v, t, p: (1.0, 1 + 3.0 * x)),
+    "pressure_dependent_term": Oleo(factors=lambda x, v, t, p: (1 + 1e-6 * p, 1.0)),
+    "temperature_dependent_term": Oleo(
+        friction=1e-4, factors=lambda x, v, t, p: (1.0, 1 + 5.0 * (t / T0 - 1))
+    ),
 }
 
 

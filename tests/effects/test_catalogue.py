@@ -20,6 +20,7 @@ from bayesoleo.effects import (
     force_effect,
 )
 from bayesoleo.errors import InputError, ModelError
+from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.systems import system
 
 
@@ -44,9 +45,31 @@ def test_every_effect_is_described_and_its_formulas_render(effect):
         parser.parse(f"${parameter['latex'] or 'c'}$")
 
 
+def controlled_damper() -> Model:
+    """A damper whose friction a current may change."""
+    return Model(
+        "controlled damper",
+        inputs={"displacement": "m", "current": "A"},
+        parameters={
+            "damping": Parameter(1.0, "N*s/(m*A)", sd=1.0),
+            "friction": Parameter(1.0, "N", sd=1.0),
+        },
+        outputs={
+            "force": Output(
+                {
+                    "damping": "damping*current*dot(displacement)",
+                    "friction": "friction*tanh(100*dot(displacement))",
+                },
+                "N",
+            )
+        },
+    )
+
+
 def test_every_effect_applies_to_some_system(offered):
     names = ("f16n1d2", "f16n2d2", "viscous_damper", "duffing")
     used = {c.effect for name in names for c in offered(system(name))}
+    used |= {c.effect for c in offered(controlled_damper())}
     assert used == {effect.id for effect in catalogue()}
 
 
