@@ -34,7 +34,9 @@ def add_propose(app: typer.Typer) -> None:
     shell.add(app, PANEL, propose)
 
 
-@options.of_settings("seed", "jobs", "effects", "without", *options.SOLVED, "nuisance")
+@options.of_settings(
+    "seed", "jobs", "effects", "without", *options.SOLVED, "nuisance", "disturbances"
+)
 def propose(
     campaign: options.CampaignPath,
     model: options.ModelText,
@@ -216,7 +218,7 @@ def _is_demo(folder: Path, name: str) -> bool:
 
 @options.of_settings(
     *options.SAMPLED, "max_effects", "effects", "without", *options.SOLVED,
-    "nuisance", "error_model", "between_runs",
+    "nuisance", "disturbances", "error_model", "between_runs",
 )  # fmt: skip
 def close(
     campaign: options.CampaignPath,
@@ -268,7 +270,7 @@ def _closed(
     _print_loop(tree, folder)
 
 
-@options.of_settings(*options.SOLVED, "nuisance", "without")
+@options.of_settings(*options.SOLVED, "nuisance", "disturbances", "without")
 def check(
     campaign: options.CampaignPath,
     model: options.ModelText,

@@ -96,7 +96,9 @@ def add_to(app: typer.Typer) -> None:
     shell.add(app, RECORDS_PANEL, estimate, sample, trace)
 
 
-@options.of_settings("jobs", *options.SOLVED, "nuisance", "error_model", "between_runs")
+@options.of_settings(
+    "jobs", *options.SOLVED, "nuisance", "disturbances", "error_model", "between_runs"
+)
 def estimate(
     campaign: options.CampaignPath,
     model: options.ModelText,
@@ -199,7 +201,9 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
     return cast(list[str], lines + json.loads(status["notes"]))
 
 
-@options.of_settings(*options.SAMPLED, *options.SOLVED, "nuisance", "error_model", "between_runs")
+@options.of_settings(
+    *options.SAMPLED, *options.SOLVED, "nuisance", "disturbances", "error_model", "between_runs"
+)
 def sample(
     campaign: options.CampaignPath,
     model: options.ModelText,
@@ -238,7 +242,9 @@ def sample(
     _print_written(folder, console)
 
 
-@options.of_settings("seed", "jobs", "effects", "without", *options.SOLVED, "nuisance")
+@options.of_settings(
+    "seed", "jobs", "effects", "without", *options.SOLVED, "nuisance", "disturbances"
+)
 def trace(
     campaign: options.CampaignPath,
     model: options.ModelText,

@@ -176,7 +176,7 @@ def _of_campaign(data: Any, model: Model, settings: Settings, progress: bool) ->
 
 
 #: Settings that only a campaign has.
-_OF_CAMPAIGNS = ("drive", "nuisance", "between_runs", "scheme", "steps")
+_OF_CAMPAIGNS = ("drive", "nuisance", "disturbances", "between_runs", "scheme", "steps")
 
 
 def _of_function(

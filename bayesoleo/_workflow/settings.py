@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 RUNNING, SOLVING = "How it is run", "How the model is solved"
 SCHEMES = ("radau2", "radau3", "gauss2", "gauss3", "thesis")
+DISTURBANCES = ("drift", "tone", "tails")
 SOLVERS = ("collocation", "adaptive", "shooting", "hybrid", "library")
 #: Key of a field's metadata under which its option is.
 OPTION = "option"
@@ -109,6 +110,11 @@ def _check_kind(item: Field[Any], value: Any) -> None:
         raise InputError("is too small", key=item.name, value=value, hint=hint)
 
 
+def _disturbances(text: str) -> tuple[str, ...]:
+    """Kinds of disturbances; ``none`` stands for none of them."""
+    return () if text.strip() == "none" else words(text)
+
+
 def _effects(text: str) -> tuple[Effect, ...]:
     """Load the effects of a file, after those of the catalogue."""
     from bayesoleo._workflow.model_files import load_effects
@@ -166,6 +172,8 @@ class Settings:
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated
         (:func:`bayesoleo.posterior.hierarchical`).
+    disturbances : tuple of {"drift", "tone", "tails"}
+        What is looked for in the outputs of periodic runs, and removed before physics is named.
     policy : SearchPolicy
         The numbers by which the search for missing effects decides.
     """
@@ -237,6 +245,12 @@ class Settings:
         "collocation", str, SOLVING, f"Solver of periodic runs: {', '.join(SOLVERS)}.",
         metavar="NAME",
     )  # fmt: skip
+    disturbances: tuple[str, ...] = _setting(
+        DISTURBANCES, str, SOLVING,
+        "What is no physics and is removed from the outputs of periodic runs where it is found: "
+        "drift, tone (no harmonic), tails (outliers); 'none' for nothing.",
+        read=_disturbances, metavar="drift,tone,tails",
+    )  # fmt: skip
     policy: SearchPolicy = field(default_factory=_search_policy)
 
     def __post_init__(self) -> None:
@@ -254,6 +268,12 @@ class Settings:
             raise InputError("unknown scheme", key="scheme", value=self.scheme, hint=hint)
         check_solver(self.solver, self.scheme)
         check_word(self.error_model)
+        for kind in self.disturbances:
+            if kind not in DISTURBANCES:
+                raise InputError(
+                    "unknown disturbance", key="disturbances", value=kind,
+                    hint=f"some of {', '.join(DISTURBANCES)}, or () for none",
+                )  # fmt: skip
         known = [effect.id for effect in self._offered] + [FAMILY]
         for name in self.without:
             if name not in known:

@@ -19,6 +19,7 @@ from bayesoleo._units import parse_unit, same_quantity
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
+from bayesoleo.data._disturbances import without_disturbances
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._fit import first_steps
@@ -304,6 +305,7 @@ def prepare(
     starts = not all(record.periodic for record in reduced.records)
     assembly = Assembly(model, drive, starts=starts)
     assembly, reduced = _with_nuisance(assembly, reduced, settings.nuisance)
+    assembly, reduced = _undisturbed(assembly, reduced, settings.disturbances)
     driven = assembly.model()
     # Building a predictor of one step checks channels, conditions and priors of every run without
     # solving anything.
@@ -394,6 +396,24 @@ def _with_nuisance(
     found = declared_nuisance(kinds, assembly.model(), reduced.records, accuracy)
     records = found.complete(reduced.records)
     return replace(assembly, nuisance=found), ReducedCampaign(reduced.campaign, records)
+
+
+def _undisturbed(
+    assembly: Assembly, reduced: ReducedCampaign, kinds: tuple[str, ...]
+) -> tuple[Assembly, ReducedCampaign]:
+    """Remove from the outputs what is no physics; the mean of one that drifts becomes unknown."""
+    model = assembly.model()
+    outputs = [name for name in model.outputs if name in reduced.campaign.channels]
+    records = without_disturbances(reduced.records, outputs, kinds)
+    drifting = tuple(
+        name
+        for name in outputs
+        if any(name in r.disturbances and r.disturbances[name].drift for r in records)
+    )
+    if drifting:
+        assembly = replace(assembly, nuisance=replace(assembly.nuisance, drifting=drifting))
+        records = assembly.nuisance.complete(records)
+    return assembly, ReducedCampaign(reduced.campaign, records)
 
 
 def _check_units(model: Model, campaign: CampaignData) -> None:

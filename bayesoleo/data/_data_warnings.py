@@ -241,10 +241,53 @@ def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = N
         for record in records
         for item in drifting(record)
     ]
+    found += _about_removed(records, known)
     for record, doubts in zip(records, periods, strict=True):
         # Lines between the harmonics of a wrong frequency are harmonics of the true one.
         found += [] if doubts else _about_channels(record, known)
     return found
+
+
+def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[str]:
+    """What was removed from channels, one sentence a channel and kind."""
+    found = []
+    for channel in dict.fromkeys(name for r in records for name in r.disturbances):
+        there = [(r, r.disturbances[channel]) for r in records if channel in r.disturbances]
+        unit = _unit(units, channel)
+        runs = [r.label for r, item in there if item.drift]
+        if runs:
+            largest = max(item.drift for _, item in there)
+            found.append(
+                f"{channel} drifts ({_runs(runs)}), by up to {largest:.2g}{unit} root mean square: "
+                "the drift was removed, and the mean of each run is estimated as unknown; to keep "
+                "it leave drift out of disturbances"
+            )
+        tones = [(tone, r.label) for r, item in there for tone in item.tones]
+        if tones:
+            loudest, where = max(tones, key=lambda pair: pair[0].amplitude)
+            runs = list(dict.fromkeys(label for _, label in tones))
+            found.append(
+                f"{channel} has a tone that is no harmonic of the drive ({_runs(runs)}), the "
+                f"loudest in run {where} at {loudest.frequency:.4g} Hz with the amplitude "
+                f"{loudest.amplitude:.3g}{unit}: it was removed; to keep it leave tone out of "
+                "disturbances"
+            )
+        runs = [r.label for r, item in there if item.degrees]
+        if runs:
+            least = min(item.degrees for _, item in there if item.degrees)
+            found.append(
+                f"{channel} has outliers ({_runs(runs)}), as noise with {least:g} degrees of "
+                "freedom of the t distribution has: they were weighted down; to keep them leave "
+                "tails out of disturbances"
+            )
+    return found
+
+
+def _runs(labels: Sequence[str]) -> str:
+    """Labels after the word run; the first few of many."""
+    some = ", ".join(labels[:4])
+    more = f" and {len(labels) - 4} more" if len(labels) > 4 else ""
+    return f"run{'s' if len(labels) > 1 else ''} {some}{more}"
 
 
 def _unit(units: Mapping[str, str], channel: str) -> str:

@@ -316,11 +316,14 @@ class NoiseSpectrum:
         Lines from one harmonic to the next: the number of periods.
     samples : int
         Number N of samples.
+    emptied : ndarray of bool, shape (N // 2 + 1,), optional
+        Lines that say nothing of the noise, because something was removed there.
     """
 
     level: Array
     lines: int
     samples: int
+    emptied: NDArray[np.bool_] | None = None
 
     @cached_property
     def weights(self) -> Array:
@@ -363,7 +366,9 @@ class NoiseSpectrum:
     def freedom(self, power: Array) -> float:
         """Degrees of freedom of ``power @ level``: few lines have said what the level is."""
         used = ~self._harmonic()
-        low, high = _windows(self.level.size, self.lines)
+        if self.emptied is not None:
+            used = used & ~self.emptied
+        low, high = _windows(self.level.size, self.lines, self.emptied)
         counts = np.maximum(_between(used.astype(float), low, high), 1.0)
         spread = np.zeros(self.level.size + 1)
         np.add.at(spread, low, power / counts)
@@ -373,7 +378,9 @@ class NoiseSpectrum:
         return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
 
 
-def noise_spectrum(rest: Array, periods: int) -> NoiseSpectrum:
+def noise_spectrum(
+    rest: Array, periods: int, emptied: NDArray[np.bool_] | None = None
+) -> NoiseSpectrum:
     """Spectrum of noise.
 
     Parameters
@@ -382,22 +389,40 @@ def noise_spectrum(rest: Array, periods: int) -> NoiseSpectrum:
         What of a signal does not repeat, over whole periods.
     periods : int
         Their number, at least two.
+    emptied : ndarray of bool, shape (N // 2 + 1,), optional
+        Lines that something was removed at; the noise there is that of the nearest lines.
     """
     size = rest.size
     power = np.abs(scipy.fft.rfft(rest)) ** 2 / size
-    used = (np.arange(power.size) % periods != 0).astype(float)
-    low, high = _windows(power.size, periods)
+    free = np.arange(power.size) % periods != 0
+    free = free if emptied is None else free & ~emptied
+    used = free.astype(float)
+    low, high = _windows(power.size, periods, emptied)
     level = _between(power * used, low, high) / np.maximum(_between(used, low, high), 1.0)
-    return NoiseSpectrum(level, periods, size)
+    return NoiseSpectrum(level, periods, size, emptied)
 
 
-def _windows(size: int, periods: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First line of each line's neighbourhood, and the first beyond it."""
+def _windows(
+    size: int, periods: int, emptied: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First line of each line's neighbourhood, and the first beyond it.
+
+    Where a neighbourhood has emptied lines only, it is that of the next line that has another.
+    """
     line = np.arange(size)
     half = np.maximum(HARMONICS * periods, PART * line).astype(np.int64)
     half[:1] = max(1, int(AT_MEAN * periods))
     high = np.minimum(line + half + 1, size)
-    return np.maximum(line - half, 0), high
+    low = np.maximum(line - half, 0)
+    if emptied is None:
+        return low, high
+    used = (line % periods != 0) & ~emptied
+    known = np.flatnonzero(_between(used.astype(float), low, high) > 0)
+    if not known.size:
+        return low, high
+    # Lines are emptied from the slowest on, so that the next faster one is the nearest.
+    nearest = known[np.clip(np.searchsorted(known, line), 0, known.size - 1)]
+    return low[nearest], high[nearest]
 
 
 def _between(values: Array, low: NDArray[np.int64], high: NDArray[np.int64]) -> Array:

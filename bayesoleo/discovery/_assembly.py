@@ -168,6 +168,11 @@ def _part(record: Record, samples: slice, periods: int, name: str, role: str) ->
         samples={channel: values[samples] for channel, values in record.samples.items()},
         kept=None if record.kept is None else record.kept[samples],
         harmonics=harmonics,
+        # Half a record has half as many lines below a frequency.
+        disturbances={
+            channel: replace(item, terms=(item.terms + 1) // 2)
+            for channel, item in record.disturbances.items()
+        },
     )
 
 

@@ -26,6 +26,7 @@ from scipy import stats
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
+from bayesoleo.data._disturbances import emptied_lines
 from bayesoleo.data._noise import (
     LocalAverage,
     NoiseSpectrum,
@@ -276,7 +277,7 @@ def compared(
         residual = without_masked(record, rest)
         before.append(measured(output, record.label))
         averages.append(_average(record, output, residual, before[-1], policy))
-        spectra.append(_spectrum(record, residual, averages[-1]))
+        spectra.append(_spectrum(record, output, residual, averages[-1]))
         # All samples of a transient are used: averages over neighbours contain no fast noise.
         shown.append(averages[-1].values if record.periodic else residual)
     averaged = columns if record.periodic else local_means(columns)
@@ -308,13 +309,14 @@ def _factor(scale: float, spread: float, known: RecordNoise | None) -> float:
 
 
 def _spectrum(
-    record: Record, residual: Array, average: PeriodicAverage | LocalAverage
+    record: Record, output: str, residual: Array, average: PeriodicAverage | LocalAverage
 ) -> NoiseSpectrum | None:
     if not record.periodic or not np.isfinite(residual).all():
         return None
     # Bridged samples do not scatter, which the factor compensates.
     part = counted(record) / record.time.size
-    return noise_spectrum((residual - average.values) / part, record.periods)
+    emptied = emptied_lines(record, output)
+    return noise_spectrum((residual - average.values) / part, record.periods, emptied)
 
 
 def _average(

@@ -105,7 +105,8 @@ def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
     for k, left in enumerate((run.residual - direction).reshape(parts.shape)):
         average = periodic_average(left, step, record.frequency)
         unit = run.scale[k * left.size]
-        found.append(noise_spectrum((left - average.values) / unit, record.periods))
+        rest = (left - average.values) / unit
+        found.append(noise_spectrum(rest, record.periods, run.spectra[k].emptied))
     return tuple(found)
 
 

@@ -24,6 +24,7 @@ from typing import cast
 import numpy as np
 
 from bayesoleo._types import Array, Flags, Integers
+from bayesoleo.data._disturbances import baseline_of
 from bayesoleo.effects._catalogue import find_effect
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
@@ -165,14 +166,17 @@ class Nuisance:
         Standard deviation of a sensor's offset by channel, SI.
     gain : mapping of str to float
         Standard deviation of a sensor's relative gain error by channel.
+    drifting : tuple of str
+        Outputs whose mean is unknown in each run, because they drift.
     """
 
     conditions: tuple[str, ...] = ()
     offset: Mapping[str, float] = field(default_factory=dict)
     gain: Mapping[str, float] = field(default_factory=dict)
+    drifting: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.conditions or self.offset or self.gain)
+        return bool(self.conditions or self.offset or self.gain or self.drifting)
 
     def extend(self, model: Model) -> Model:
         """Model with nuisance parameters, whose null values leave its predictions unchanged.
@@ -189,7 +193,9 @@ class Nuisance:
             declared standard deviation and ``c_error`` one standard normal unknown a run. A channel
             ``y`` shows ``(1 + g) y + b``, with ``g`` and ``b`` common to all runs.
         """
-        for name in self.conditions:
+        for channel in self.drifting:
+            model = _with_baseline(model, channel)
+        for name in (*self.conditions, *map(baseline_of, self.drifting)):
             model = _uncertain_condition(model, name)
         for effect, spread in (("sensor_gain", self.gain), ("sensor_offset", self.offset)):
             for channel, sd in spread.items():
@@ -204,7 +210,8 @@ class Nuisance:
                 conditions={
                     **record.conditions,
                     **{
-                        _sd_of(name): record.condition_sd.get(name, 0.0) for name in self.conditions
+                        _sd_of(name): record.condition_sd.get(name, 0.0)
+                        for name in (*self.conditions, *map(baseline_of, self.drifting))
                     },
                 },
             )
@@ -313,6 +320,17 @@ def _largest(records: Sequence[Record], channel: str) -> float:
 
 def _sd_of(condition: str) -> str:
     return f"{condition}_sd"
+
+
+def _with_baseline(model: Model, channel: str) -> Model:
+    """The model with a known baseline of one of its outputs, zero by default."""
+    name = baseline_of(channel)
+    about = f"mean of the drift of {channel}"
+    extended = replace(
+        model,
+        conditions={**model.conditions, name: Condition(model.outputs[channel].unit, 0.0, about)},
+    )
+    return extended.with_term("output", channel, "baseline", symbol(name))
 
 
 def _uncertain_condition(model: Model, name: str) -> Model:

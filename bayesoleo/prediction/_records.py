@@ -106,6 +106,47 @@ class Harmonics:
 
 
 @dataclass(frozen=True)
+class Tone:
+    """A sinusoid that is no harmonic of the drive.
+
+    Parameters
+    ----------
+    frequency : float
+        Hz.
+    amplitude : float
+        SI.
+    """
+
+    frequency: float
+    amplitude: float
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """What was removed from a channel because it is no physics.
+
+    Parameters
+    ----------
+    drift : float
+        Root mean square of the drift about its mean, SI; zero where there was none.
+    terms : int
+        Slow functions that it was made of; half as many lines of the spectrum are without noise.
+    tones : tuple of Tone
+    degrees : float
+        Degrees of freedom of the Student-t noise whose outliers were weighted down; zero where the
+        noise is normal.
+    """
+
+    drift: float = 0.0
+    terms: int = 0
+    tones: tuple[Tone, ...] = ()
+    degrees: float = 0.0
+
+    def __bool__(self) -> bool:
+        return bool(self.drift or self.tones or self.degrees)
+
+
+@dataclass(frozen=True)
 class Record:
     """One reduced run.
 
@@ -135,6 +176,8 @@ class Record:
         The curve through each channel, with those for derivatives (transient runs).
     kept : ndarray of bool, shape (N,), optional
         Which samples count; None where all do.
+    disturbances : mapping of str to Disturbances
+        What was removed from channels; see :mod:`bayesoleo.data._disturbances`.
     """
 
     label: str
@@ -153,6 +196,7 @@ class Record:
     dropped_periods: int = 0
     smoothed: Mapping[str, Smoothed] = field(default_factory=dict)
     kept: Bool[Flags, " samples"] | None = None
+    disturbances: Mapping[str, Disturbances] = field(default_factory=dict)
 
     @property
     def phase(self) -> Array:

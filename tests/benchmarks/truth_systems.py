@@ -38,6 +38,10 @@ _RTOL, _ATOL = 1e-7, 1e-12
 _AMBIENT = 293.0
 
 
+#: Draws noise: of a generator, an output, times, a frequency and a standard deviation.
+Draw = Callable[[np.random.Generator, str, Array, float, float], Array]
+
+
 @dataclass(frozen=True)
 class Noise:
     """What recording adds.
@@ -53,12 +57,16 @@ class Noise:
         The same as ``relative`` of a measured input's noise, which is white.
     step : float
         Step of the converter in standard deviations of the output's noise; zero rounds nothing.
+    drawn : callable, optional
+        Draws the noise of outputs instead: of the output's name, the times, the fundamental
+        frequency (of a transient, about that of its input) and the noise's standard deviation.
     """
 
     relative: float | None = None
     colour: float = 0.0
     relative_input: float = 0.0
     step: float = 0.0
+    drawn: Draw | None = None
 
 
 @dataclass(frozen=True)
@@ -550,7 +558,7 @@ def make(
         for name in system.channels
     }
     measured = {
-        run.label: _measured(system, clean[run.label], level, relative, noise, noise_rng)
+        run.label: _measured(system, run, clean[run.label], level, relative, noise, noise_rng)
         for run in runs
     }
     campaign = _campaign(kind, system, runs, measured)
@@ -744,6 +752,7 @@ def _repeating(rates: Callable[[float, Array], Array], start: Array, period: flo
 
 def _measured(
     system: System,
+    run: _Run,
     clean: Mapping[str, Array],
     level: Mapping[str, float],
     relative: float,
@@ -755,6 +764,9 @@ def _measured(
         if name == system.driven:
             ratio = noise.relative_input / relative
             found[name] = values + ratio * level[name] * rng.standard_normal(values.size)
+            continue
+        if noise.drawn is not None:
+            found[name] = values + noise.drawn(rng, name, run.time, run.base, level[name])
             continue
         noisy = values + level[name] * _coloured(rng, values.size, noise.colour)
         step = noise.step * level[name]
