@@ -254,7 +254,13 @@ def discrepancy_common(output: str) -> str:
     return f"discrepancy_common_{output}"
 
 
+#: Size of the effects that a model might lack, and of the remainder that no effect describes.
+CATALOGUE_SIZE: Final = "catalogue_size"
+REMAINDER_SIZE: Final = "remainder_size"
+
 _ERROR_QUANTITIES: Final = (
+    CATALOGUE_SIZE,
+    REMAINDER_SIZE,
     log_variance(""),
     spread(log_variance("")),
     "correlation_",

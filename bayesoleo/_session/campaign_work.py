@@ -11,7 +11,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._display import LabelledResult, columns
-from bayesoleo._workflow.closing import search, written
+from bayesoleo._workflow.closing import draw_final, search, written
 from bayesoleo._workflow.estimating import draw, drawn_groups, estimated
 from bayesoleo._workflow.output import ResultFolder, Stages
 from bayesoleo._workflow.predicting import predict
@@ -185,7 +185,7 @@ class CampaignSearch:
     def sample(self, settings: Settings, out: Path | None, progress: float) -> xr.DataTree:
         """The whole result, with the posterior of the extended model."""
         task, stages = replace(self.before.task, settings=settings), Stages()
-        drawn = draw(task, self.loop.final.fit, out, silent, progress)
+        drawn = draw_final(task, self.loop, out, silent, progress)
         return written(task, self.loop, drawn, ResultFolder(None), stages, self.questions)
 
 

@@ -21,6 +21,7 @@ from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array, Integers
 from bayesoleo._workflow.estimating import draw_from
 from bayesoleo._workflow.settings import Settings
+from bayesoleo.discovery._inference import function_errors
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._function_problem import FunctionProblem
@@ -453,7 +454,8 @@ class FunctionWork:
     ) -> xr.DataTree:
         """The tree with the posterior."""
         settings, problem = self.settings, fit.problem
-        density = LogDensity(problem, settings.jobs, errors=settings.error_model)
+        word, reason = function_errors(problem, fit.point.theta, settings.error_model)
+        density = LogDensity(problem, settings.jobs, errors=word)
         of = ["" if out is None else digest((self.table, self.call, self.parameters))]
         samples = draw_from(
             density, fit.point.theta, settings, of=of, checkpoints=out, progress=progress
@@ -467,6 +469,8 @@ class FunctionWork:
         )
         groups = {name: tree[name].to_dataset() for name in tree.children} | found
         groups[schema.COMPARISON] = compare(groups)
+        if reason:
+            groups[schema.POSTERIOR].attrs["error_model_reason"] = reason
         drawn = xr.DataTree.from_dict(groups)
         drawn.attrs.update({**tree.attrs, schema.SEED: settings.seed})
         return drawn

@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 import xarray as xr
 
 from bayesoleo._types import ProgressCallback
-from bayesoleo._workflow.estimating import NOT_SAMPLED, draw
+from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
     PROPOSALS_STAGE,
@@ -32,6 +33,8 @@ from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
 from bayesoleo.model._model import Model
+from bayesoleo.posterior._diagnostics import Samples
+from bayesoleo.posterior._log_density import LogDensity
 
 #: What stands in the place of the search's last round while it goes on.
 NOT_YET = "the search had not finished when this was written"
@@ -109,11 +112,33 @@ def close(
         if not settings.quick:
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
-        fit, place = loop.final.fit, output.checkpoints
+        place = output.checkpoints
         drawn = stages.attempt(
-            POSTERIOR_STAGE, lambda: draw(task, fit, place, callback, progress), lambda: None
+            POSTERIOR_STAGE, lambda: draw_final(task, loop, place, callback, progress), lambda: None
         )
         return written(task, loop, drawn, output, stages, questions)
+
+
+def draw_final(
+    task: Task,
+    loop: ClosedLoop,
+    checkpoints: Path | None,
+    callback: ProgressCallback,
+    progress: bool | float,
+) -> tuple[Samples, LogDensity]:
+    """Draws of the posterior of the final model, with the error model that suits its residual.
+
+    Effects that the search could not tell from one that it added are undecided: the catalogue then
+    takes part in the errors.
+    """
+    final = loop.final
+    rivals = [
+        name for item in loop.rounds if item.accepted is not None for name in item.accepted.same
+    ]
+    inference = inference_for(
+        task, final.fit, final.assembly, callback, held_out=final.held_out, undecided=rivals
+    )
+    return draw(task, final.fit, checkpoints, callback, progress, inference)
 
 
 def no_questions() -> tuple[Question, ...]:

@@ -21,9 +21,20 @@ from bayesoleo._workflow.output import POSTERIOR_STAGE, PREDICTIONS_STAGE, Resul
 from bayesoleo._workflow.result import finish, mark_unfinished
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
+from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit, fit_model
-from bayesoleo.discovery._inference import at_mode, mixture_at, mode_group, mode_of
+from bayesoleo.discovery._hold_out_error import Prediction, predict_held_out
+from bayesoleo.discovery._inference import (
+    CATALOGUE,
+    Inference,
+    at_mode,
+    chosen_for,
+    mixture_at,
+    mode_group,
+    mode_of,
+)
 from bayesoleo.discovery._result_tree import point_group, posterior_groups, predictive_groups
+from bayesoleo.error_models._registry import AUTO
 from bayesoleo.estimation._per_run import by_run_dataset
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._comparison import compare
@@ -84,22 +95,61 @@ def estimated(
     fit = fit_model(model, runs, settings.numerics, method=method, progress=callback)
     plain: tuple[ModelFit, dict[str, xr.Dataset]] = (fit, {})
     return stages.attempt(
-        POSTERIOR_STAGE, lambda: under_error_model(fit, settings, callback), lambda: plain
+        POSTERIOR_STAGE, lambda: under_error_model(task, fit, callback), lambda: plain
     )
 
 
 def under_error_model(
-    fit: ModelFit, settings: Settings, callback: ProgressCallback
+    task: Task, fit: ModelFit, callback: ProgressCallback
 ) -> tuple[ModelFit, dict[str, xr.Dataset]]:
     """The estimate moved to the mode under the error model that was chosen, with what it found."""
-    inference = settings.inference
+    settings = task.settings
+    inference = inference_for(task, fit, task.assembly, callback)
+    remarks = (inference.reason,) if inference.reason else ()
     if inference.plain:
-        return fit, {}
+        return replace(fit, point=replace(fit.point, remarks=remarks)), {}
     callback(f"posterior mode, {inference.error_model} errors")
     density = inference.density(fit, settings.jobs)
-    mode = mode_of(density, fit.point.theta)
+    mode = mode_of(density, fit)
     group = mode_group(density, mode, inference.error_model)
-    return at_mode(fit, density, mode, inference.error_model), {schema.ERROR_MODEL: group}
+    moved = at_mode(fit, density, mode, inference.error_model, inference.reason)
+    return moved, {schema.ERROR_MODEL: group}
+
+
+def inference_for(
+    task: Task,
+    fit: ModelFit,
+    assembly: Assembly,
+    callback: ProgressCallback,
+    *,
+    held_out: Sequence[Prediction] | None = None,
+    undecided: Sequence[str] = (),
+) -> Inference:
+    """Error model and scatter of a fit: the user's choice, or by what the data show.
+
+    What was chosen for this fit before stays.
+    """
+    settings = task.settings
+    inference = settings.inference
+    if fit.point.objective_name in (CATALOGUE, "correlated") and fit.point.remarks:
+        return replace(inference, error_model=fit.point.objective_name, reason=fit.point.remarks[0])
+    if inference.error_model not in (AUTO, CATALOGUE) or (
+        inference.error_model == CATALOGUE and fit.problem.signatures is not None
+    ):
+        return inference
+    callback("compare the residual with effects that may be missing, to choose an error model")
+    if held_out is None:
+        declared = task.roles.held_out if task.roles.strategy == "declared" else ()
+        held_out = predict_held_out(fit, declared)
+    return chosen_for(
+        inference,
+        fit,
+        assembly,
+        effects=settings.searched,
+        held_out=held_out,
+        undecided=undecided,
+        jobs=settings.jobs,
+    )
 
 
 def estimate_each(
@@ -222,12 +272,21 @@ def draw(
     checkpoints: Path | None,
     callback: ProgressCallback,
     progress: bool | float,
+    inference: Inference | None = None,
 ) -> tuple[Samples, LogDensity]:
-    """Draws of the posterior, from the checkpoints if there are some."""
+    """Draws of the posterior, from the checkpoints if there are some.
+
+    ``inference`` is what is assumed of errors and runs; by default that of :func:`inference_for`.
+    """
     settings = task.settings
-    density = settings.inference.density(fit, settings.jobs)
+    if inference is None:
+        inference = inference_for(task, fit, task.assembly, callback)
+    if inference.reason:
+        callback(inference.reason)
+    density = inference.density(fit, settings.jobs)
     of = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
     of += [] if settings.solver == COLLOCATION else [settings.solver]
+    of += [] if inference.error_model == settings.error_model else [inference.error_model]
     samples = draw_from(
         density, fit.point.theta, settings, of=of, checkpoints=checkpoints, progress=progress
     )

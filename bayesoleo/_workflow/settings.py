@@ -166,9 +166,10 @@ class Settings:
     nuisance : tuple of {"conditions", "offset", "gain"}
         What is estimated within its declared tolerance: conditions by run (``sd``), offset and gain
         of sensors (``accuracy``).
-    error_model : {"independent", "per-run", "full", "correlated", "discrepancy", ...}
+    error_model : {"auto", "independent", "per-run", "full", "correlated", "discrepancy", ...}
         What the errors of the outputs have in common; see
-        :mod:`bayesoleo.error_models`.
+        :mod:`bayesoleo.error_models`. By default the data decide: ``correlated`` where noise is
+        coloured, ``catalogue`` where more than noise is left, else ``independent``.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated
         (:func:`bayesoleo.posterior.hierarchical`).
@@ -219,10 +220,12 @@ class Settings:
         read=words, metavar="conditions,offset,gain", show_default=False,
     )  # fmt: skip
     error_model: str = _setting(
-        "independent", str, SOLVING,
+        "auto", str, SOLVING,
         "What errors have in common: independent (one variance an output), per-run, full "
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
-        "shared-discrepancy (and is partly alike in all runs).",
+        "shared-discrepancy (and is partly alike in all runs), catalogue (all effects that the "
+        "model might lack). The default, auto, chooses among independent, correlated and "
+        "catalogue by what the data show, and says why.",
         metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(
@@ -267,7 +270,7 @@ class Settings:
             hint = choose(self.scheme, SCHEMES)
             raise InputError("unknown scheme", key="scheme", value=self.scheme, hint=hint)
         check_solver(self.solver, self.scheme)
-        check_word(self.error_model)
+        check_word(self.error_model, automatic=True)
         for kind in self.disturbances:
             if kind not in DISTURBANCES:
                 raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,16 +10,32 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array
+from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.error_models._registry import ERROR_MODELS, check_word
+from bayesoleo.discovery._hold_out_error import Prediction
+from bayesoleo.discovery._signatures import COLOUR_FALSE_ALARM, noise_of, signatures_of
+from bayesoleo.effects._effect import Effect
+from bayesoleo.error_models._base import Frame
+from bayesoleo.error_models._catalogue import CatalogueErrors, Linearised
+from bayesoleo.error_models._correlated import CorrelatedErrors
+from bayesoleo.error_models._fitting import derivatives
+from bayesoleo.error_models._independent import IndependentErrors
+from bayesoleo.error_models._registry import AUTO, ERROR_MODELS, check_word
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._multistart import multistart
+from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._hierarchy import hierarchical
 from bayesoleo.posterior._laplace import Mode, find_mode, laplace_mixture, start_coordinates
 from bayesoleo.posterior._log_density import LogDensity
 from bayesoleo.posterior._mixture import Mixture
+from bayesoleo.posterior._unknowns import PlainUnknowns
+from bayesoleo.solvers._orbit import Status
+
+#: The error model that needs signatures.
+CATALOGUE = CatalogueErrors.word
 
 
 @dataclass(frozen=True)
@@ -28,9 +45,12 @@ class Inference:
     Parameters
     ----------
     error_model : str
-        One of :data:`~bayesoleo.error_models.ERROR_MODELS`.
+        One of :data:`~bayesoleo.error_models.ERROR_MODELS`, or ``"auto"`` for the choice of
+        :func:`chosen_for`.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated.
+    reason : str
+        Why this error model was chosen; empty where the user did.
 
     Raises
     ------
@@ -40,9 +60,10 @@ class Inference:
 
     error_model: str = ERROR_MODELS[0]
     between_runs: tuple[str, ...] = ()
+    reason: str = ""
 
     def __post_init__(self) -> None:
-        check_word(self.error_model)
+        check_word(self.error_model, automatic=True)
 
     @property
     def plain(self) -> bool:
@@ -91,9 +112,211 @@ class Inference:
         return LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
 
 
-def mode_of(density: LogDensity, theta: Array) -> Mode:
-    """The mode next to a parameter vector."""
-    return find_mode(density, start_coordinates(density, theta))
+#: Log odds of the data above which noise alone does not explain a residual.
+MORE_THAN_NOISE = 1.5
+#: Times that the estimate under the catalogue's errors is linearised anew.
+_PASSES = 3
+#: Fewest samples of which correlation is judged.
+_FEWEST = 20
+#: Step, in standard deviations, below which it is not.
+_SMALL = 0.1
+_PLAIN = "the noise is white, and no more than noise is left"
+_COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
+_LEFT = "more than noise is left, by a factor of exp({:.3g}) in likelihood"
+_UNDECIDED = "effects that the data do not tell apart are left: {}"
+
+
+def chosen_for(
+    inference: Inference,
+    fit: ModelFit,
+    assembly: Assembly,
+    *,
+    effects: Sequence[Effect] | None = None,
+    held_out: Sequence[Prediction] = (),
+    undecided: Sequence[str] = (),
+    jobs: int | None = None,
+) -> Inference:
+    """The inference with an error model that is chosen by what the data show.
+
+    The fit's problem receives the signatures of the catalogue, if they are needed. A model that the
+    user chose stays.
+
+    Parameters
+    ----------
+    inference : Inference
+    fit : ModelFit
+    assembly : Assembly
+        What was fitted.
+    effects : sequence of Effect, optional
+        That the model might lack; by default the catalogue.
+    held_out : sequence of Prediction
+        Runs that were not fitted, for predictions.
+    undecided : sequence of str
+        Effects between which the search could not decide.
+    jobs : int, optional
+        Threads.
+    """
+    word = inference.error_model
+    if word not in (AUTO, CATALOGUE):
+        return inference
+    if not fit.point.status.ok:
+        plain = ERROR_MODELS[0] if word == AUTO else word
+        return replace(
+            inference, error_model=plain, reason=f"the estimate: {fit.point.status.message}"
+        )
+    noise = noise_of(fit)
+    fit.problem.signatures = signatures_of(
+        fit, assembly, noise, effects=effects, held_out=held_out, jobs=jobs
+    )
+    if word == CATALOGUE:
+        return inference
+    word, reason = error_model_by(
+        noise.p_value, lambda _: linearised_of(fit).log_odds, fit.predictor.outputs, undecided
+    )
+    if word != CATALOGUE:
+        fit.problem.signatures = None
+    return replace(inference, error_model=word, reason=reason)
+
+
+def error_model_by(
+    p_values: Sequence[float],
+    rise: Callable[[bool], float],
+    outputs: Sequence[str],
+    undecided: Sequence[str] = (),
+) -> tuple[str, str]:
+    """The error model that suits what was found, and the reason in a sentence.
+
+    Parameters
+    ----------
+    p_values : sequence of float, length s
+        Probabilities of the outputs' noise if its spectrum were flat.
+    rise : callable
+        Of whether noise is coloured: log odds of more than noise, see :func:`linearised_of`.
+    outputs : sequence of str, length s
+    undecided : sequence of str
+        Effects between which a search could not decide.
+    """
+    least = float(np.min(p_values, initial=1.0))
+    coloured = least < COLOUR_FALSE_ALARM / len(p_values)
+    word, left = ERROR_MODELS[0], _PLAIN
+    if coloured:
+        word = "correlated"
+        left = _COLOURED.format(outputs[int(np.argmin(p_values))], least)
+    if undecided:
+        word, left = CATALOGUE, _UNDECIDED.format(", ".join(undecided))
+    found = rise(coloured)
+    if found > MORE_THAN_NOISE:
+        word, left = CATALOGUE, _LEFT.format(found)
+    return word, f"{word} errors, chosen because {left}"
+
+
+#: Rise of the log-likelihood above which neighbouring residuals are alike: one chance in a
+#: thousand, by a chi-square distribution with two degrees of freedom.
+_ALIKE = 6.9
+
+
+def function_errors(problem: ResidualProblem, theta: Array, word: str) -> tuple[str, str]:
+    """The error model of a function's residual, and why; a user's choice stays, without reason.
+
+    Without repetition, noise that is correlated and a smooth missing term look alike: both call for
+    correlated errors.
+
+    Parameters
+    ----------
+    problem : ResidualProblem
+    theta : ndarray, shape (l,)
+        The estimate.
+    word : str
+        One of :data:`~bayesoleo.error_models.ERROR_MODELS`, or ``"auto"``.
+    """
+    if word != AUTO:
+        return word, ""
+    plain = ERROR_MODELS[0]
+    residual, status = problem.residuals(theta[None], 0)
+    if status[0] or residual.shape[2] < _FEWEST:
+        return plain, f"{plain} errors: too few samples to see whether they are correlated"
+    errors = CorrelatedErrors(Frame.of(problem))
+    eta = errors.start([residual[0]])[None]
+    white = IndependentErrors(errors.frame)
+    sums = np.sum(residual**2, axis=2)[None]
+    before = white.of_sums(sums, white.start([residual[0]])[None])
+    rise = float((errors.of_runs([residual], eta) - before).sum())
+    if rise > _ALIKE:
+        why = f"neighbouring residuals are alike: the log-likelihood rises by {rise:.3g}"
+        return "correlated", f"correlated errors, chosen because {why}"
+    return plain, f"{plain} errors, chosen because neighbouring residuals are not alike"
+
+
+def linearised_of(fit: ModelFit) -> Linearised:
+    """Posterior about an estimate with effects of the catalogue and a smooth remainder.
+
+    Unknowns are in units of their priors' standard deviations. See
+    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the fit's problem has signatures.
+    """
+    problem = fit.problem
+    errors = CatalogueErrors(Frame.of(problem))
+    evaluation, counts = problem.evaluate(fit.point.theta), problem.counts
+    ends = np.cumsum(counts, axis=0)
+
+    def by_run(columns: Sequence[Array]) -> list[list[Array]]:
+        return [
+            [column[..., a:b] for column, a, b in zip(columns, first, last, strict=True)]
+            for first, last in zip(ends - counts, ends, strict=True)
+        ]
+
+    scale = PriorScale.of(problem.priors, problem.names)
+    # Unknowns in units of their priors' deviations, lest the system depend on units.
+    pull = scale.slope(fit.point.theta) * scale.sd / scale.unit(fit.point.theta)
+    sensitivity = by_run([(j * scale.sd).T for j in evaluation.sensitivity])
+    return errors.linearised(
+        sensitivity, by_run(evaluation.residual), scale.root.T @ scale.root, pull
+    )
+
+
+def mode_of(density: LogDensity, fit: ModelFit) -> Mode:
+    """The mode next to an estimate; with the catalogue's errors the mean of the posterior.
+
+    Under these the posterior is a mixture over effects, of which a mode knows one only.
+    """
+    plain = isinstance(density.unknowns, PlainUnknowns)
+    if density.errors.word != CATALOGUE or not plain:
+        return find_mode(density, start_coordinates(density, fit.point.theta))
+    sd = np.array([prior.sd for prior in fit.problem.priors])
+    low, high = np.array([prior.support for prior in fit.problem.priors], dtype=float).T
+    theta = fit.point.theta
+    for _ in range(_PASSES):
+        found = linearised_of(replace(fit, point=replace(fit.point, theta=theta)))
+        step = found.shift * sd
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(step > 0, (high - theta) / step, (low - theta) / step)
+        length = min(1.0, 0.5 * float(np.nanmin(np.where(step == 0, np.inf, room))))
+        trial = theta + length * step
+        if not fit.problem.evaluate(trial).status.ok:
+            break
+        theta = trial
+        if np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd):
+            break
+    fit.problem.freeze(theta)
+    return _summary_mode(density, theta, found.covariance * np.outer(sd, sd))
+
+
+def _summary_mode(density: LogDensity, theta: Array, covariance: Array) -> Mode:
+    """A normal approximation with given moments of the unknowns; the errors at their mode."""
+    phi, size = start_coordinates(density, theta), len(theta)
+    chain = np.linalg.inv(density.unknowns.jacobian(phi[:size]))
+    scales = np.diag(density.errors.scales())
+
+    def height(eta: Array) -> Array:
+        return density(np.hstack([np.repeat(phi[None, :size], len(eta), axis=0), eta]))[0]
+
+    _, _, hessian = derivatives(height, phi[size:], scales)
+    values, vectors = np.linalg.eigh(-hessian)
+    # A direction that the residual does not determine keeps its prior, of about unit width.
+    whole = scales @ vectors
+    full = np.zeros((len(phi), len(phi)))
+    full[:size, :size] = chain @ covariance @ chain.T
+    full[size:, size:] = whole / np.maximum(values, np.diag(scales).min() ** 2) @ whole.T
+    return Mode(phi, full, 0.0, Status.CONVERGED)
 
 
 def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int = 0) -> Mixture:
@@ -125,8 +348,10 @@ def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int 
     return mixture
 
 
-def at_mode(fit: ModelFit, density: LogDensity, mode: Mode, word: str) -> ModelFit:
-    """The fit with its point at the mode of a density under another error model."""
+def at_mode(
+    fit: ModelFit, density: LogDensity, mode: Mode, word: str, reason: str = ""
+) -> ModelFit:
+    """The fit with its point at the mode of a density under another error model, and why that."""
     block, eta = (part[0] for part in density.split(mode.centre[None]))
     theta = density.unknowns.theta(block[None])[0]
     jacobian = density.unknowns.jacobian(block)
@@ -141,6 +366,7 @@ def at_mode(fit: ModelFit, density: LogDensity, mode: Mode, word: str) -> ModelF
         error_covariance=np.diag(variance),
         status=mode.status,
         objective_name=word,
+        remarks=(reason,) if reason else (),
     )
     fit.problem.freeze(theta)
     predictions = fit.problem.predictor.predict(fit.problem.full(theta[None])[0])

@@ -29,7 +29,13 @@ from bayesoleo.discovery._summary import in_words, titles_of
 from bayesoleo.error_models._base import ErrorModel, RunSamples
 from bayesoleo.estimation._point_estimate import to_dataset
 from bayesoleo.model._parameters import Coordinate
-from bayesoleo.posterior._datatree import block_groups, choose_all, sd_of_averages, to_datasets
+from bayesoleo.posterior._datatree import (
+    block_groups,
+    choose_all,
+    common_to_runs,
+    sd_of_averages,
+    to_datasets,
+)
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._log_density import LogDensity
 from bayesoleo.prediction._predictor import Predictor
@@ -67,7 +73,7 @@ _OUTPUT_UNIT = "SI unit of each output"
 
 
 def predictive_group(
-    fit: ModelFit, found: Sequence[Prediction], samples: Samples, errors: ErrorModel, seed: int
+    fit: ModelFit, found: Sequence[Prediction], samples: Samples, density: LogDensity, seed: int
 ) -> xr.Dataset:
     """Draws of the outputs, with errors as the error model has them and without.
 
@@ -79,8 +85,8 @@ def predictive_group(
         The runs, held-out ones too if they are to be predicted.
     samples : Samples
         Draws of the posterior.
-    errors : ErrorModel
-        Under which they were drawn.
+    density : LogDensity
+        From which they were drawn.
     seed : int
         Seeds choice and errors.
 
@@ -95,7 +101,9 @@ def predictive_group(
     theta, own = choose_all(samples, DRAWS, seed=seed)
     draws = dict(zip(samples.parameters, theta.T, strict=True))
     rng = np.random.default_rng(seed)
-    runs = [_one_run(prediction, draws, errors, own, rng) for prediction in found]
+    errors = density.errors
+    common = common_to_runs(density, np.concatenate([theta, own], axis=1), rng)
+    runs = [_one_run(prediction, draws, errors, own, rng, common) for prediction in found]
     data = {}
     for b, output in enumerate(fit.predictor.outputs):
         unit = fit.model.outputs[output].unit
@@ -115,6 +123,7 @@ def _one_run(
     errors: ErrorModel,
     own: Array,
     rng: np.random.Generator,
+    common: Array | None,
 ) -> dict[str, Array]:
     """By kind, arrays that begin with (draws, outputs)."""
     record = prediction.record
@@ -130,9 +139,10 @@ def _one_run(
     if record.periodic:
         kept = slice(None) if record.kept is None else record.kept
         taken = RunSamples(record.time[kept], frequency)
-        sd = sd_of_averages(errors.draw(own, record.label, taken, rng), taken.phase, PHASES)
+        drawn = errors.draw(own, record.label, taken, rng, common)
+        sd = sd_of_averages(drawn, taken.phase, PHASES)
     return {
-        "sample": y[1:] + errors.draw(own, record.label, points, rng),
+        "sample": y[1:] + errors.draw(own, record.label, points, rng, common),
         "expected": y[1:],
         "at_estimate": y[:1],
         "average_sd": sd,
@@ -271,7 +281,7 @@ def predictive_groups(
     found = predict_fitted(fit)
     return {
         schema.PREDICTION: _predictions([(BEFORE, fit, found)]),
-        schema.PERIOD_PREDICTIVE: predictive_group(fit, found, samples, density.errors, seed),
+        schema.PERIOD_PREDICTIVE: predictive_group(fit, found, samples, density, seed),
     }
 
 
@@ -306,7 +316,7 @@ def loop_groups(
     if drawn is not None:
         final, (samples, density) = loop.final, drawn
         groups[schema.PERIOD_PREDICTIVE] = predictive_group(
-            final.fit, ordered(final), samples, density.errors, seed
+            final.fit, ordered(final), samples, density, seed
         )
     return groups
 

@@ -8,11 +8,15 @@ from ._base import (
     Residuals as Residuals,
     RunSamples as RunSamples,
 )
+from ._catalogue import (
+    CatalogueErrors as CatalogueErrors,
+)
 from ._correlated import (
     CorrelatedErrors as CorrelatedErrors,
 )
 from ._discrepancy import (
     DiscrepancyErrors as DiscrepancyErrors,
+    SharedDiscrepancyErrors as SharedDiscrepancyErrors,
     basis as basis,
     spectrum as spectrum,
 )
@@ -31,6 +35,6 @@ from ._registry import (
     ERROR_MODELS as ERROR_MODELS,
     error_model as error_model,
 )
-from ._shared import (
-    SharedDiscrepancyErrors as SharedDiscrepancyErrors,
+from ._signatures import (
+    Signatures as Signatures,
 )

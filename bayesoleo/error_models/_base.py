@@ -18,6 +18,7 @@ from scipy.special import ndtr, ndtri
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, Int, Integers
+from bayesoleo.error_models._signatures import Signatures
 from bayesoleo.errors import InputError
 from bayesoleo.model._priors import Prior, Transform, Uniform
 
@@ -159,6 +160,8 @@ class Frame:
         Times of the samples, if the problem gives them.
     log_variance_prior : mapping of str to Prior
         Prior of the logarithm of an output's variance where it is not flat.
+    signatures : Signatures or None
+        Of the effects that the model might lack, if they are known.
     """
 
     outputs: tuple[str, ...]
@@ -166,6 +169,7 @@ class Frame:
     counts: Int[Integers, "runs outputs"]
     samples: tuple[RunSamples, ...] | None
     log_variance_prior: Mapping[str, Prior]
+    signatures: Signatures | None = None
 
     @classmethod
     def of(cls, problem: Measured, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
@@ -177,6 +181,7 @@ class Frame:
             np.asarray(problem.counts),
             None if samples is None else tuple(samples),
             dict(log_variance_prior or {}),
+            getattr(problem, "signatures", None),
         )
 
     def log_variances(self) -> tuple[Quantity, ...]:
@@ -312,7 +317,9 @@ class ErrorModel(ABC):
         raise NotImplementedError(f"{self.word} needs sums only")
 
     def of_runs(self, residuals: Sequence[Array], eta: Array) -> Array:
-        """Normalised log-likelihood of each run given those before it, shape (L, N).
+        """Normalised log-likelihoods of runs, shape (L, N), whose sum is the joint one.
+
+        Each is that of a run given those before it, unless a model says otherwise.
 
         Parameters
         ----------
@@ -367,6 +374,18 @@ class ErrorModel(ABC):
         ndarray, shape (k, k)
         """
 
+    def products_of_all(self, columns: Sequence[Sequence[Array]], eta: Array) -> Array:
+        """``C V^-1 C'`` over all runs, shape (k, k).
+
+        Parameters
+        ----------
+        columns : sequence over runs of sequence over outputs of ndarray, shape (k, n)
+            Rows ``C``.
+        eta : ndarray, shape (m,)
+            Coordinates.
+        """
+        return np.asarray(sum(self.products(run, rows, eta) for run, rows in enumerate(columns)))
+
     @abstractmethod
     def start(self, residuals: Sequence[Array]) -> Array:
         """Likely coordinates, shape (m,), given residuals (s, n) of each run."""
@@ -385,8 +404,33 @@ class ErrorModel(ABC):
         """
         return np.exp(natural[:, : len(self.frame.outputs)])
 
+    def common(
+        self, residuals: Sequence[Array], eta: Array, rng: np.random.Generator
+    ) -> Array | None:
+        """Draw what all runs have in common given the fitted residuals; None if they have nothing.
+
+        Parameters
+        ----------
+        residuals : sequence over runs of ndarray, shape (W, s, n)
+            ``y - yhat`` of ``W`` parameter vectors.
+        eta : ndarray, shape (W, m)
+            Coordinates.
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (W, c), or None
+            For :meth:`draw`.
+        """
+        return None
+
     def draw(
-        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+        self,
+        natural: Array,
+        run: str,
+        samples: RunSamples,
+        rng: np.random.Generator,
+        common: Array | None = None,
     ) -> Array:
         """Draw errors of a repetition of a run.
 
@@ -399,6 +443,8 @@ class ErrorModel(ABC):
         samples : RunSamples
             Times of the ``n`` samples, which need not be those of the problem's run.
         rng : numpy.random.Generator
+        common : ndarray, shape (W, c), optional
+            Of :meth:`common`; by default drawn anew.
 
         Returns
         -------

@@ -28,7 +28,7 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from bayesoleo import _schema as schema
 from bayesoleo._compiled import jit
@@ -163,13 +163,40 @@ class CorrelatedErrors(ByOutput):
         return np.asarray(white @ white.T)
 
     def draw_coloured(self, length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
-        lag = np.diff(samples.time)[:, None] / length
-        decay = np.exp(-lag)
-        new = rng.standard_normal((samples.time.size, len(length)))
-        new[1:] *= np.sqrt(-np.expm1(-2 * lag))
-        for i, kept in enumerate(decay):
-            new[i + 1] += kept * new[i]
-        return new.T
+        return draw_process(length, samples, rng)
+
+
+def draw_process(length: Array, samples: RunSamples, rng: np.random.Generator) -> Array:
+    """Draw Ornstein-Uhlenbeck processes of unit variance, (W, n), with correlation times (W,)."""
+    lag = np.diff(samples.time)[:, None] / length
+    decay = np.exp(-lag)
+    new = rng.standard_normal((samples.time.size, len(length)))
+    new[1:] *= np.sqrt(-np.expm1(-2 * lag))
+    for i, kept in enumerate(decay):
+        new[i + 1] += kept * new[i]
+    return new.T
+
+
+def whitened(rows: Array, time: Array, share: float, length: float) -> tuple[Array, float]:
+    """Rows ``(L, n)`` whitened by the model with unit variance, and half its ``ln det``.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (L, n)
+    time : ndarray, shape (n,)
+    share : float
+        Correlated part of the variance, below one; at zero the rows come back as they are.
+    length : float
+        Correlation time.
+    """
+    if not share > 0:
+        return rows, 0.0
+    white, log_sd = np.empty_like(rows), np.empty(time.size)
+    eta = np.array([0.0, float(ndtri(share)), float(np.log(length))])
+    if not len(rows):
+        rows, white = np.zeros((1, time.size)), np.empty((1, time.size))
+    _whiten(np.ascontiguousarray(rows), *_kinds(np.diff(time)), eta, white, log_sd)
+    return white, float(np.sum(log_sd))
 
 
 def _kinds(steps: Array) -> tuple[np.ndarray, Array]:

@@ -175,7 +175,12 @@ class FullErrors(ErrorModel):
         return np.asarray(np.einsum("akn,aln->kl", white, white))
 
     def draw(
-        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+        self,
+        natural: Array,
+        run: str,
+        samples: RunSamples,
+        rng: np.random.Generator,
+        common: Array | None = None,
     ) -> Array:
         white = super().draw(natural, run, samples, rng)
         sd = np.sqrt(self.variance(natural, run))[:, :, None]

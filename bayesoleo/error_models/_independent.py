@@ -139,7 +139,12 @@ class ByOutput(ErrorModel):
         """Draw the coloured part, of unit variance, shape (W, n); length (W,)."""
 
     def draw(
-        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+        self,
+        natural: Array,
+        run: str,
+        samples: RunSamples,
+        rng: np.random.Generator,
+        common: Array | None = None,
     ) -> Array:
         out = super().draw(natural, run, samples, rng)
         for b, sd in enumerate(np.sqrt(self.variance(natural, run)).T):
@@ -449,7 +454,12 @@ class PerRunErrors(ErrorModel):
         return np.exp(natural[:, self._own[self.frame.runs.index(run)]])
 
     def draw(
-        self, natural: Array, run: str, samples: RunSamples, rng: np.random.Generator
+        self,
+        natural: Array,
+        run: str,
+        samples: RunSamples,
+        rng: np.random.Generator,
+        common: Array | None = None,
     ) -> Array:
         white = super().draw(natural, run, samples, rng)
         if run in self.frame.runs:

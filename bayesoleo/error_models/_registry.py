@@ -13,6 +13,7 @@ word                   errors
 ``correlated``         white noise and an Ornstein-Uhlenbeck process in time, for each output
 ``discrepancy``        white noise and a periodic Gaussian process over phase, for each output
 ``shared-discrepancy`` as ``discrepancy``, with a part of the process that all runs share
+``catalogue``          all effects that the model might lack, and a smooth remainder
 ====================== =============================================================================
 """
 
@@ -22,8 +23,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bayesoleo.error_models._base import ErrorModel, Frame, Measured, ProfiledErrorModel
+from bayesoleo.error_models._catalogue import CatalogueErrors
 from bayesoleo.error_models._correlated import CorrelatedErrors
-from bayesoleo.error_models._discrepancy import DiscrepancyErrors
+from bayesoleo.error_models._discrepancy import DiscrepancyErrors, SharedDiscrepancyErrors
 from bayesoleo.error_models._full import FullErrors, GivenErrors, ProfiledFullErrors
 from bayesoleo.error_models._independent import (
     IndependentErrors,
@@ -31,7 +33,6 @@ from bayesoleo.error_models._independent import (
     ProfiledCommonErrors,
     ProfiledIndependentErrors,
 )
-from bayesoleo.error_models._shared import SharedDiscrepancyErrors
 from bayesoleo.errors import InputError, choose
 from bayesoleo.model._priors import Prior
 
@@ -51,6 +52,7 @@ _REGISTRY = {
     "correlated": _Forms(CorrelatedErrors, None),
     "discrepancy": _Forms(DiscrepancyErrors, None),
     "shared-discrepancy": _Forms(SharedDiscrepancyErrors, None),
+    "catalogue": _Forms(CatalogueErrors, None),
     "common": _Forms(None, ProfiledCommonErrors),
     "given": _Forms(None, GivenErrors),
 }
@@ -58,16 +60,27 @@ _REGISTRY = {
 ERROR_MODELS: tuple[str, ...] = tuple(word for word, form in _REGISTRY.items() if form.sampled)
 
 
-def check_word(word: str) -> str:
+#: Chooses by what the data show.
+AUTO = "auto"
+
+
+def check_word(word: str, *, automatic: bool = False) -> str:
     """The word, if there is such an error model.
+
+    Parameters
+    ----------
+    word : str
+    automatic : bool
+        Whether :data:`AUTO` is one.
 
     Raises
     ------
     InputError
         If there is none.
     """
-    if word not in ERROR_MODELS:
-        hint = choose(word, ERROR_MODELS)
+    known = (AUTO, *ERROR_MODELS) if automatic else ERROR_MODELS
+    if word not in known:
+        hint = choose(word, known)
         raise InputError("unknown error model", key="error_model", value=word, hint=hint)
     return word
 

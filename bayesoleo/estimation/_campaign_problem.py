@@ -10,6 +10,7 @@ import numpy as np
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
+from bayesoleo.error_models._signatures import Signatures
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation._problem import Evaluation, Misfit
@@ -39,6 +40,8 @@ class CampaignProblem:
     ):
         self.predictor = predictor
         self._last: tuple[Array, Evaluation] | None = None
+        #: Of the effects that the model might lack, if they were computed.
+        self.signatures: Signatures | None = None
         layout = predictor.layout
         self._all_priors = layout.priors(predictor.model)
         self._free = np.arange(len(layout.names)) if free is None else free

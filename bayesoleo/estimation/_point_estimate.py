@@ -85,6 +85,8 @@ class PointEstimate:
     known : tuple of str
         Unknowns that were held because the method disregards their prior; their uncertainty is
         carried into the covariance.
+    remarks : tuple of str
+        What else is to be said, such as why an error model was chosen.
     """
 
     names: tuple[str, ...]
@@ -112,6 +114,7 @@ class PointEstimate:
     stability: Stability | None = field(default=None, repr=False)
     exact: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def sd(self) -> Array:
@@ -145,7 +148,8 @@ class PointEstimate:
         """Notes on the estimate's solutions, such as an unstable one, and on its standard
         deviations."""
         held = [KNOWN.format(_listed(self.known))] if self.known else []
-        return [*([] if self.stability is None else self.stability.notes()), *self.doubts, *held]
+        stable = [] if self.stability is None else self.stability.notes()
+        return [*stable, *self.doubts, *held, *self.remarks]
 
     def __getitem__(self, name: str) -> float:
         return float(self.theta[self.names.index(name)])

@@ -27,6 +27,7 @@ from ._parameters import (
 )
 from ._priors import (
     LogNormal as LogNormal,
+    LogUniform as LogUniform,
     Normal as Normal,
     Prior as Prior,
     Shape as Shape,

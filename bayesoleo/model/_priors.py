@@ -133,6 +133,41 @@ class Uniform:
 
 
 @dataclass(frozen=True)
+class LogUniform:
+    """Uniform in the logarithm between ``low`` and ``high``, both positive."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low < self.high:
+            raise ModelError("log-uniform prior needs 0 < low < high", value=(self.low, self.high))
+
+    @property
+    def mean(self) -> float:
+        return float((self.high - self.low) / np.log(self.high / self.low))
+
+    @property
+    def sd(self) -> float:
+        square = (self.high**2 - self.low**2) / (2 * float(np.log(self.high / self.low)))
+        return float(np.sqrt(square - self.mean**2))
+
+    @property
+    def support(self) -> tuple[float, float]:
+        return self.low, self.high
+
+    def log_density(self, value: ArrayLike) -> Array:
+        x = np.asarray(value, dtype=float)
+        inside = (x >= self.low * (1 - 1e-12)) & (x <= self.high * (1 + 1e-12))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            height = -np.log(x) - np.log(np.log(self.high / self.low))
+        return np.where(inside, height, -np.inf)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        return self.low * (self.high / self.low) ** rng.uniform(size=size)
+
+
+@dataclass(frozen=True)
 class LogNormal:
     """Log-normal: ``log(value)`` is normal about ``log(median)``, spread ``log_spread``."""
 

@@ -239,14 +239,45 @@ def _evaluate(
     parts = [slice(k, min(k + LANES, len(natural))) for k in range(0, len(natural), LANES)]
     thread_map(work, parts, density.jobs)
     rng, own = np.random.default_rng(seed), samples.of_errors.reshape(len(natural), -1)
+    common = common_to_runs(density, natural, rng)
     for run, part in enumerate(blocks):
         when = problem.samples[run]
         # With the run's first and last sample, by which a transient's length is known.
         places = np.concatenate([[0], part.shown, [when.time.size - 1]])
         taken = RunSamples(when.time[places], when.frequency, when.origin)
-        errors = density.errors.draw(own, problem.runs[run], taken, rng)
+        errors = density.errors.draw(own, problem.runs[run], taken, rng, common)
         predicted[:, :, ends[run] : ends[run + 1]] += errors[:, :, 1:-1]
     return likelihood, predicted
+
+
+def common_to_runs(density: LogDensity, natural: Array, rng: np.random.Generator) -> Array | None:
+    """Draws of what the errors of all runs have in common, given the fitted runs.
+
+    Parameters
+    ----------
+    density : LogDensity
+    natural : ndarray, shape (W, p + m)
+        Draws of its quantities.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (W, c), or None
+        None where errors have nothing in common that fitted runs inform.
+    """
+    if not density.errors.over_runs:
+        return None
+    problem = cast(ResidualProblem, density.problem)
+    block, eta = density.split(density.coordinates(natural))
+    theta, found = density.unknowns.theta(block), list[Array]()
+    for first in range(0, len(natural), LANES):
+        rows = slice(first, first + LANES)
+        residuals = [problem.residuals(theta[rows], run)[0] for run in range(len(problem.runs))]
+        drawn = density.errors.common(residuals, eta[rows], rng)
+        if drawn is None:
+            return None
+        found.append(drawn)
+    return np.concatenate(found)
 
 
 def choose_all(samples: Samples, size: int, *, seed: int) -> tuple[Array, Array]:

@@ -71,16 +71,16 @@ def information_at(
     ----------
     Verbeek (1993), eq. 3.19: ``A``.
     """
-    total = np.zeros((len(theta), len(theta)))
     evaluation = problem.evaluate(theta)
     if not evaluation.status.ok:
-        return total
+        return np.zeros((len(theta), len(theta)))
     counts = np.asarray(problem.counts)
     ends = np.cumsum(counts, axis=0)
-    for run, (first, last) in enumerate(zip(ends - counts, ends, strict=True)):
-        columns = zip(evaluation.sensitivity, first, last, strict=True)
-        total += errors.products(run, [j[a:b].T for j, a, b in columns], eta)
-    return total
+    by_run = [
+        [j[a:b].T for j, a, b in zip(evaluation.sensitivity, first, last, strict=True)]
+        for first, last in zip(ends - counts, ends, strict=True)
+    ]
+    return errors.products_of_all(by_run, eta)
 
 
 class Density(Protocol):

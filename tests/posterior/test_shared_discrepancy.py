@@ -8,8 +8,7 @@ from scipy import stats
 
 from bayesoleo.error_models import error_model
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._discrepancy import basis, spectrum
-from bayesoleo.error_models._shared import _dense, _diagonal
+from bayesoleo.error_models._discrepancy import _dense, _diagonal, basis, spectrum
 from bayesoleo.estimation._campaign_problem import _samples_of
 from bayesoleo.prediction._records import Harmonics, Record
 

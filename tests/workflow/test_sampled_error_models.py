@@ -29,7 +29,7 @@ def tree(campaign):
 
 
 def test_friction_that_is_missing_widens_the_intervals_of_a_discrepancy(campaign, tree):
-    white = sampled(campaign)
+    white = sampled(campaign, error_model="independent")
     # Cubic stiffness keeps its meaning beside friction.
     narrow, wide = (t["posterior"]["cubic"] for t in (white, tree))
     assert float(wide.std()) > 3 * float(narrow.std())

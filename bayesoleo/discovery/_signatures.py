@@ -1,0 +1,386 @@
+"""Signatures of all effects that a fitted model might lack, and the colour of its noise.
+
+Both are made at the estimate, for the error model that takes the catalogue as discrepancy. Effects
+are those that a search would score, at the same shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from scipy import optimize, stats
+from scipy.special import expit
+
+from bayesoleo._parallel import thread_map
+from bayesoleo._types import Array
+from bayesoleo.data._noise import PeriodicAverage, periodic_average
+from bayesoleo.discovery._assembly import Assembly, Option
+from bayesoleo.discovery._fit import ModelFit, without_masked
+from bayesoleo.discovery._hold_out_error import Prediction, sample_noise
+from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._score_basis import LEAST, Block, coefficients, sensitivities_of
+from bayesoleo.effects._effect import Effect
+from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._orbit import Status
+
+#: Probability that white noise is taken for coloured, over all outputs.
+COLOUR_FALSE_ALARM = 1e-3
+#: Least part of a signature beside the model's parameters by which it is normalised: an effect that
+#: they imitate more closely is believed to be at most a hundred times its remainder.
+LEAST_BESIDE = 0.01
+#: Squared cosine above which two signatures count as one where an effect acts alone.
+ALIKE = 0.9
+#: Largest correlated share: some white noise remains, so that the filter stays regular.
+MOST_SHARE = 0.999
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the outputs, measured between periods.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (s,)
+        Standard deviation of a sample, SI.
+    colour : tuple of (float, float), length s
+        Correlated share and correlation time in s; a share of zero where noise is white.
+    p_value : tuple of float, length s
+        Probability of a spectrum that differs as much from a flat one by chance; one where the
+        spectrum is not known.
+    """
+
+    sigma: Array
+    colour: tuple[tuple[float, float], ...]
+    p_value: tuple[float, ...]
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the spectrum of an output is not flat."""
+        return any(share > 0 for share, _ in self.colour)
+
+
+# -- noise -----------------------------------------------------------------------------------------
+
+
+def noise_of(fit: ModelFit) -> Noise:
+    """Size and colour of the noise of each output, pooled over the fitted runs.
+
+    A periodic run shows its noise in what does not repeat. That of a transient is measured by
+    differences of neighbours and taken as white.
+    """
+    sigma, colour, chances = [], [], []
+    for b, output in enumerate(fit.predictor.outputs):
+        parts = [_rest(fit, r, b, output) for r in range(len(fit.records))]
+        weight = np.array([part.free for part in parts])
+        sigma.append(float(np.sqrt(weight @ [part.sigma**2 for part in parts] / weight.sum())))
+        lines = [part for part in parts if part.power.size]
+        found, p_value = colour_of(lines) if lines else ((0.0, 1.0), 1.0)
+        kept = p_value < COLOUR_FALSE_ALARM / len(fit.predictor.outputs)
+        colour.append(found if kept else (0.0, 1.0))
+        chances.append(p_value)
+    return Noise(np.array(sigma), tuple(colour), tuple(chances))
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Periodogram of the noise of a run between the harmonics.
+
+    Parameters
+    ----------
+    power : ndarray, shape (q,)
+        By line, in squared units of the output.
+    angle : ndarray, shape (q,)
+        Frequency in radians per sample.
+    step : float
+        Sampling interval, s.
+    sigma, free : float
+        Standard deviation of a sample, and degrees of freedom.
+    """
+
+    power: Array
+    angle: Array
+    step: float
+    sigma: float
+    free: float
+
+
+def _rest(fit: ModelFit, r: int, b: int, output: str) -> Lines:
+    """Noise of one output in one run."""
+    record = fit.records[r]
+    residual = without_masked(record, fit.predictor.runs[r].measured[b] - fit.predictions[r].y[b])
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    none = np.zeros(0)
+    if not record.periodic:
+        sigma = sample_noise(record, output, residual)
+        return Lines(none, none, step, max(sigma, 1e-300), float(residual.size))
+    average = periodic_average(residual, step, record.frequency)
+    return lines_of(residual - average.values, average, step, record.frequency)
+
+
+def lines_of(rest: Array, average: PeriodicAverage, step: float, frequency: float) -> Lines:
+    """Lines between the harmonics of what does not repeat, (n,), beside an average over periods."""
+    size = rest.size
+    # A repeating signal has lines at multiples of the frequency only; neighbours hold its leakage.
+    cycle = np.arange(1, size // 2) / (size * step * frequency)
+    between = np.abs(cycle - np.round(cycle)) > 0.75 / (size * step * frequency)
+    power = np.abs(np.fft.rfft(rest)[1 : size // 2]) ** 2 / size
+    angle = 2 * np.pi * np.arange(1, size // 2) / size
+    free = float(average.samples - average.number)
+    return Lines(power[between], angle[between], step, max(average.sigma, 1e-300), free)
+
+
+def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
+    """Correlated share and correlation time of noise, and the probability by chance.
+
+    The Whittle likelihood of white noise and an Ornstein-Uhlenbeck process is compared with that of
+    white noise alone.
+
+    Parameters
+    ----------
+    lines : sequence of Lines
+        By run.
+
+    Returns
+    -------
+    (share, time) : tuple of float
+        Time in s.
+    p_value : float
+        By a chi-square distribution with two degrees of freedom, which is conservative.
+
+    References
+    ----------
+    Whittle (1953), Arkiv för Matematik 2, 423-434.
+    """
+    step = float(np.median([one.step for one in lines]))
+
+    def cost(x: Array) -> float:
+        share, total = MOST_SHARE * float(expit(x[0])), 0.0
+        for one in lines:
+            density = _spectrum(one.angle, share, one.step / (step * float(np.exp(x[1]))))
+            level = np.mean(one.power / density)  # each run's own variance
+            total += float(np.sum(np.log(density * level) + one.power / (density * level)))
+        return total
+
+    white = cost(np.array([-40.0, 0.0]))
+    starts = [np.array([s, np.log(t)]) for s in (-1.0, 3.0) for t in (1.0, 10.0, 60.0)]
+    bounds = [(-8.0, 12.0), (np.log(0.2), np.log(1e4))]
+    found = [optimize.minimize(cost, x, method="L-BFGS-B", bounds=bounds) for x in starts]
+    best = min(found, key=lambda one: float(one.fun))
+    p_value = float(stats.chi2.sf(2 * max(white - float(best.fun), 0.0), 2))
+    share = MOST_SHARE * float(expit(best.x[0]))
+    return (share, step * float(np.exp(best.x[1]))), p_value
+
+
+def _spectrum(angle: Array, share: float, steps: float) -> Array:
+    """Spectrum of unit-variance noise of which a share decays by ``exp(-steps)`` per sample."""
+    a = np.exp(-steps)
+    process = -np.expm1(-2 * steps) / (1 - 2 * a * np.cos(angle) + a * a)
+    return np.asarray((1 - share) + share * process)
+
+
+# -- signatures ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Scanned:
+    """Sensitivities of the new unknowns of one candidate, by set of shapes and run."""
+
+    option: Option
+    blocks: list[Block]
+
+
+def signatures_of(
+    fit: ModelFit,
+    assembly: Assembly,
+    noise: Noise,
+    *,
+    effects: Sequence[Effect] | None = None,
+    held_out: Sequence[Prediction] = (),
+    jobs: int | None = None,
+) -> Signatures:
+    """Signatures of every effect at every place where it applies.
+
+    Each is normalised over all fitted runs and outputs, in units of the noise: what it leaves
+    beside the model's parameters has a root mean square of one. An effect that the parameters can
+    largely imitate may therefore be larger than one that they cannot, as it is among effects that
+    have not been noticed. The effects of a family share one variance. What the parameters do as
+    well is left out.
+
+    Parameters
+    ----------
+    fit : ModelFit
+    assembly : Assembly
+        What was fitted.
+    noise : Noise
+        Of the outputs.
+    effects : sequence of Effect, optional
+        By default the catalogue.
+    held_out : sequence of Prediction
+        Runs that were not fitted, for predictions.
+    jobs : int, optional
+        Threads.
+    """
+    scales = scales_of(fit, assembly.drive, tuple(assembly.native.dofs))
+    options = assembly.options(scales, None if effects is None else tuple(effects))
+    labels = {record.label for record in fit.records}
+    others = [_as_fit(fit, one) for one in held_out if one.record.label not in labels]
+    groups: list[_Group] = []
+    sensitivity = _sensitivity(fit, noise)
+    gram = sensitivity @ sensitivity.T
+    for found in thread_map(lambda option: _groups(fit, others, option), options, jobs):
+        scaled = (_scaled(fit, noise, group, sensitivity, gram) for group in found)
+        groups += [group for group in scaled if group is not None]
+    return _assembled(fit, others, noise, groups)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Signatures of one parameter of one effect at one set of shapes; one a run if it has several.
+
+    ``columns`` holds, by unknown, arrays (ny, N) by run label; ``directions`` what is beside the
+    model's parameters, over all fitted samples in units of the noise, of unit length, (k, n).
+    """
+
+    family: str
+    member: str
+    columns: Mapping[str, Mapping[str, Array]]
+    directions: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def _groups(fit: ModelFit, others: Sequence[ModelFit], option: Option) -> list[_Group]:
+    """Signatures of one candidate, in the outputs' units."""
+    candidate, found = option.candidate, list[_Group]()
+    values = list(product(*candidate.shapes.values()))
+    shapes = [dict(zip(candidate.shapes, item, strict=True)) for item in values]
+    fixed = [name for name in option.model.estimated() if name not in candidate.parameters]
+    model = option.model.fixing(*fixed)
+    solved = [(one, sensitivities_of(one, model, shapes)) for one in (fit, *others)]
+    if isinstance(solved[0][1], Status):
+        return []
+    for k in range(len(shapes)):
+        columns: dict[str, dict[str, dict[str, Array]]] = {}
+        for one, blocks in solved:
+            if isinstance(blocks, Status):
+                continue
+            for r, record in enumerate(one.records):
+                by_run = blocks[k].by_run[r]
+                for j, name in enumerate(blocks[k].names):
+                    group = columns.setdefault(name.split("[")[0], {})
+                    group.setdefault(name, {})[record.label] = one.problem.kept(r, by_run[:, j])
+        member = f"{candidate.effect} at {candidate.target}"
+        found += [
+            _Group(candidate.family, f"{member}: {name}", item) for name, item in columns.items()
+        ]
+    return found
+
+
+def _flat(fit: ModelFit, noise: Noise, column: Mapping[str, Array]) -> Array:
+    """A signature over all fitted runs and outputs in units of the noise, shape (n,)."""
+    parts = []
+    for r, record in enumerate(fit.records):
+        values = column.get(record.label)
+        if values is None:
+            values = np.zeros((len(noise.sigma), fit.problem.counts[r, 0]))
+        parts.append((values / noise.sigma[:, None]).ravel())
+    return np.concatenate(parts)
+
+
+def _sensitivity(fit: ModelFit, noise: Noise) -> Array:
+    """Sensitivities of the model's unknowns likewise, of unit length, shape (l, n)."""
+    names = fit.predictor.layout.names
+    free = [names.index(name) for name in fit.problem.names]
+    rows = []
+    for name in free:
+        column = {
+            record.label: fit.problem.kept(r, fit.predictions[r].sensitivity[:, name])
+            for r, record in enumerate(fit.records)
+        }
+        rows.append(_flat(fit, noise, column))
+    table = np.array(rows).reshape(len(free), -1)
+    norm = np.linalg.norm(table, axis=1, keepdims=True)
+    return np.asarray(table / np.where(norm > 0, norm, 1.0))
+
+
+def _scaled(
+    fit: ModelFit, noise: Noise, group: _Group, sensitivity: Array, gram: Array
+) -> _Group | None:
+    """The group at unit size beside the parameters; None if these do the same, or it is zero."""
+    rows = np.array([_flat(fit, noise, column) for column in group.columns.values()])
+    beside = rows - coefficients(gram, sensitivity @ rows.T).T @ sensitivity
+    whole, left = float(np.sum(rows**2)), float(np.sum(beside**2))
+    if not (np.isfinite(whole) and whole > 0) or left <= LEAST * whole:
+        return None
+    size = max(float(np.sqrt(left)), LEAST_BESIDE * float(np.sqrt(whole))) / rows.shape[1] ** 0.5
+    columns = {
+        name: {label: values / size for label, values in column.items()}
+        for name, column in group.columns.items()
+    }
+    norm = np.linalg.norm(beside, axis=1, keepdims=True)
+    directions = beside / np.where(norm > 0, norm, 1.0)
+    return replace(group, columns=columns, directions=directions)
+
+
+def _assembled(
+    fit: ModelFit, others: Sequence[ModelFit], noise: Noise, groups: Sequence[_Group]
+) -> Signatures:
+    """All signatures in the order of their groups."""
+    share = equal_shares([g.family for g in groups], [g.member for g in groups])
+    columns = [
+        (f"{group.member} {name}", float(np.sqrt(part)), values)
+        for group, part in zip(groups, share, strict=True)
+        for name, values in group.columns.items()
+    ]
+    known = len(groups[0].directions[0]) if groups else 0
+    directions = np.concatenate([np.zeros((0, known)), *(g.directions for g in groups)])
+    # Unknowns of held-out runs have no direction: they come last in their group.
+    shares = np.array([root**2 for _, root, _ in columns])
+    usable = np.array([len(g.columns) == 1 for g in groups for _ in g.columns], dtype=bool)
+    single, odds = alike(directions, shares, usable, ALIKE)
+    outputs, curves, origins = len(noise.sigma), {}, {}
+    table = []
+    for one in (fit, *others):
+        for r, record in enumerate(one.records):
+            shape = (outputs, int(one.problem.counts[r, 0]))
+            block = np.zeros((outputs, len(columns), shape[1]))
+            for k, (_, root, values) in enumerate(columns):
+                block[:, k] = root * values.get(record.label, np.zeros(shape))
+            curves[record.label] = curves_of(block, _position(one, r, record), record.periodic)
+            origins[record.label] = one.problem.samples[r].origin
+            if one is fit:
+                table.append(block)
+    swing = [
+        np.concatenate([run.measured[b] for run in fit.predictor.runs]).std()
+        for b in range(outputs)
+    ]
+    return Signatures(
+        tuple(name for name, _, _ in columns),
+        tuple(fit.problem.runs),
+        tuple(table),
+        noise.sigma,
+        noise.colour,
+        curves,
+        shares,
+        single,
+        odds,
+        origins,
+        float(np.max(np.array(swing) / noise.sigma)),  # no effect exceeds the signal
+    )
+
+
+def _position(fit: ModelFit, r: int, record: Record) -> Array:
+    """Cycles since the first sample that counts, or parts of a transient's length."""
+    samples = fit.problem.samples[r]
+    since = samples.time - samples.time[0]
+    return np.asarray(since * record.frequency if record.periodic else since / since[-1])
+
+
+def _as_fit(fit: ModelFit, prediction: Prediction) -> ModelFit:
+    """A run that was not fitted, at its prediction, as sensitivities need it."""
+    problem = CampaignProblem(prediction.predictor)
+    point = replace(fit.point, theta=prediction.vector)
+    return replace(fit, problem=problem, point=point)
