@@ -218,7 +218,7 @@ def _is_demo(folder: Path, name: str) -> bool:
 
 @options.of_settings(
     *options.SAMPLED, "max_effects", "effects", "without", *options.SOLVED,
-    "nuisance", "disturbances", "error_model", "between_runs",
+    "nuisance", "disturbances", "error_model", "between_runs", "structure_prior",
 )  # fmt: skip
 def close(
     campaign: options.CampaignPath,

@@ -10,7 +10,7 @@ import inspect
 import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -131,11 +131,14 @@ def settings(**given: Any) -> Settings:
     Raises
     ------
     InputError
-        If there is no such scheme, solver, error model or effect, or the file of effects cannot be
-        used.
+        If there is no such scheme, solver, error model or effect, or the file of effects or the
+        prior of structures cannot be used.
     """
     found = {}
+    made = {item.name for item in fields(Settings) if item.default_factory is not MISSING}
     for name, value in given.items():
+        if value is None and name in made:
+            continue
         read = _OPTIONS[name].read
         found[name] = value if read is None or value is None else read(value)
     try:

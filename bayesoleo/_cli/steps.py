@@ -243,7 +243,14 @@ def sample(
 
 
 @options.of_settings(
-    "seed", "jobs", "effects", "without", *options.SOLVED, "nuisance", "disturbances"
+    "seed",
+    "jobs",
+    "effects",
+    "without",
+    *options.SOLVED,
+    "nuisance",
+    "disturbances",
+    "structure_prior",
 )
 def trace(
     campaign: options.CampaignPath,

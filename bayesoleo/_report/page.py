@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._report import sections, sentences, tables
+from bayesoleo._report import sections, sentences, structures, tables
 from bayesoleo._report.sections import encode_formula
 from bayesoleo._report.sentences import begin, proposal_lines, proposal_table, role_shown
 from bayesoleo._report.tables import (
@@ -351,6 +351,8 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "attributes": tree.attrs,
         "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
         "headline": sentences.headline(summary),
+        "badge": sentences.badge(summary),
+        "structures": {"lines": structures.section(summary), "table": structures.table(summary)},
         "extended": sentences.added(summary),
         "unfinished": [*sentences.unfinished(summary), *drawing.failed],
         "role": sentences.role_shown(summary),
@@ -429,6 +431,7 @@ def _figures(
     makers = {
         "data": ("the data", sections.data_figures),
         "fit": ("the fit", sections.fit_figures),
+        "structures": ("the probabilities of structures", sections.structures_figure),
         "where": ("the residual breakdown", sections.breakdown_figure),
         "residual": ("the residual", sections.residual_figures),
         "posterior": ("the posterior", sections.posterior_figures),

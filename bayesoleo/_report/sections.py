@@ -222,6 +222,19 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
                 )
 
 
+def structures_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """The probabilities of what is missing; nothing where they are not known."""
+    if not reading.summary(tree).get("structures"):
+        return []
+    caption = (
+        "Left: probability that nothing is missing, that each effect acts, alone or with others, "
+        "and that something outside the catalogue does; what was added is blue. Right: the most "
+        "probable structures, a column each with its probability on top and a dot for each member; "
+        "hollow dots: from scores, not estimated together."
+    )
+    return _drawn([(lambda: plots.structures(tree), caption)])
+
+
 def ranking_figure(tree: xr.DataTree, number: int) -> list[CaptionedFigure]:
     """The candidates of one round."""
     caption = (

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesoleo import _schema as schema
+from bayesoleo._report import structures
 from bayesoleo._report.tables import (
     Table,
     error_scale,
@@ -19,7 +20,7 @@ from bayesoleo._report.tables import (
 )
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.effects._catalogue import PROPER, called, listed, titles_for, with_titles
-from bayesoleo.plots._discovery import chosen, format_p, name
+from bayesoleo.plots._discovery import chosen, format_p, format_probability, name
 from bayesoleo.plots._style import Scale, engineering
 
 
@@ -46,23 +47,52 @@ def _not_tried(summary: Mapping[str, Any]) -> str:
 def _said(summary: Mapping[str, Any]) -> str:
     sure, found = certainty(summary), added(summary)
     was = "was" if len(summary["effects"]) == 1 else "were"
+    apart = structures.disagreement(summary)
+    apart = f" {apart}" if apart else ""
     if sure is None:
-        if summary["verdict"] == schema.NOTHING_MISSING:
-            return (
-                f"Nothing is missing: the model explains the measurements down to {words(summary)}."
-            )
-        lead = "No verdict" if only_too_small(summary) else "Something is missing"
-        return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
+        return f"{_nothing_added(summary)}{apart}"
+    likely = structures.with_probability(summary)
     down = f"the error is then down to {words(summary)}"
     if sure == schema.CERTAIN:
-        return f"Certain: {found} {was} missing; {down}."
+        return f"Certain: {found} {was} missing{likely}; {down}.{structures.next_best(summary)}"
     if sure == schema.PROBABLE:
-        return f"Probable: {found} {was} missing; {down}.{_class(summary)}"
+        lead = _probable(summary, f"{found} {was}")
+        return f"{lead}{likely}; {down}.{_class(summary)}{apart}"
+    outside = structures.outside_acts(summary)
     if sure == schema.NO_CAUSE and summary["verdict"] == schema.EFFECT_ADDED:
-        return f"No cause is named: {found} {was} added; {down}.{_class(summary)}"
+        return f"No cause is named: {found} {was} added; {down}.{outside or _class(summary)}"
     lead = "No cause is named" if sure == schema.NO_CAUSE else "A likeness only"
-    left = f"{_size_left(summary)}{_unexplained(summary)}"
-    return f"{lead}: {found} {was} added, and {left}."
+    left = f"and {_size_left(summary)}{_unexplained(summary)}"
+    if summary["verdict"] == schema.EFFECT_ADDED:
+        left = f"explaining most of the excess, but {_size_left(summary)}{_unexplained(summary)}"
+    return f"{lead}: {found} {was} added{likely}, {left}.{outside}{apart}"
+
+
+def _nothing_added(summary: Mapping[str, Any]) -> str:
+    """The result where no effect was added."""
+    found = structures.known(summary)
+    if summary["verdict"] == schema.NOTHING_MISSING:
+        explains = f"the model explains the measurements down to {words(summary)}"
+        if found is None:
+            return f"Nothing is missing: {explains}."
+        p = structures.spoken(found["nothing"])
+        if found["nothing"] >= structures.LIKELY:
+            return f"Nothing is missing, with probability {p}: {explains}."
+        return f"Nothing was added: {explains}; but that nothing is missing has probability {p}."
+    lead = "No verdict" if only_too_small(summary) else structures.lead_of_unexplained(summary)
+    return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
+
+
+def _probable(summary: Mapping[str, Any], found: str) -> str:
+    """Beginning of the headline for effects that explain everything but have alternatives."""
+    of = structures.of_added(summary)
+    if not of or min(of) >= structures.LIKELY:
+        return f"Probable: {found} missing"
+    every = structures.known(summary)
+    together = [] if every is None else [one["probability"] for one in every["classes"]]
+    if together and min(together) >= structures.LIKELY:
+        return f"Probable as one of a class: {found} added"
+    return f"One explanation of several: {found} added"
 
 
 def certainty(summary: Mapping[str, Any]) -> str | None:
@@ -77,6 +107,21 @@ def certainty(summary: Mapping[str, Any]) -> str | None:
     if summary["verdict"] == schema.UNEXPLAINED:
         return schema.LIKENESS
     return schema.CERTAIN if summary.get("certain") else schema.PROBABLE
+
+
+#: How a name that is not certain is called beside the verdict.
+_WORDS = {schema.LIKENESS: "a likeness only", schema.NO_CAUSE: "no cause named"}
+
+
+def badge(summary: Mapping[str, Any]) -> str:
+    """The verdict with how sure it is: ``effect added · a likeness only``."""
+    sure, found = certainty(summary), structures.known(summary)
+    text = str(summary["verdict"])
+    if sure is not None:
+        return f"{text} · {_WORDS.get(sure, sure)}"
+    if text == schema.NOTHING_MISSING and found is not None:
+        return f"{text} · {format_probability(found['nothing'])}"
+    return text
 
 
 def titles(summary: Mapping[str, Any]) -> dict[str, str]:

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from bayesoleo import _schema as schema
-from bayesoleo._report import sentences, tables
+from bayesoleo._report import sentences, structures, tables
 from bayesoleo._report.sentences import proposal_lines
 from bayesoleo._storage.files import write_text_atomic
 from bayesoleo.effects._catalogue import called, listed
@@ -47,7 +47,8 @@ def write_plain_report(summary: Mapping[str, Any], path: str | os.PathLike[str])
         Empty: no figure was tried.
     """
     units = summary.get("units", {})
-    lines = [*sentences.unfinished(summary), *sentences.remainder(summary)]
+    lines = [*sentences.unfinished(summary), *structures.lines(summary)]
+    lines += sentences.remainder(summary)
     shown = [tables.error_by_role(summary, units), tables.parameters(summary)]
     page = _PAGE.format(
         title=html.escape(f"{summary['campaign']} · {summary['model']}"),
@@ -90,6 +91,8 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
     console.print(Text(sentences.headline(summary), style=f"bold {COLOURS[summary['verdict']]}"))
     for line in sentences.unfinished(summary):
         console.print(Text(line, style="bold red"))
+    for line in structures.lines(summary):
+        console.print(Text(line))
     console.print(_errors(summary))
     for number, entry in enumerate(summary["rounds"], start=1):
         if entry["accepted"]:

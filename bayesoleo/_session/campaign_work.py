@@ -29,7 +29,9 @@ from bayesoleo.systems._systems import equations
 
 #: Settings that may still be changed when the posterior is sampled, and in a search.
 SAMPLING = ("seed", "jobs", "quick", "effective_size", "scheduler")
-SEARCHING = ("seed", "jobs", "quick", "scheduler", "max_effects", "effects", "without")
+SEARCHING = (
+    "seed", "jobs", "quick", "scheduler", "max_effects", "effects", "without", "structure_prior",
+)  # fmt: skip
 
 
 def changed(

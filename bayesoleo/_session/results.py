@@ -20,6 +20,8 @@ from rich.console import Console
 from bayesoleo import _schema as schema, plots
 from bayesoleo._display import LabelledResult, columns
 from bayesoleo._report.page import write_report
+from bayesoleo._report.sentences import certainty
+from bayesoleo._report.structures import structures_data, structures_text
 from bayesoleo._report.terminal import print_summary
 from bayesoleo._session import display
 from bayesoleo._session.campaign import DELAY, Campaign, status_line
@@ -459,8 +461,49 @@ class Explanation(Stored):
     @property
     def verdict(self) -> str:
         """``nothing missing``, ``effect added`` or ``unexplained remainder``; for a function
-        without a significant term, a sentence that says so."""
+        without a significant term, a sentence that says so.
+
+        It says whether the error was explained, :attr:`certainty` how sure the name is: most of an
+        error may be explained by an effect that only resembles the true one.
+        """
         return str(self.tree.attrs[schema.VERDICT])
+
+    @property
+    def certainty(self) -> str | None:
+        """How sure the names of the added effects are: ``certain``, ``probable``, ``likeness`` or
+        ``no cause``; None where none was added, and for a function."""
+        summary = json.loads(self.tree.attrs.get(schema.SUMMARY, '{"effects": []}'))
+        return certainty(summary)
+
+    @property
+    def structures(self) -> Result:
+        """Probabilities of what may be missing: nothing, each effect, something outside the
+        catalogue, and the leading structures.
+
+        Raises
+        ------
+        ResultsError
+            Of a function, whose terms are tested one by one, and of a search that was stopped early
+            or could score no candidate.
+
+        Examples
+        --------
+        >>> found.structures["probability"]  # doctest: +SKIP
+        """
+        if schema.SUMMARY not in self.tree.attrs:
+            raise ResultsError(
+                "terms of a function are tested one by one and have no probabilities of structures",
+                key="structures", hint="see the p-values that this result shows",
+            )  # fmt: skip
+        summary = json.loads(self.tree.attrs[schema.SUMMARY])
+        if not summary.get("structures"):
+            raise ResultsError(
+                "this result holds no probabilities of structures", key="structures",
+                hint="the search was stopped early, scored no candidate, or is of an older version:"
+                " explain() once more",
+            )  # fmt: skip
+        shown = LabelledResult(structures_data(summary), structures_text(summary))
+        return replace(result(shown, "structures"), source=self.tree)
 
     @property
     def fit(self) -> Fit:

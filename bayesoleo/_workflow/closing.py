@@ -244,6 +244,7 @@ def run_loop(
             max_effects=max_effects,
             nonparametric=settings.nonparametric,
             known=known,
+            prior=settings.structure_prior,
             keep=keep,
             callback=callback,
         )

@@ -10,7 +10,7 @@ import os
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -154,8 +154,10 @@ def is_finished(results: Path) -> bool:
 
 def search_key(task: Task) -> dict[str, str]:
     """Digests of all that a search depends on."""
-    # How much is drawn from the posterior has no say in what is missing.
-    settings = replace(task.settings, quick=False, effective_size=0, command="")
+    # How much is drawn from the posterior has no say in what is missing, and probabilities of
+    # structures are computed once the search has ended.
+    same = {"quick": False, "effective_size": 0, "command": "", "structure_prior": None}
+    settings = {f.name: getattr(task.settings, f.name) for f in fields(task.settings)} | same
     return {
         "campaign": digest((task.campaign.sha256, task.reduced.records)),
         "model": digest(task.assembly),

@@ -6,10 +6,12 @@ metadata are set from Python only. This file imports no numerics, so that ``--he
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields
+import difflib
+import math
+from collections.abc import Callable, Collection
+from dataclasses import Field, dataclass, field, fields, replace
 from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from bayesoleo.errors import InputError, choose
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from bayesoleo.discovery._fit import Numerics
     from bayesoleo.discovery._inference import Inference
     from bayesoleo.discovery._policy import SearchPolicy
+    from bayesoleo.discovery._structures import StructurePrior
     from bayesoleo.effects._effect import Effect
 
 RUNNING, SOLVING = "How it is run", "How the model is solved"
@@ -85,6 +88,7 @@ _KINDS: dict[str, tuple[Any, str, str]] = {
         tuple, "a sequence of effects", '(bayesoleo.effects.find_effect("{word}"),)',
     ),
     "SearchPolicy": (object, "a SearchPolicy", ""),
+    "StructurePrior": (object, "a StructurePrior", ""),
 }  # fmt: skip
 
 
@@ -126,6 +130,83 @@ def _search_policy() -> SearchPolicy:
     from bayesoleo.discovery._policy import SearchPolicy
 
     return SearchPolicy()
+
+
+def _structure_prior() -> StructurePrior:
+    from bayesoleo.discovery._structures import StructurePrior
+
+    return StructurePrior()
+
+
+#: Parts of the prior of structures that an option gives; they share one.
+PRIOR_PARTS = ("nothing", "catalogue", "outside")
+_PRIOR_FLAG, _PRIOR_EXAMPLE = "--structure-prior", "write nothing=0.5,catalogue=0.4,outside=0.1"
+
+
+def _read_prior(text: str) -> StructurePrior:
+    """The prior of structures from ``nothing=0.8,outside=0.1``; parts that are left out share the
+    rest in the proportion of their defaults."""
+    default = _structure_prior()
+    given: dict[str, float] = {}
+    for item in words(text):
+        name, _, number = item.partition("=")
+        name = name.strip()
+        if name not in PRIOR_PARTS:
+            hint = f"use {', '.join(PRIOR_PARTS)}; {_PRIOR_EXAMPLE}"
+            raise InputError("no part of this prior", key=_PRIOR_FLAG, value=item, hint=hint)
+        try:
+            given[name] = float(number)
+        except ValueError:
+            hint = _PRIOR_EXAMPLE
+            raise InputError("no number", key=_PRIOR_FLAG, value=item, hint=hint) from None
+    left = {name: getattr(default, name) for name in PRIOR_PARTS if name not in given}
+    rest = 1.0 - sum(given.values())
+    if left and not rest > 0:
+        raise InputError(
+            "leaves no probability for the other parts", key=_PRIOR_FLAG, value=text,
+            hint=f"parts must add up to less than one, or give all: {_PRIOR_EXAMPLE}",
+        )  # fmt: skip
+    given |= {name: rest * weight / sum(left.values()) for name, weight in left.items()}
+    found = replace(default, **cast(dict[str, Any], given))
+    _check_prior(found, (), _PRIOR_FLAG)
+    return found
+
+
+def _check_prior(prior: StructurePrior, families: Collection[str], key: str) -> None:
+    """Refuse a prior of structures that allows no logarithm, or names no family."""
+    parts: dict[str, Any] = {name: getattr(prior, name) for name in PRIOR_PARTS}
+    parts |= {f"numbers[{k}]": number for k, number in enumerate(prior.numbers)}
+    parts |= {f"families[{name!r}]": weight for name, weight in prior.families.items()}
+    for name, value in parts.items():
+        if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+            raise InputError(
+                "must be a finite number above zero", key=f"{key}.{name}", value=value,
+                hint="write a small number, such as 1e-6, for what is nearly impossible",
+            )  # fmt: skip
+    if not prior.numbers:
+        hint = "write (0.75, 0.2, 0.04, 0.01) for one, two, three and four effects"
+        raise InputError("is empty", key=f"{key}.numbers", value=prior.numbers, hint=hint)
+    for name in prior.families if families else ():
+        if name not in families:
+            close = difflib.get_close_matches(name, families, 1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            hint += f"families are: {', '.join(sorted(families))}"
+            raise InputError("unknown family", key=f"{key}.families", value=name, hint=hint)
+
+
+#: The setting is made where it is needed, so that ``--help`` needs no numerics.
+_PRIOR_OPTION = SettingOption(
+    str | None,
+    "Prior probabilities that nothing is missing, that effects of the catalogue are, and that only"
+    " something outside of it is. Parts that are left out share the rest.",
+    RUNNING,
+    None,
+    _read_prior,
+    {
+        "metavar": "PART=P,…",
+        "show_default": "nothing=0.5,catalogue=0.4,outside=0.1",
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -177,6 +258,9 @@ class Settings:
         What is looked for in the outputs of periodic runs, and removed before physics is named.
     policy : SearchPolicy
         The numbers by which the search for missing effects decides.
+    structure_prior : StructurePrior
+        Prior probabilities that nothing is missing, that effects of the catalogue are, and that
+        something outside of it is; see :class:`~bayesoleo.discovery.StructurePrior`.
     """
 
     seed: int = _setting(
@@ -255,6 +339,9 @@ class Settings:
         read=_disturbances, metavar="drift,tone,tails",
     )  # fmt: skip
     policy: SearchPolicy = field(default_factory=_search_policy)
+    structure_prior: StructurePrior = field(
+        default_factory=_structure_prior, metadata={OPTION: _PRIOR_OPTION}
+    )
 
     def __post_init__(self) -> None:
         from bayesoleo.effects._nonparametric import FAMILY
@@ -277,11 +364,24 @@ class Settings:
                     "unknown disturbance", key="disturbances", value=kind,
                     hint=f"some of {', '.join(DISTURBANCES)}, or () for none",
                 )  # fmt: skip
+        self._check_structure_prior()
         known = [effect.id for effect in self._offered] + [FAMILY]
         for name in self.without:
             if name not in known:
                 hint = choose(name, known, 3)
                 raise InputError("unknown effect", key="without", value=name, hint=hint)
+
+    def _check_structure_prior(self) -> None:
+        from bayesoleo.discovery._structures import StructurePrior
+        from bayesoleo.effects._catalogue import catalogue
+
+        if not isinstance(self.structure_prior, StructurePrior):
+            raise InputError(
+                "no prior of structures", key="structure_prior", value=self.structure_prior,
+                hint="write bayesoleo.discovery.StructurePrior(nothing=0.8)",
+            )  # fmt: skip
+        families = {effect.family for effect in (*self._offered, *catalogue())}
+        _check_prior(self.structure_prior, families, "structure_prior")
 
     @property
     def _offered(self) -> tuple[Effect, ...]:

@@ -37,6 +37,10 @@ from bayesoleo.effects._nonparametric import FAMILY
 #: Families of effects that name no cause.
 NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
 
+#: Probability that the effect of a certain name has at least, where probabilities were computed.
+SURE = 0.95
+#: Beginning of the note on probabilities that could not be computed.
+NO_PROBABILITIES = "the probabilities of structures could not be computed"
 #: Beginning of a note that lists parameters.
 ON_LIMIT = "at the limit of their prior's support"
 #: Beginning of the note on a declared model that was estimated from another start than its own.
@@ -188,13 +192,16 @@ class ClosedLoop:
         The effect must explain everything alone: the errors are at the noise floor and no other
         effect is significant. The data must distinguish it from all other effects of the catalogue.
         It must be so large that a merely similar effect would have left a significant remainder.
-        Hold-out runs must have confirmed it.
+        Hold-out runs must have confirmed it. Where the probabilities of structures are known, its
+        own must be 0.95 at least.
         """
         if not self.complete or self.final.too_quiet or not self.final.hold_errors.entries:
             return False
         accepted = [item.accepted for item in self.rounds if item.accepted]
         accepted = [item for item in accepted if (item.effect, item.target) in self.added]
         if len(self.added) != 1 or not accepted or not self.final.at_floor:
+            return False
+        if self.structures and self.structures.effects.get(self.added[0], 0.0) < SURE:
             return False
         found, last = accepted[-1], self.rounds[-1]
         estimate = found.beside or found.refit
@@ -269,8 +276,13 @@ def close_loop(
 
     roles = _with_noise(roles, known)
     known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
-    structures = probabilities(known, numerics, prior, callback)
-    return replace(loop_of(known, roles), structures=structures)
+    loop = loop_of(known, roles)
+    try:
+        structures = probabilities(known, numerics, prior, callback)
+    except (np.linalg.LinAlgError, ArithmeticError) as error:
+        # What was found stands without them.
+        return replace(loop, notes=(*loop.notes, f"{NO_PROBABILITIES}: {error}"))
+    return replace(loop, structures=structures)
 
 
 def probabilities(

@@ -14,9 +14,15 @@ from bayesoleo.discovery._error_table import limit, lowest
 from bayesoleo.discovery._loop import ON_LIMIT, ClosedLoop
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round
+from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State
+from bayesoleo.discovery._structures import Structure, StructurePosterior
 from bayesoleo.effects._catalogue import titles_for, with_titles
 from bayesoleo.posterior._diagnostics import Samples
+
+#: Structures are listed until their probabilities add up to the first, at most so many; a class is
+#: listed where so many of its effects have the last at least.
+LISTED, MOST_LISTED, OF_A_CLASS, VISIBLE = 0.99, 20, 2, 0.01
 
 
 def summarise(
@@ -55,6 +61,7 @@ def summarise(
         "verdict": loop.verdict,
         "certain": loop.certain,
         "certainty": loop.certainty,
+        "structures": structures_entry(loop, titles),
         "titles": titles,
         "policy": loop.policy.changed(),
         "hold_out": loop.roles.description,
@@ -77,6 +84,86 @@ def summarise(
     clean = _finite(summary)
     schema.validate_summary(clean)
     return cast(dict[str, Any], clean)
+
+
+def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, Any] | None:
+    """The probabilities of structures as plain values; None where there are none.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    titles : mapping of str to str
+        Title of each effect.
+    """
+    found = loop.structures
+    if found is None:
+        return None
+    prior, shown, total = found.prior, list[Structure](), 0.0
+    for one in found.structures[:MOST_LISTED]:
+        shown.append(one)
+        total += one.probability
+        if total >= LISTED:
+            break
+    whole = prior.nothing + prior.catalogue + prior.outside
+    return {
+        "prior": {
+            "nothing": prior.nothing / whole,
+            "catalogue": prior.catalogue / whole,
+            "outside": prior.outside / whole,
+            "numbers": [number / sum(prior.numbers) for number in prior.numbers],
+            "families": dict(prior.families),
+        },
+        "nothing": found.nothing,
+        "outside": found.outside,
+        "only_outside": found.only_outside,
+        "effects": [
+            {"effect": e, "target": t, "title": titles.get(e, e), "probability": probability}
+            for (e, t), probability in found.effects.items()
+        ],
+        "classes": _classes(loop, found),
+        "list": [
+            {
+                "effects": [f"{effect} @ {target}" for effect, target in one.effects],
+                "outside": one.outside,
+                "probability": one.probability,
+                "estimated": one.estimated,
+            }
+            for one in shown
+        ],
+    }
+
+
+def _classes(loop: ClosedLoop, found: StructurePosterior) -> list[dict[str, Any]]:
+    """Classes of similar effects with the probability that at least one of each acts.
+
+    The class of an added effect holds those that the data cannot distinguish from it, or else its
+    family. Where none was added, the family of the most probable effect is given.
+    """
+    same = {(one.effect, one.target): one.same for r in loop.rounds if (one := r.accepted)}
+    family = {s.option.key: s.option.candidate.family for s in _scores(loop)}
+    classes = []
+    for key in loop.added or tuple(found.effects)[:1]:
+        alike = same.get(key, ())
+        # An id without a place stands for the effect at each of its places.
+        members = [k for k in found.effects if k == key or {k[0], f"{k[0]} @ {k[1]}"} & {*alike}]
+        if not alike:
+            members = [k for k in found.effects if family.get(k) == family.get(key, "")]
+        if sum(found.effects[k] >= VISIBLE for k in members) < OF_A_CLASS:
+            continue
+        acts = sum(s.probability for s in found.structures if set(s.effects) & set(members))
+        entry = {
+            "effects": [f"{effect} @ {target}" for effect, target in members],
+            "family": None if alike else family.get(key),
+            "probability": acts,
+        }
+        if entry not in classes:
+            classes.append(entry)
+    return classes
+
+
+def _scores(loop: ClosedLoop) -> list[Score]:
+    """The scores of the first round, about which structures are compared."""
+    return [item.score for item in loop.rounds[0].ranking] if loop.rounds else []
 
 
 def titles_of(loop: ClosedLoop) -> dict[str, str]:

@@ -2,6 +2,7 @@ from ._discovery import (
     nonparametric_shape as nonparametric_shape,
     proposal as proposal,
     ranking as ranking,
+    structures as structures,
 )
 from ._errors import (
     by_run as by_run,

@@ -19,6 +19,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array
 from bayesoleo.effects._catalogue import called, listed, titles_for
+from bayesoleo.errors import InputError
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._reading import dataset
 from bayesoleo.plots._style import Scale, engineering
@@ -114,6 +115,11 @@ def format_p(value: float | None) -> str:
     )
 
 
+def format_probability(value: float) -> str:
+    """A probability in the two digits that its computation warrants."""
+    return "> 0.99" if value > 0.995 else "< 0.01" if value < 0.005 else f"{value:.2f}"
+
+
 def _bar(axes: Axes, row: int, candidate: dict[str, Any], first: bool, alike: bool) -> None:
     """One candidate: bar, share, p-value, and whether it is or is like the accepted one."""
     colour = style.AFTER if first else style.SIMILAR if alike else style.NEUTRAL
@@ -152,6 +158,110 @@ def _explain(figure: Figure, entry: dict[str, Any], hidden: int) -> None:
         ]
     remark = f"{hidden} more with less" if hidden > 0 else ""
     style.legend(figure, handles, remark)
+
+
+#: Inches: narrow, so that text stays readable where a phone shrinks it.
+STRUCTURES_WIDTH, BARS, STRUCTURES_TOP, STRUCTURES_ROW, STRUCTURES_BOTTOM = (
+    5.4,
+    3.3,
+    0.75,
+    0.42,
+    0.1,
+)
+COLUMN = 0.34
+#: Effects and structures that are shown have this probability at least.
+SHOWN, MOST_EFFECTS, MOST_STRUCTURES = 0.01, 10, 5
+#: Key of the row of what lies outside the catalogue.
+OUTSIDE = "outside"
+
+
+def structures(tree: xr.DataTree) -> Figure:
+    """Probability that nothing is missing, that each effect acts, and of the leading structures.
+
+    Parameters
+    ----------
+    tree : DataTree
+        Its ``summary`` attribute is read.
+
+    Returns
+    -------
+    Figure
+        Left: a bar for nothing, for each effect of at least 1 %, and for something outside the
+        catalogue. Right: a column for each of the leading structures, with a dot in the row of each
+        effect that it has; hollow where it follows from scores and was not estimated.
+
+    Raises
+    ------
+    InputError
+        If the result holds no probabilities of structures.
+    """
+    summary = reading.summary(tree)
+    found, titles = summary.get("structures"), summary.get("titles", {})
+    if not found:
+        hint = "search once more: those of older or unfinished searches are not known"
+        raise InputError("the result holds no probabilities of structures", hint=hint)
+    effects = [e for e in found["effects"] if e["probability"] >= SHOWN][:MOST_EFFECTS]
+    rows = [("", "nothing missing", found["nothing"])]
+    rows += [(name(e), called(name(e), titles), e["probability"]) for e in effects]
+    rows += [(OUTSIDE, "something outside the catalogue", found["outside"])]
+    height = STRUCTURES_TOP + STRUCTURES_ROW * len(rows) + STRUCTURES_BOTTOM
+    figure = style.blank(STRUCTURES_WIDTH, height)
+    added = {f"{e} @ {t}" for e, t in zip(summary["effects"], summary["targets"], strict=True)}
+    place = 0.05, STRUCTURES_BOTTOM, BARS - 0.05, STRUCTURES_ROW * len(rows)
+    bars = style.add_axes(figure, *place)
+    for row, (key, label, probability) in enumerate(rows):
+        colour = style.AFTER if key in added else style.MEASURED
+        _probability_bar(bars, row, label, probability, colour)
+    bars.set_xlim(0.0, 1.0)
+    shown = [one for one in found["list"] if one["probability"] >= SHOWN][:MOST_STRUCTURES]
+    left = BARS + 0.2
+    dots = style.add_axes(figure, left, place[1], COLUMN * MOST_STRUCTURES, place[3])
+    for column, one in enumerate(shown):
+        _structure_dots(dots, column, one, [key for key, _, _ in rows])
+    dots.set_xlim(-0.5, MOST_STRUCTURES - 0.5)
+    for axes in (bars, dots):
+        axes.set_axis_off()
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+    _structure_heads(figure, left)
+    return figure
+
+
+def _probability_bar(axes: Axes, row: int, label: str, probability: float, colour: str) -> None:
+    """A bar below its label, with the number at the right."""
+    axes.barh(row + 0.17, 1.0, 0.22, color=style.NOISE, alpha=0.5)
+    axes.barh(row + 0.17, probability, 0.22, color=colour)
+    bold = "bold" if colour == style.AFTER else "normal"
+    text: dict[str, Any] = {
+        "va": "center",
+        "fontsize": style.TEXT,
+        "color": style.INK,
+        "fontweight": bold,
+    }
+    axes.text(0.0, row - 0.2, style.plain(label, 38), ha="left", **text)
+    axes.text(1.0, row - 0.2, format_probability(probability), ha="right", **text)
+
+
+def _structure_dots(axes: Axes, column: int, one: Mapping[str, Any], keys: list[str]) -> None:
+    """The column of a structure: its probability, and a dot for each of its members."""
+    members = {*one["effects"], *([OUTSIDE] if one["outside"] else [])} or {""}
+    own = [row for row, key in enumerate(keys) if key in members]
+    axes.plot([column] * len(keys), range(len(keys)), "o", color=style.NOISE, ms=4, clip_on=False)
+    axes.plot([column] * len(own), own, color=style.INK, lw=1.4)
+    fill = style.INK if one["estimated"] else "white"
+    axes.plot([column] * len(own), own, "o", color=style.INK, mfc=fill, ms=7, clip_on=False)
+    axes.text(
+        column, -0.62, format_probability(one["probability"]), rotation=60, fontsize=style.SMALL,
+        ha="center", va="bottom", color=style.INK,
+    )  # fmt: skip
+
+
+def _structure_heads(figure: Figure, left: float) -> None:
+    """Titles of bars and columns."""
+    for x, text in ((0.05, "probability"), (left, "leading structures")):
+        figure.text(
+            x / STRUCTURES_WIDTH, 1 - 0.05 / figure.get_figheight(), text,
+            fontsize=style.SMALL, color=style.FAINT, va="top",
+        )  # fmt: skip
 
 
 PROPOSAL_LEFT, PROPOSAL_TOP, PROPOSAL_BOTTOM, PROPOSAL_RIGHT, HIGH = 0.85, 0.75, 0.62, 1.2, 2.8

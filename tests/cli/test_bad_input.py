@@ -8,7 +8,11 @@ import xarray as xr
 from small_rig import CAMPAIGN, MODEL, rows, write_rows
 
 from bayesoleo import _schema as schema
+from bayesoleo._cli.options import settings
 from bayesoleo._storage.result_files import read_tree, write_tree
+from bayesoleo._workflow import Settings
+from bayesoleo.discovery import StructurePrior
+from bayesoleo.errors import InputError
 
 
 def change(path, old, new):
@@ -234,3 +238,40 @@ def test_usage_errors_exit_with_two(run, arguments):
     result = run(*arguments)
     assert result.exit_code == 2
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("nothing=x", "no number (got 'nothing=x'); write nothing=0.5,"),
+        ("noth=0.5", "no part of this prior (got 'noth=0.5'); use nothing, catalogue, outside"),
+        ("nothing=0.9,outside=0.2", "leaves no probability for the other parts"),
+        ("outside=0", "structure-prior.outside: must be a finite number above zero (got 0.0)"),
+        ("outside=nan", "leaves no probability for the other parts"),
+    ],
+)
+def test_a_prior_of_structures_that_cannot_be(refused, campaign, model, given, message):
+    text = refused("close", campaign, "--model", model, "--structure-prior", given)
+    assert "key --structure-prior" in text
+    assert message in text
+
+
+def test_parts_of_the_prior_that_are_left_out_share_the_rest():
+    prior = settings(structure_prior="nothing=0.8").structure_prior
+    assert (prior.nothing, prior.catalogue, prior.outside) == pytest.approx((0.8, 0.16, 0.04))
+    assert settings(structure_prior=None).structure_prior == StructurePrior()
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (0.5, r"key structure_prior: no prior of structures \(got 0.5\); write .*StructurePrior"),
+        (StructurePrior(nothing=-1.0), r"structure_prior.nothing: must be a finite number"),
+        (StructurePrior(numbers=(0.5, 0.0)), r"structure_prior.numbers\[1\]: must be a finite"),
+        (StructurePrior(numbers=()), r"structure_prior.numbers: is empty"),
+        (StructurePrior(families={"frction": 2.0}), r"unknown family .*did you mean friction\?"),
+    ],
+)
+def test_priors_in_python_are_checked_where_they_are_given(prior, message):
+    with pytest.raises(InputError, match=message):
+        Settings(structure_prior=prior)

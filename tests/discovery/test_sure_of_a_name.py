@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,8 @@ from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._round import _hidden, _may_be_significant
 from bayesoleo.discovery._score_tests import Score, corrected_p, without_twins
+from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
+from bayesoleo.discovery._summary import structures_entry
 
 TESTS, POLICY = 60.0, SearchPolicy()
 LEVEL, SAME = POLICY.significance, POLICY.same_cosine
@@ -102,3 +105,64 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
 def test_a_name_is_certain_where_nothing_else_could_be(change, certain):
     # A hundredth shared by sixty tests leaves 1.7e-4 to each: 14.2 of chi-square.
     assert loop(**change).certain is certain
+
+
+PLAY, OTHER = ("play", "stroke"), ("preload", "stroke")
+
+
+def posterior(table):
+    """Probabilities of structures, each ``(effects, outside)``."""
+    found = [Structure(effects, outside, p, 0.0, True) for (effects, outside), p in table.items()]
+    return StructurePosterior(tuple(found), StructurePrior())
+
+
+@pytest.mark.parametrize(
+    ("table", "certain"),
+    [
+        ({((PLAY,), False): 0.9, ((PLAY,), True): 0.06, ((), False): 0.04}, True),
+        ({((PLAY,), False): 0.94, ((), False): 0.06}, False),
+        ({((OTHER,), False): 1.0}, False),
+    ],
+)
+def test_a_certain_name_is_probable_as_well(table, certain):
+    assert replace(loop(), structures=posterior(table)).certain is certain
+
+
+def weighed(table, same=()):
+    """The entry of the summary where play was added, of a family with preload."""
+    found = loop(same=same)
+    ranking = [
+        SimpleNamespace(score=score(effect, [1.0], family="contact"))
+        for effect in ("play", "preload")
+    ]
+    rounds = (SimpleNamespace(accepted=found.rounds[0].accepted, ranking=ranking),)
+    return structures_entry(replace(found, rounds=rounds, structures=posterior(table)), {})
+
+
+def test_the_summary_lists_structures_down_to_99_percent():
+    many = {((PLAY,), False): 0.6, ((OTHER,), False): 0.3}
+    many |= {(((f"effect {k}", "x"),), False): 0.1 / 40 for k in range(40)}
+    assert [one["probability"] for one in weighed(many)["list"][:2]] == [0.6, 0.3]
+    assert len(weighed(many)["list"]) == 20
+    assert len(weighed({((PLAY,), False): 0.992, ((OTHER,), False): 0.008})["list"]) == 1
+    assert sum(weighed(many)["prior"][key] for key in ("nothing", "catalogue", "outside")) == 1.0
+
+
+def test_a_class_counts_structures_with_several_of_its_effects_once():
+    table = {((PLAY, OTHER), False): 0.5, ((PLAY,), False): 0.2, ((OTHER,), False): 0.2,
+             ((), False): 0.1}  # fmt: skip
+    (by_family,) = weighed(table)["classes"]
+    (alike,) = weighed(table, same=("preload",))["classes"]
+    assert by_family["family"] == "contact"
+    assert alike["family"] is None
+    # Not 0.7 + 0.7, which the single effects have together.
+    assert by_family["probability"] == pytest.approx(0.9)
+    assert alike["probability"] == pytest.approx(0.9)
+
+
+def test_an_effect_that_stands_out_of_its_family_needs_no_class():
+    assert weighed({((PLAY,), False): 0.995, ((OTHER,), False): 0.005})["classes"] == []
+
+
+def test_a_search_without_probabilities_has_none_in_its_summary():
+    assert structures_entry(loop(), {}) is None

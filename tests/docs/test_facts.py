@@ -33,7 +33,7 @@ def test_every_group_of_a_result_is_described(name: str) -> None:
 def test_every_key_of_the_summary_is_described() -> None:
     text = page("results.md")
     whole = schema.summary_schema()
-    parts = ("round", "candidate", "run_error", "proposal", "trial")
+    parts = ("round", "candidate", "run_error", "proposal", "trial", "structures")
     tables = [whole, *(whole["$defs"][part] for part in parts)]
     keys = {key for table in tables for key in table["properties"]}
     # In words of code within the text, alone or in braces that stand for an object.

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from bayesoleo import _schema as schema, plots
+from bayesoleo.errors import InputError
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._discovery import chosen, similar
 
@@ -253,3 +254,30 @@ def test_figures_need_no_pyplot(oleo):
     plots.fit(oleo, "force")
     after = sys.modules["matplotlib.pyplot"].get_fignums() if known else []
     assert after == before
+
+
+def test_probabilities_of_structures_are_drawn_as_stored(oleo):
+    tree = oleo.copy()
+    summary = json.loads(tree.attrs["summary"])
+    effects = [
+        {"effect": "Stribeck_friction", "target": "stroke", "title": "", "probability": 0.9},
+        {"effect": "play", "target": "stroke", "title": "", "probability": 0.002},
+    ]
+    listed = [
+        {"effects": ["Stribeck_friction @ stroke"], "outside": outside, "probability": p,
+         "estimated": True}
+        for outside, p in ((False, 0.86), (True, 0.04))
+    ]  # fmt: skip
+    known = {"nothing": 0.06, "outside": 0.08, "effects": effects, "list": listed}
+    tree.attrs["summary"] = json.dumps(summary | {"targets": ["stroke"], "structures": known})
+    figure = plots.structures(tree)
+    shown = texts(figure)
+    assert {"0.06", "0.08", "0.90", "0.86", "0.04", "nothing missing"} <= set(shown)
+    assert not any("play" in text for text in shown)
+    widths = [bar.get_width() for bar in figure.axes[0].patches]
+    assert widths[1::2] == [0.06, 0.9, 0.08]
+
+
+def test_results_without_probabilities_have_no_such_figure(oleo):
+    with pytest.raises(InputError, match="holds no probabilities of structures"):
+        plots.structures(oleo)

@@ -48,8 +48,10 @@ def test_each_certainty_has_its_word():
     assert told(one, schema.CERTAIN).startswith(f"Certain: Coulomb friction (stroke) {down}")
     assert told(one, schema.PROBABLE).startswith(f"Probable: Coulomb friction (stroke) {down}")
     assert "something that was not may" in told(one, schema.PROBABLE)
-    left = told(one, schema.LIKENESS, ratio=13.6)
+    left = told(one, schema.LIKENESS, ratio=13.6, verdict=schema.UNEXPLAINED)
     assert left.startswith("A likeness only: Coulomb friction (stroke) was added, and the error of")
+    most = told(one, schema.LIKENESS, ratio=13.6)
+    assert "was added, explaining most of the excess, but the error of force" in most
     assert "force on the hold-out runs is 13.6 times" in left
     none = told(["nonparametric_stroke @ force"], schema.NO_CAUSE,
                 titles={

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import pickle
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -120,6 +121,16 @@ def test_what_is_missing_is_found(found: bo.Explanation) -> None:
     assert len(found.parameters) == 3
     check_shown(found.fit, "fit of damper")
     assert found.fit is found.fit
+
+
+def test_what_is_missing_has_probabilities(found: bo.Explanation) -> None:
+    assert found.certainty == json.loads(found.tree.attrs["summary"])["certainty"]
+    known = found.structures
+    check_shown(known, "cubic stiffness", "what is missing")
+    cubic = [name for name in known["effect"].values if name.startswith("cubic_stiffness")]
+    assert float(known["probability"].sel(effect=cubic).sum()) > 0.5
+    # Structures exclude each other, and those that were listed hold nearly everything.
+    assert 0.95 < float(known["structure_probability"].sum()) <= 1.0 + 1e-9
 
 
 def test_report_and_posterior_of_what_was_found(found: bo.Explanation, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import xarray as xr
 
 import bayesoleo as bo
 from bayesoleo import _schema as schema
+from bayesoleo.errors import ResultsError
 from tests.session.conftest import line
 from tests.session.shown import check_shown
 
@@ -97,6 +98,9 @@ def test_missing_term_is_found(line_fit: bo.Fit, tmp_path: Path) -> None:
     found = line_fit.explain(candidates=TERMS)
     assert found.effects == ("cubic",)
     assert found.verdict == "effect added"
+    assert found.certainty is None
+    with pytest.raises(ResultsError, match="terms of a function are tested one by one"):
+        _ = found.structures
     check_shown(found, "cubic", "added")
     value, sd = found.parameters.loc["cubic_c", ["estimate", "sd"]]
     assert abs(value - 0.4) < 3 * sd

@@ -69,6 +69,7 @@ def test_good_summaries_pass():
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
+        (("structures",), {}, r"key structures: "),
         (("verdict",), "all good", r"key verdict: .*'all good' is not one of"),
         (("rounds",), [], r"key rounds: "),
         (("rounds", 0, "accepted"), 3, r"key rounds\[0\].accepted: "),
