@@ -13,13 +13,13 @@ of periodic runs before a model is compared with them.
   least squares on ``f + psi(r) / mean(psi')`` is to first order the maximum-likelihood estimate
   under Student-t noise, and the pseudo-residuals have the variance of that estimate.
 
-A transient has no lines between harmonics that tell a drift from slow physics: it is left as it is.
+A transient is left as it is: nothing in it tells a drift from slow physics.
 
 References
 ----------
 Huber and Ronchetti (2009), Robust Statistics, section 7.10: pseudo-observations. Lange, Little and
 Taylor (1989), Journal of the American Statistical Association 84(408), 881-896: the t
-distribution. Anscombe and Glynn (1983), Biometrika 70(1), 227-234: distribution of the kurtosis.
+distribution. Anscombe and Glynn (1983), Biometrika 70(1), 227-234: kurtosis.
 """
 
 from __future__ import annotations
@@ -61,10 +61,8 @@ _HARMONICS, _FEWEST_LINES = 4, 24
 #: Prior standard deviation of the mean's error over the drift's root mean square. A random walk
 #: from zero has 1.4 of it, a straight line 1.7; one that began before the record has more.
 BASELINE = 5.0
-#: Neighbours that a line must exceed as well.
-_BESIDE = 8
-#: Tones of a channel at most; what has more is broadband.
-_MOST_TONES = 4
+#: Neighbours that a line must exceed as well, and tones of a channel at most.
+_BESIDE, _MOST_TONES = 8, 4
 #: Weighting is worth it where it lowers the variance of the noise below this part.
 _WORTH = 0.9
 #: Degrees of freedom of the t distribution that are tried.
@@ -93,8 +91,7 @@ def without_disturbances(
 
     Returns
     -------
-    tuple of Record
-        The same objects where nothing was found.
+    tuple of Record, the same objects where nothing was found.
     """
     level = FALSE_ALARM / max(len(channels) * len(records), 1)
     found = [_cleaned(record, channels, frozenset(), level, kinds) for record in records]
@@ -224,13 +221,9 @@ def baseline_of(channel: str) -> str:
 
 
 def _basis(record: Record) -> HarmonicBasis:
-    return HarmonicBasis(record.time.size, _step(record))
-
-
-def _step(record: Record) -> float:
-    """Cycles per sample."""
+    """All harmonics at a record's samples."""
     span = float(record.time[-1] - record.time[0])
-    return record.frequency * span / (record.time.size - 1)
+    return HarmonicBasis(record.time.size, record.frequency * span / (record.time.size - 1))
 
 
 def _is_resolved(basis: HarmonicBasis, values: Array) -> bool:
@@ -453,7 +446,6 @@ def _repeating(basis: HarmonicBasis, values: Array, cleaned: Array) -> Array:
 
 
 def _phase(basis: HarmonicBasis) -> Array:
-    """Cycles since the first sample (N,)."""
     return basis.step * np.arange(basis.samples, dtype=float)
 
 
@@ -507,28 +499,3 @@ def _pseudo(rest: Array, degrees: float, scale: float) -> Array | None:
     psi = (degrees + 1) * unit / across
     slope = float(np.mean((degrees + 1) * (degrees - unit**2) / across**2))
     return scale * psi / slope if slope > 0.05 else None
-
-
-def emptied_lines(record: Record, channel: str) -> NDArray[np.bool_] | None:
-    """Lines of a channel's spectrum that hold no noise since a disturbance was removed.
-
-    Parameters
-    ----------
-    record : Record
-    channel : str
-
-    Returns
-    -------
-    ndarray of bool, shape (N // 2 + 1,), or None
-        None where there are none.
-    """
-    what = record.disturbances.get(channel)
-    if what is None or not (what.terms or what.tones):
-        return None
-    span = record.periods / record.frequency
-    line = np.arange(record.time.size // 2 + 1)
-    # A cosine of k half cycles lies at the line k / 2; the last one is emptied in part only.
-    found = line < 0.5 * what.terms
-    for tone in what.tones:
-        found = found | (np.abs(line - tone.frequency * span) < 0.75)
-    return np.asarray(found)

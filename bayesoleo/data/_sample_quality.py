@@ -439,3 +439,28 @@ def _is_switched(values: Array, first: NDArray[np.intp], end: NDArray[np.intp]) 
         return False
     least = max(_JUMP * float(np.ptp(values)), _SWITCHED * float(np.median(beside)))
     return float(np.median(jump)) > least
+
+
+def emptied_lines(record: Record, channel: str) -> NDArray[np.bool_] | None:
+    """Lines of a channel's spectrum that hold no noise since a disturbance was removed.
+
+    Parameters
+    ----------
+    record : Record
+    channel : str
+
+    Returns
+    -------
+    ndarray of bool, shape (N // 2 + 1,), or None
+        None where there are none.
+    """
+    what = record.disturbances.get(channel)
+    if what is None or not (what.terms or what.tones):
+        return None
+    span = record.periods / record.frequency
+    line = np.arange(record.time.size // 2 + 1)
+    # A cosine of k half cycles lies at the line k / 2; the last one is emptied in part only.
+    found = line < 0.5 * what.terms
+    for tone in what.tones:
+        found = found | (np.abs(line - tone.frequency * span) < 0.75)
+    return np.asarray(found)

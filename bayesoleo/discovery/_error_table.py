@@ -26,7 +26,6 @@ from scipy import stats
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
-from bayesoleo.data._disturbances import emptied_lines
 from bayesoleo.data._noise import (
     LocalAverage,
     NoiseSpectrum,
@@ -36,7 +35,7 @@ from bayesoleo.data._noise import (
     noise_spectrum,
     periodic_average,
 )
-from bayesoleo.data._sample_quality import rounding_in_average
+from bayesoleo.data._sample_quality import emptied_lines, rounding_in_average
 from bayesoleo.discovery._assembly import RecordNoise
 from bayesoleo.discovery._fit import counted, of_those_counted, weights, without_masked
 from bayesoleo.discovery._hold_out_error import Prediction, borne_out, sample_noise

@@ -22,8 +22,8 @@ from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._structure_curves import curves_of
 from bayesoleo.discovery._structures import (
-    Anchor,
     Comparison,
+    EstimatedModel,
     Evidence,
     StructurePosterior,
     StructurePrior,
@@ -74,7 +74,7 @@ def structure_posterior(
     evidence = Evidence(
         Comparison.of(base.data, errors, scores, prior, curves_of(base, assembly, numerics.jobs))
     )
-    evidence.add(Anchor(base.fit, {}))
+    evidence.add(EstimatedModel(base.fit, {}))
     for grown, fit in known:
         evidence.add(_anchor(grown, fit, by_key))
     tried: set[tuple[Added, ...]] = set()
@@ -91,7 +91,7 @@ def structure_posterior(
     return evidence.posterior()
 
 
-def _anchor(assembly: Assembly, fit: ModelFit, scores: Mapping[Added, Score]) -> Anchor:
+def _anchor(assembly: Assembly, fit: ModelFit, scores: Mapping[Added, Score]) -> EstimatedModel:
     """An estimated model with the effects that it has."""
     effects = {(step.effect.id, step.target): step.amplitudes for step in assembly.steps}
     shapes = {
@@ -100,7 +100,7 @@ def _anchor(assembly: Assembly, fit: ModelFit, scores: Mapping[Added, Score]) ->
         if key in scores
         for name, values in scores[key].option.candidate.shapes.items()
     }
-    return Anchor(fit, effects, shapes)
+    return EstimatedModel(fit, effects, shapes)
 
 
 def _parameters(grown: Assembly, score: Score, base: Base) -> dict[str, Parameter]:
@@ -114,10 +114,10 @@ def _parameters(grown: Assembly, score: Score, base: Base) -> dict[str, Paramete
 
 def _extended(
     base: Base, assembly: Assembly, scores: Mapping[Added, Score], numerics: Numerics
-) -> Callable[[tuple[Added, ...]], Anchor | None]:
+) -> Callable[[tuple[Added, ...]], EstimatedModel | None]:
     """Estimates a set of effects together; None where that failed."""
 
-    def estimated(effects: tuple[Added, ...]) -> Anchor | None:
+    def estimated(effects: tuple[Added, ...]) -> EstimatedModel | None:
         grown, known = assembly.with_values(base.fit.shared), dict(base.fit.values)
         try:
             for key in effects:

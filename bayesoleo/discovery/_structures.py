@@ -181,7 +181,7 @@ class StructurePosterior:
 
 
 @dataclass(frozen=True)
-class Anchor:
+class EstimatedModel:
     """An estimated model, about which structures are compared.
 
     Parameters
@@ -441,7 +441,7 @@ class Evidence:
     def __post_init__(self) -> None:
         self.columns = self.comparison.columns()
 
-    def add(self, anchor: Anchor) -> None:
+    def add(self, anchor: EstimatedModel) -> None:
         """Compare structures about one more estimated model; the declared one comes first.
 
         Where several anchors reach a structure, the one that has more of its effects counts, and
@@ -522,7 +522,7 @@ def _best(evidences: Evidences, count: int) -> list[Added]:
 
 
 def _evidences(
-    anchor: Anchor,
+    anchor: EstimatedModel,
     comparison: Comparison,
     columns: _Columns,
     chosen: Sequence[Added] | None,
@@ -619,7 +619,7 @@ def _grids(comparison: Comparison, reach: Array) -> tuple[_Remainders, Array]:
 
 
 def _anchored(
-    anchor: Anchor,
+    anchor: EstimatedModel,
     comparison: Comparison,
     columns: _Columns,
     beside: Sequence[Added],
@@ -660,7 +660,7 @@ def _anchored(
     )
 
 
-def _own_groups(anchor: Anchor) -> tuple[Group, ...]:
+def _own_groups(anchor: EstimatedModel) -> tuple[Group, ...]:
     """Columns of each of an anchor's effects, in the order of :func:`_linearised`."""
     found, start = [], 0
     for names in anchor.effects.values():
@@ -670,7 +670,9 @@ def _own_groups(anchor: Anchor) -> tuple[Group, ...]:
     return tuple(found)
 
 
-def _linearised(anchor: Anchor, data: SpectralData) -> tuple[Array, Array, Array, Array, Array]:
+def _linearised(
+    anchor: EstimatedModel, data: SpectralData
+) -> tuple[Array, Array, Array, Array, Array]:
     """Residual (n,), columns (l, n) of unknowns in units of their priors, centres (l,) of these,
     and columns (k, n) and values (k,) of the amplitudes of the anchor's effects."""
     fit = anchor.fit

@@ -275,10 +275,10 @@ def between_places(model: Model) -> dict[str, Between]:
     divided by its mass: by reciprocity the ratio of the joining terms is that of the scales.
     Without such a term both must be in one unit, and in no unit of acceleration.
     """
-    return dict(_between(Structure(model)))
+    return dict(_between(SameModel(model)))
 
 
-class Structure:
+class SameModel:
     """A model as the key of a cache: equal where equations and signs are."""
 
     def __init__(self, model: Model):
@@ -289,12 +289,12 @@ class Structure:
         return hash(self.model.structure)
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, Structure) and self._signs == other._signs
+        same = isinstance(other, SameModel) and self._signs == other._signs
         return same and self.model.structure == other.model.structure  # type: ignore[attr-defined]
 
 
 @lru_cache(maxsize=256)
-def _between(like: Structure) -> tuple[tuple[str, Between], ...]:
+def _between(like: SameModel) -> tuple[tuple[str, Between], ...]:
     model = like.model
     bodies = {
         item.name: item

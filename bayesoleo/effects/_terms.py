@@ -27,7 +27,7 @@ from bayesoleo.effects._parts import Amplitude, Constant, Scales
 from bayesoleo.effects._places import (
     PART,
     Between,
-    Structure,
+    SameModel,
     all_places,
     balance_terms,
     balance_unit,
@@ -51,7 +51,7 @@ _ROOM = 293.15
 
 
 @dataclass(frozen=True)
-class Term:
+class ModelTerm:
     """A part of a balance that follows the motion at a place.
 
     Parameters
@@ -110,16 +110,16 @@ class Term:
         return model
 
 
-def terms_of(model: Model) -> dict[str, Term]:
+def terms_of(model: Model) -> dict[str, ModelTerm]:
     """Terms that follow the motion at a place, by ``place.term``."""
-    return dict(_terms(Structure(model)))
+    return dict(_terms(SameModel(model)))
 
 
 @lru_cache(maxsize=256)
-def _terms(like: Structure) -> tuple[tuple[str, Term], ...]:
+def _terms(like: SameModel) -> tuple[tuple[str, ModelTerm], ...]:
     model = like.model
     bodies = {place.name for place in force_places(model).values()}
-    found: dict[str, Term] = {}
+    found: dict[str, ModelTerm] = {}
     for target, place in all_places(model).items():
         for term in _at(model, place, bodies):
             word = "_".join(term.name.split())
@@ -127,7 +127,7 @@ def _terms(like: Structure) -> tuple[tuple[str, Term], ...]:
     return tuple(found.items())
 
 
-def _at(model: Model, place: Coordinate, bodies: set[str]) -> Iterator[Term]:
+def _at(model: Model, place: Coordinate, bodies: set[str]) -> Iterator[ModelTerm]:
     """Terms of one place's balance."""
     for name, term in balance_terms(model, place).items():
         definition = _bare(model, term)
@@ -137,12 +137,12 @@ def _at(model: Model, place: Coordinate, bodies: set[str]) -> Iterator[Term]:
                 whole = _own_motion(model, place, part, bodies)
                 if whole is not None:
                     followed = _followed(model, part)
-                    yield Term(place, own, whole, followed, (), definition, part)
+                    yield ModelTerm(place, own, whole, followed, (), definition, part)
             continue
         whole = _own_motion(model, place, term, bodies)
         balances = None if whole is None else _balances(model, place, name, term)
         if whole is not None and balances is not None:
-            yield Term(place, name, whole, _followed(model, term), balances)
+            yield ModelTerm(place, name, whole, _followed(model, term), balances)
 
 
 def _bare(model: Model, term: sp.Expr) -> str:
@@ -199,18 +199,18 @@ def _followed(model: Model, term: sp.Expr) -> frozenset[str]:
 # -- quantities ------------------------------------------------------------------------------------
 
 
-def _positions(model: Model, term: Term) -> tuple[str, ...]:
+def _positions(model: Model, term: ModelTerm) -> tuple[str, ...]:
     return () if term.place.velocity is None else (term.place.name,)
 
 
-def _pressures(model: Model, term: Term) -> tuple[str, ...]:
+def _pressures(model: Model, term: ModelTerm) -> tuple[str, ...]:
     declared = next((name for name in PRESSURES if name in model.definitions), None)
     if declared is not None:
         return (declared,)
     return _of_unit(model, term, "Pa")
 
 
-def _temperatures(model: Model, term: Term) -> tuple[str, ...]:
+def _temperatures(model: Model, term: ModelTerm) -> tuple[str, ...]:
     """Absolute temperatures: an excess, whose guess is zero, has no ratio."""
     found = _of_unit(model, term, "K")
     excess = {name for name, dof in model.dofs.items() if sp.sympify(dof.guess) == 0}
@@ -218,7 +218,7 @@ def _temperatures(model: Model, term: Term) -> tuple[str, ...]:
     return (*(name for name in found if name not in excess), *stated)
 
 
-def _others(model: Model, term: Term) -> tuple[str, ...]:
+def _others(model: Model, term: ModelTerm) -> tuple[str, ...]:
     """Inputs that are no motion, force, pressure or temperature at a place, such as a current."""
     moving = {place.name for place in force_places(model).values()}
     balance = _unit_of_balance(model, term.place)
@@ -241,7 +241,7 @@ def _unit_of_balance(model: Model, place: Coordinate) -> str:
     return balance_unit(model, place.target)
 
 
-def _of_unit(model: Model, term: Term, unit: str) -> tuple[str, ...]:
+def _of_unit(model: Model, term: ModelTerm, unit: str) -> tuple[str, ...]:
     """Dofs of first order and inputs in a unit, that are no motion at the place."""
     declared = {name: item.unit for name, item in model.dofs.items() if model.order(name) == 1}
     declared |= {name: text for name, text in model.inputs.items() if WITHIN not in name}
@@ -268,7 +268,7 @@ _QUANTITIES = {
 }
 
 
-def _is_told_otherwise(model: Model, term: Term, kind: str, quantity: str) -> bool:
+def _is_told_otherwise(model: Model, term: ModelTerm, kind: str, quantity: str) -> bool:
     """Whether the term follows a quantity already, or another effect says the same."""
     bodies = {term.place.dof, term.place.other} if isinstance(term.place, Between) else {quantity}
     if (bodies if kind == "stroke" else {quantity}) <= term.followed:

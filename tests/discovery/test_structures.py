@@ -15,8 +15,8 @@ from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structure_evidence import Likelihood, fewer
 from bayesoleo.discovery._structure_search import _extended, structure_posterior
 from bayesoleo.discovery._structures import (
-    Anchor,
     Comparison,
+    EstimatedModel,
     Evidence,
     _grids,
     scan_prior,
@@ -101,7 +101,7 @@ def test_evidence_about_an_estimate_is_that_of_importance_sampling(tmp_path):
     scores, _ = score_candidates(base, rubbing.assembly, [find_effect(FRICTION[0])], 1)
     errors = {(entry.run, entry.output): entry for entry in rubbing.fit_errors.entries}
     evidence = Evidence(Comparison.of(base.data, errors, scores, StructurePrior()))
-    evidence.add(Anchor(base.fit, {}))
+    evidence.add(EstimatedModel(base.fit, {}))
     (score,) = scores
     anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)((FRICTION,))
     evidence.add(anchor)

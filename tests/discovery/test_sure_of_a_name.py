@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bayesoleo.discovery import _loop
 from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._round import _hidden, _may_be_significant
@@ -166,3 +167,22 @@ def test_an_effect_that_stands_out_of_its_family_needs_no_class():
 
 def test_a_search_without_probabilities_has_none_in_its_summary():
     assert structures_entry(loop(), {}) is None
+
+
+def test_what_was_found_stands_where_probabilities_fail(monkeypatch):
+    found = loop()
+    progress = SimpleNamespace(first=None, state=None)
+
+    def fails(*_):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    for name, value in {
+        "searched": lambda known, _: known, "best_of_beam": lambda known, *_: known,
+        "_with_noise": lambda roles, _: roles, "loop_of": lambda *_: found, "probabilities": fails,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(_loop, name, value)
+    ended = _loop.close_loop(None, None, None, known=progress)
+    assert ended.structures is None
+    assert ended.rounds == found.rounds
+    (note,) = ended.notes
+    assert note == f"{_loop.NO_PROBABILITIES}: Matrix is not positive definite"
