@@ -55,6 +55,10 @@ from ._score_tests import (
     score_all as score_all,
     without_twins as without_twins,
 )
+from ._spectral_data import (
+    RunLines as RunLines,
+    SpectralData as SpectralData,
+)
 from ._state import (
     State as State,
     fit_state as fit_state,

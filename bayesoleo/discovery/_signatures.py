@@ -116,7 +116,7 @@ def _rest(fit: ModelFit, r: int, b: int, output: str) -> Lines:
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     none = np.zeros(0)
     if not record.periodic:
-        sigma = sample_noise(record, output, residual)
+        sigma = sample_noise(record, output, residual, policy=fit.policy)
         return Lines(none, none, step, max(sigma, 1e-300), float(residual.size))
     average = periodic_average(residual, step, record.frequency)
     return lines_of(residual - average.values, average, step, record.frequency)

@@ -29,9 +29,11 @@ from ._predictor import (
     RunPrediction as RunPrediction,
 )
 from ._records import (
+    Disturbances as Disturbances,
     Harmonics as Harmonics,
     Record as Record,
     Signal as Signal,
+    Tone as Tone,
     transient_record as transient_record,
 )
 from ._simulate import (

@@ -177,7 +177,7 @@ class Record:
     kept : ndarray of bool, shape (N,), optional
         Which samples count; None where all do.
     disturbances : mapping of str to Disturbances
-        What was removed from channels; see :mod:`bayesoleo.data._disturbances`.
+        What was removed from channels before physics is named.
     """
 
     label: str

@@ -242,7 +242,7 @@ def test_one_word_in_the_settings(tmp_path):
     ]
     channels = {"displacement": ("x", "m"), "force": ("f", "N")}
     write_campaign(tmp_path / "springs", name="springs", channels=channels, runs=runs)
-    options = {"jobs": 1, "steps": 16}
+    options = {"jobs": 1, "steps": 16, "error_model": "independent"}
     free = Settings(nuisance=("conditions",), **options)
     points = [
         estimate_campaign(tmp_path / "springs", spring(), settings)["point"].to_dataset()

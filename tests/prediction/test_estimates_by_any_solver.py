@@ -199,7 +199,9 @@ def test_a_campaign_is_checked_by_the_solver_of_the_settings(campaigns):
 def test_what_cannot_be_solved_says_what_to_use():
     with pytest.raises(InputError, match=r"unknown solver.*shoting.*did you mean shooting"):
         Settings(solver="shoting")
-    with pytest.raises(InputError, match=r"--solver: unknown solver.*use collocation, adaptive"):
+    with pytest.raises(
+        InputError, match=r"--solver: unknown solver.*one of: collocation, adaptive"
+    ):
         options.settings(solver="euler")
     with pytest.raises(InputError, match=r"'thesis' needs equal steps.*use .*solver collocation"):
         Settings(solver="adaptive", scheme="thesis")

@@ -183,7 +183,7 @@ def test_failures_have_a_status_and_no_numbers():
 
 
 def test_bad_input_says_what_to_write():
-    with pytest.raises(InputError, match=r"unknown solver.*euler.*use collocation, adaptive"):
+    with pytest.raises(InputError, match=r"unknown solver.*euler.*one of: collocation, adaptive"):
         periodic_orbit(DUFFING, PLAN, None, "euler")
     with pytest.raises(InputError, match=r"stifness: no such parameter; parameters there are"):
         periodic_orbit(DUFFING, PLAN, {"stifness": 1.0})

@@ -51,7 +51,8 @@ def campaign(tmp_path_factory):
 @pytest.fixture(scope="module")
 def tree(campaign, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    workflow.sample(campaign, damper(), Settings(quick=True, jobs=1, effects=(), seed=5), out=out)
+    settings = Settings(quick=True, jobs=1, effects=(), seed=5, error_model="independent")
+    workflow.sample(campaign, damper(), settings, out=out)
     return read_tree(out / "results.nc")
 
 

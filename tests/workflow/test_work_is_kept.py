@@ -26,7 +26,7 @@ from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError, UnfinishedError
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness")))
-SETTINGS = Settings(quick=True, jobs=1, effects=EFFECTS, seed=5)
+SETTINGS = Settings(quick=True, jobs=1, effects=EFFECTS, seed=5, error_model="independent")
 FAULT = "NameError: name 'dahl_friction_memory' is not defined"
 
 
@@ -249,7 +249,7 @@ def test_how_much_is_drawn_has_no_say_in_what_is_missing(campaign, tmp_path, mon
         workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
     without_draws(monkeypatch)
     said: list[str] = []
-    settings = replace(SETTINGS, quick=False, effective_size=9, command="again")
+    settings = replace(SETTINGS, quick=False, effective_size=10, command="again")
     workflow.close(campaign, damper(), settings, out=tmp_path, callback=said.append)
     assert said[0].startswith("go on after round 2")
     assert not any(text.startswith(("round", "start anew")) for text in said)
