@@ -10,6 +10,7 @@ from ._base import (
 )
 from ._catalogue import (
     CatalogueErrors as CatalogueErrors,
+    Linearised as Linearised,
 )
 from ._correlated import (
     CorrelatedErrors as CorrelatedErrors,
