@@ -247,7 +247,8 @@ class InitialState:
             for _ in range(MAXIMUM_HALVINGS):
                 one[0, columns, 0] = base + fraction * step
                 self._evaluate(one, where, only, g, gz)
-                after = float(np.sum((g[0, rows, 0] / unit) ** 2))
+                with np.errstate(over="ignore"):  # a step so far off is not taken
+                    after = float(np.sum((g[0, rows, 0] / unit) ** 2))
                 if self._admissible(one, where) and (after < before or before < 1e-24):
                     break
                 fraction *= 0.5

@@ -285,7 +285,7 @@ def say(text):
         os.kill(os.getpid(), signal.SIGKILL)
 
 effects = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness")))
-settings = Settings(quick=True, jobs=1, effects=effects, seed=5)
+settings = Settings(quick=True, jobs=1, effects=effects, seed=5, error_model="independent")
 workflow.close({campaign!r}, damper(), settings, out={out!r}, callback=say)
 """
 
