@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+import scipy.fft
 from scipy import optimize, stats
 from scipy.special import expit
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
-from bayesoleo.data._noise import PeriodicAverage, periodic_average
+from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, without_masked
 from bayesoleo.discovery._hold_out_error import Prediction, sample_noise
@@ -30,6 +31,8 @@ from bayesoleo.solvers._orbit import Status
 
 #: Probability that white noise is taken for coloured, over all outputs.
 COLOUR_FALSE_ALARM = 1e-3
+#: Numbers of lines whose power is compared with that of noise.
+LEADING = (1, 2, 3, 5, 8, 13, 21, 34, 100, 10**9)
 #: Least part of a signature beside the model's parameters by which it is normalised: an effect that
 #: they imitate more closely is believed to be at most a hundred times its remainder.
 LEAST_BESIDE = 0.01
@@ -181,6 +184,51 @@ def _spectrum(angle: Array, share: float, steps: float) -> Array:
     a = np.exp(-steps)
     process = -np.expm1(-2 * steps) / (1 - 2 * a * np.cos(angle) + a * a)
     return np.asarray((1 - share) + share * process)
+
+
+def more_than_noise_p(fit: ModelFit, noise: Noise) -> float:
+    """Probability that noise alone repeats as the residual does, by its slowest lines.
+
+    Sums of squares of ever more lines are compared with what the noise lets expect: harmonics of
+    periodic runs, pairs of lines of a cosine transform of transients. The least probability counts:
+    noise alone is below one tenth in about one campaign of four.
+
+    Parameters
+    ----------
+    fit : ModelFit
+    noise : Noise
+        Of the outputs.
+    """
+    chances = [1.0]
+    for b in range(len(fit.predictor.outputs)):
+        powers, free = [], 0.0
+        for r, record in enumerate(fit.records):
+            left = fit.predictor.runs[r].measured[b] - fit.predictions[r].y[b]
+            power, own = _line_powers(record, without_masked(record, left), noise, b)
+            powers.append(power)
+            free += own
+        for count in LEADING:
+            some = np.concatenate([power[:count] for power in powers])
+            chances.append(float(stats.f.sf(some.mean(), 2 * some.size, free)))
+    return min(chances)
+
+
+def _line_powers(record: Record, left: Array, noise: Noise, b: int) -> tuple[Array, float]:
+    """Power of what is left of an output by line, in units of its noise, and how well that is
+    known in degrees of freedom."""
+    if not record.periodic:
+        power = scipy.fft.dct(left, norm="ortho")[: 2 * (left.size // 2)] ** 2
+        return np.asarray(power.reshape(-1, 2).mean(axis=1) / noise.sigma[b] ** 2), float(left.size)
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    average = periodic_average(left, step, record.frequency)
+    power = np.abs(average.coefficients[1:]) ** 2 * average.samples / 4
+    if not noise.colour[b][0] > 0:
+        return power / average.sigma**2, float(average.samples - average.number)
+    # The noise of the run itself next to each harmonic, of which less is known.
+    level = noise_spectrum(left - average.values, record.periods).level
+    order = np.arange(1, average.coefficients.size)
+    near = level[np.minimum(order * record.periods, level.size - 1)]
+    return power / np.maximum(near, 1e-300), 4.0 * HARMONICS * (record.periods - 1)
 
 
 # -- signatures ------------------------------------------------------------------------------------

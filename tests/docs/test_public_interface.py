@@ -110,12 +110,20 @@ def _resolved(namespace: dict[str, typing.Any], name: str) -> object:
     """What a name stands for, also where it is imported for type checkers only."""
     if name in namespace:
         return namespace[name]
-    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[namespace["__name__"]]))):
-        if isinstance(node, ast.ImportFrom):
-            for alias in node.names:
-                if (alias.asname or alias.name) == name:
-                    return getattr(import_module(str(node.module)), alias.name, None)
-    return None
+    module, original = _imports(namespace["__name__"]).get(name, ("", ""))
+    return getattr(import_module(module), original, None) if module else None
+
+
+@cache
+def _imports(module: str) -> dict[str, tuple[str, str]]:
+    """Module and name there of each name that a module imports, for type checkers too."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {
+        alias.asname or alias.name: (str(node.module), alias.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
 
 
 def _private_types(value: object, seen: set[int]) -> Iterator[type]:
