@@ -39,6 +39,8 @@ SEARCHING = 0.25
 #: Evaluations of the log density at which a quick run ends, converged or not, but not before this
 #: number of steps of each walker: minutes, where a motion takes milliseconds.
 QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+#: Draws that are handed on at least, where each one costs a factorisation for each run.
+ENOUGH = 4_000
 
 
 @dataclass(frozen=True)
@@ -366,11 +368,26 @@ def _quality(kept: list[Segment], group: Ensembles) -> Quality:
     )
 
 
+def _every(group: Ensembles, quality: Quality, draws: int) -> int:
+    """Of how many draws one is handed on; all are, unless each one costs a factorisation a run."""
+    errors = getattr(group.log_density, "errors", None)
+    if errors is None or not errors.over_runs:
+        return 1
+    # A quarter of the autocorrelation time loses a hundredth of the information at most.
+    return int(max(1, min(draws // ENOUGH, quality.times.min() / 4)))
+
+
 def _samples(
     segments: list[Segment], group: Ensembles, quality: Quality, short: list[str]
 ) -> Samples:
     kept = [s for s in segments if s.phase == "kept"]
     coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
+    every = _every(group, quality, coords.shape[0] * coords.shape[1])
+    # The last draw of each few, with what failed on the way to all of them.
+    first = np.arange(coords.shape[1] % every, coords.shape[1], every)
+    last = first + every - 1
+    failed = np.concatenate([s.failed for s in kept])[coords.shape[1] % every :]
+    coords = coords[:, last]
     chains, draws, dimension = coords.shape
     natural = group.log_density.natural(coords.reshape(-1, dimension))
     proposed = sum((s.proposed for s in kept), start=Counter[str]())
@@ -381,8 +398,8 @@ def _samples(
         names=group.log_density.names,
         runs=group.log_density.runs,
         draws=natural.reshape(chains, draws, dimension),
-        log_density=np.concatenate([s.log_density for s in kept]).T,
-        log_likelihood=np.concatenate([s.by_run for s in kept]).swapaxes(0, 1),
+        log_density=np.concatenate([s.log_density for s in kept])[last].T,
+        log_likelihood=np.concatenate([s.by_run for s in kept])[last].swapaxes(0, 1),
         ensemble=np.repeat(np.arange(group.ensembles), group.walkers),
         start=group.log_density.natural(segments[0].coords[0]),
         mixture=kept[-1].mixture,
@@ -393,7 +410,7 @@ def _samples(
         evaluations=sum(s.evaluations for s in segments),
         failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
         branch_jumps=sum(s.branch_jumps for s in segments),
-        failed=np.concatenate([s.failed for s in kept]),
+        failed=failed.reshape(draws, every, -1).sum(axis=1),
         reached=not short,
         warning="; ".join(short),
     )
