@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import xarray as xr
@@ -34,7 +35,13 @@ from bayesoleo.estimation._multistart import multistart
 from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._hierarchy import hierarchical
-from bayesoleo.posterior._laplace import Mode, find_mode, laplace_mixture, start_coordinates
+from bayesoleo.posterior._laplace import (
+    Mode,
+    find_mode,
+    laplace_mixture,
+    mixture_of,
+    start_coordinates,
+)
 from bayesoleo.posterior._log_density import LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._unknowns import PlainUnknowns
@@ -192,7 +199,10 @@ def chosen_for(
     if word == CATALOGUE:
         return inference
     word, reason = error_model_by(
-        noise.p_value, lambda _: linearised_of(fit).log_odds, fit.predictor.outputs, undecided
+        noise.p_value,
+        lambda _: linearised_of(fit.problem, fit.point.theta).log_odds,
+        fit.predictor.outputs,
+        undecided,
     )
     if word == CATALOGUE:
         word, reason = _unless_priors_decide(fit, noise, reason)
@@ -207,7 +217,7 @@ def _unless_priors_decide(fit: ModelFit, noise: Noise, reason: str) -> tuple[str
     A flexible discrepancy can explain anything, so that the estimate goes where the priors want it.
     """
     before = fit.problem.evaluate(fit.point.theta).residual
-    after = fit.problem.evaluate(_shifted(fit)[0])
+    after = fit.problem.evaluate(_shifted(fit.problem, fit.point.theta)[0])
     for b, output in enumerate(fit.predictor.outputs):
         signal = float(np.std(np.concatenate([run.measured[b] for run in fit.predictor.runs])))
         left = np.inf
@@ -302,15 +312,14 @@ def function_errors(problem: ResidualProblem, theta: Array, word: str) -> tuple[
     return plain, f"{plain} errors, chosen because neighbouring residuals are not alike"
 
 
-def linearised_of(fit: ModelFit) -> Linearised:
+def linearised_of(problem: CampaignProblem, theta: Array) -> Linearised:
     """Posterior about an estimate with effects of the catalogue and a smooth remainder.
 
     Unknowns are in units of their priors' standard deviations. See
-    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the fit's problem has signatures.
+    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the problem has signatures.
     """
-    problem = fit.problem
     errors = CatalogueErrors(Frame.of(problem))
-    evaluation, counts = problem.evaluate(fit.point.theta), problem.counts
+    evaluation, counts = problem.evaluate(theta), problem.counts
     ends = np.cumsum(counts, axis=0)
 
     def by_run(columns: Sequence[Array]) -> list[list[Array]]:
@@ -321,7 +330,7 @@ def linearised_of(fit: ModelFit) -> Linearised:
 
     scale = PriorScale.of(problem.priors, problem.names)
     # Unknowns in units of their priors' deviations, lest the system depend on units.
-    pull = scale.slope(fit.point.theta) * scale.sd / scale.unit(fit.point.theta)
+    pull = scale.slope(theta) * scale.sd / scale.unit(theta)
     sensitivity = by_run([(j * scale.sd).T for j in evaluation.sensitivity])
     return errors.linearised(
         sensitivity, by_run(evaluation.residual), scale.root.T @ scale.root, pull
@@ -336,30 +345,29 @@ def mode_of(density: LogDensity, fit: ModelFit) -> Mode:
     plain = isinstance(density.unknowns, PlainUnknowns)
     if density.errors.word != CATALOGUE or not plain:
         return find_mode(density, start_coordinates(density, fit.point.theta))
-    theta, found = _shifted(fit)
+    theta, found, _ = _shifted(fit.problem, fit.point.theta)
     sd = np.array([prior.sd for prior in fit.problem.priors])
     fit.problem.freeze(theta)
     return _summary_mode(density, theta, found.covariance * np.outer(sd, sd))
 
 
-def _shifted(fit: ModelFit) -> tuple[Array, Linearised]:
-    """Mean of the posterior under the catalogue's errors, and the last linearisation."""
-    sd = np.array([prior.sd for prior in fit.problem.priors])
-    low, high = np.array([prior.support for prior in fit.problem.priors], dtype=float).T
-    theta = fit.point.theta
+def _shifted(problem: CampaignProblem, theta: Array) -> tuple[Array, Linearised, Array]:
+    """Mean of the posterior under the catalogue's errors, the last linearisation and its place."""
+    sd = np.array([prior.sd for prior in problem.priors])
+    low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
     for _ in range(_PASSES):
-        found = linearised_of(replace(fit, point=replace(fit.point, theta=theta)))
+        found, place = linearised_of(problem, theta), theta
         step = found.shift * sd
         with np.errstate(divide="ignore", invalid="ignore"):
             room = np.where(step > 0, (high - theta) / step, (low - theta) / step)
         length = min(1.0, 0.5 * float(np.nanmin(np.where(step == 0, np.inf, room))))
         trial = theta + length * step
-        if not fit.problem.evaluate(trial).status.ok:
+        if not problem.evaluate(trial).status.ok:
             break
         theta = trial
         if np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd):
             break
-    return theta, found
+    return theta, found, place
 
 
 def _summary_mode(density: LogDensity, theta: Array, covariance: Array) -> Mode:
@@ -399,6 +407,8 @@ def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int 
     Mixture
         The solver is anchored at its heaviest mode, whatever was visited on the way.
     """
+    if density.errors.word == CATALOGUE and isinstance(density.unknowns, PlainUnknowns):
+        return _catalogue_mixture(density, theta)
     begins = [theta]
     if starts:
         rng = np.random.default_rng(seed)
@@ -408,6 +418,28 @@ def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int 
     if isinstance(density.problem, CampaignProblem):
         density.problem.freeze(density.unknowns.theta(heaviest)[0])
     return mixture
+
+
+def _catalogue_mixture(density: LogDensity, theta: Array) -> Mixture:
+    """One component for each of the likeliest effects that act alone, and one for all else.
+
+    These are what the posterior under errors of the catalogue is made of.
+    """
+    problem = cast(CampaignProblem, density.problem)
+    centre, found, origin = _shifted(problem, theta)
+    sd = np.array([prior.sd for prior in problem.priors])
+    low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
+    modes = []
+    for weight, mean, covariance in found.groups:
+        place = origin + mean * sd
+        inside = np.all((place > low) & (place < high)) and problem.evaluate(place).status.ok
+        if inside and weight > 0:
+            mode = _summary_mode(density, place, covariance * np.outer(sd, sd))
+            modes.append(replace(mode, log_weight=float(np.log(weight))))
+    if not modes:
+        modes = [_summary_mode(density, centre, found.covariance * np.outer(sd, sd))]
+    problem.freeze(centre)
+    return mixture_of(modes)
 
 
 def at_mode(

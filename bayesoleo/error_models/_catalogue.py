@@ -75,6 +75,8 @@ LEAST_ALONE, ALONE = 0.03, 8
 #: Sizes over the noise at which effects and remainder are looked for.
 EFFECTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 REMAINDERS = (0.03, 0.1, 0.3, 1.0, 3.0)
+#: Effects that act alone of which each has a group of its own, and its least probability.
+GROUPS, LEAST_GROUP = 7, 0.01
 _LOG_2_PI = float(np.log(2 * np.pi))
 
 
@@ -120,11 +122,15 @@ class Linearised:
     shift : ndarray, shape (l,)
         Mean, from the point of linearisation.
     covariance : ndarray, shape (l, l)
+    groups : tuple of (weight, mean, covariance)
+        Parts of the mixture: one for each of the likeliest effects that act alone, and one for all
+        others.
     """
 
     log_odds: float
     shift: Array
     covariance: Array
+    groups: tuple[tuple[float, Array, Array], ...] = ()
 
 
 class CatalogueErrors(ErrorModel):
@@ -411,17 +417,11 @@ class CatalogueErrors(ErrorModel):
         height = height - np.log(len(found))
         # Without anything but noise: the first component, which is no evidence of more.
         more = float(logsumexp(height[1:])) - none
-        weight = np.exp(height - logsumexp(height))
-        mean = np.concatenate([one[1] for one in found])
-        centre = weight @ mean
-        spread = sum(
-            np.einsum("c,cij->ij", weight[first : first + len(one[0])], one[2])
-            for first, one in zip(
-                np.cumsum([0, *(len(one[0]) for one in found[:-1])]), found, strict=True
-            )
-        )
-        away = (mean - centre) * np.sqrt(weight)[:, None]
-        return Linearised(more, centre, np.asarray(spread + away.T @ away))
+        weight = np.exp(height - logsumexp(height)).reshape(len(found), -1)
+        mean = np.stack([one[1] for one in found])
+        spread = np.stack([one[2] for one in found])
+        _, centre, covariance = _moments(weight, mean, spread)
+        return Linearised(more, centre, covariance, _grouped(weight, mean, spread))
 
     def _components(
         self,
@@ -595,6 +595,35 @@ class CatalogueErrors(ErrorModel):
         else:
             position = since / since[-1] if since[-1] > 0 else since
         return self._signatures.at(run, position, periodic)
+
+
+def _moments(weight: Array, mean: Array, spread: Array) -> tuple[float, Array, Array]:
+    """Weight, mean and covariance of a mixture with weights (...), means (..., l), covariances."""
+    total = float(weight.sum())
+    part = weight.ravel() / max(total, 1e-300)
+    means = mean.reshape(part.size, -1)
+    centre = part @ means
+    away = (means - centre) * np.sqrt(part)[:, None]
+    within = np.tensordot(part, spread.reshape(part.size, *spread.shape[-2:]), 1)
+    return total, centre, np.asarray(within + away.T @ away)
+
+
+def _grouped(weight: Array, mean: Array, spread: Array) -> tuple[tuple[float, Array, Array], ...]:
+    """Moments of each of the likeliest effects that act alone, and of all else.
+
+    Components ``(sizes, 1 + q ALONE)`` have no effect that acts alone first, then one effect at
+    each of its sizes.
+    """
+    count = (weight.shape[1] - 1) // ALONE
+    effect = np.repeat(np.arange(count), ALONE)
+    by_effect = np.bincount(effect, weight[:, 1:].sum(axis=0), count)
+    likely = np.argsort(-by_effect, kind="stable")[:GROUPS]
+    likely = likely[by_effect[likely] > LEAST_GROUP]
+    group = np.append(-1, np.where(np.isin(effect, likely), effect, -1))
+    return tuple(
+        _moments(weight[:, group == k], mean[:, group == k], spread[:, group == k])
+        for k in (-1, *likely)
+    )
 
 
 def _none(frame: Frame) -> Signatures:

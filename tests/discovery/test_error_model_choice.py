@@ -65,7 +65,7 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     monkeypatch.setattr(
         inference,
         "_shifted",
-        lambda fit: (0.0 * fit.point.theta, Linearised(9.0, fit.point.theta, np.eye(3))),
+        lambda problem, theta: (0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
     )
     found = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
     assert found.error_model == "independent"
