@@ -17,6 +17,8 @@ import numpy as np
 from bayesoleo.effects._catalogue import candidates, catalogue
 from bayesoleo.effects._effect import Candidate, Effect
 from bayesoleo.effects._parts import Scales
+from bayesoleo.effects._places import PART
+from bayesoleo.effects._terms import FAMILY as TERMS, terms_of
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.estimation._nuisance import Nuisance
 from bayesoleo.model._drive import driven_by
@@ -308,17 +310,26 @@ class Assembly:
         """Every effect at every place where it applies, ready to be scored.
 
         An effect that leaves no unique inverse for the drive is left out: it cannot be solved for.
+        So is a change of a term that an effect has added: that term is itself a supposition, and
+        two that lean on each other follow whatever a third one would explain.
         """
         found, driven = [], self.model()
         for effect in catalogue() if effects is None else effects:
             base = driven if effect.on_channels else self.native  # made once for all channels
             for candidate in candidates(base, scales, (effect,)):
+                if candidate.family == TERMS and not self._declares(candidate.target):
+                    continue
                 try:
                     assembly = self._with_candidate(effect, candidate, scales, base)
                     found.append(Option(candidate, assembly, assembly.model()))
                 except ModelError:
                     continue
         return found
+
+    def _declares(self, target: str) -> bool:
+        """Whether the term at a target of the family ``dependence`` is of the declared model."""
+        terms = terms_of(self.declared or self.native)
+        return target in terms or target.rpartition(PART)[0] in terms
 
     def option(self, effect: Effect, target: str, scales: Scales) -> Option:
         """One effect at one place, ready to be scored or estimated.

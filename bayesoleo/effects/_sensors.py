@@ -289,13 +289,15 @@ LAG = _sensor(
     "4.23: step response time",
 )
 # The time constant is a shape: at the null of a time constant a long lag looks like a short delay.
+# A part below zero would be a sensor that leads: what relaxes in the process, such as a gas that
+# loses heat, looks like that.
 FIRST_ORDER_LAG = Effect(
     id="first_order_lag",
     family="sensor",
     title="First-order lag of a sensor (of any length)",
     formula=r"m = y + a (w - y), \quad \tau \dot w + w = y",
     amplitudes=(
-        Amplitude("first_order_lag", "", "a", "part that lags; one where the whole sensor does"),
+        Amplitude("first_order_lag", "", "a", "part that lags; one where the whole sensor does", 1),
     ),
     places=lambda model: tuple(model.outputs),
     change=_follow,

@@ -8,9 +8,11 @@ behind a gap, and a temperature sensor of first order. The true models are writt
 equations, independently of the catalogue. The whole catalogue is searched with default settings;
 nothing is sampled.
 
-Run as ``python tests/benchmarks/structure_cases.py [--json] [--case NAME] [--seed 0]``. It prints
-by case whether the effect was named (``named``: it is the only one, or in the class of the only
-one), its size with the 95 % interval and the truth, and how many base parameters lie within theirs.
+Run as ``python tests/benchmarks/structure_cases.py [--json] [--case NAME] [--seed 0] [--seeds 1]
+[--alone]``. It prints by case, and by seed where there are several, whether the effect was named
+(``named``: it is the only one, or in the class of the only one), its size with the 95 % interval
+and the truth, and how many base parameters lie within theirs. With ``--alone`` no other effect is
+offered, so that intervals are seen over many seeds in little time.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from bayesoleo.data import load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._loop import ClosedLoop, close_loop
+from bayesoleo.effects import find_effect
 from bayesoleo.model import Condition, Dof, Model, Output, Parameter
 from bayesoleo.prediction import RunPlan, motion, simulate_run
 from bayesoleo.prediction._records import Record
@@ -411,10 +414,14 @@ CASES = {
 # -- what the loop makes of them -------------------------------------------------------------------
 
 
-def closed(case: Case, seed: int = 0) -> ClosedLoop:
-    """The loop on a new campaign of a case."""
+def closed(case: Case, seed: int = 0, *, alone: bool = False) -> ClosedLoop:
+    """The loop on a new campaign of a case; ``alone`` offers it the true effect only."""
     numerics, roles = Numerics(jobs=1, backend="numpy"), assign(case.records(seed))
-    return close_loop(Assembly(case.declared, case.drive), roles, numerics)
+    own = Assembly(case.declared, case.drive)
+    if not alone:
+        return close_loop(own, roles, numerics)
+    effects = (find_effect(case.effect),)
+    return close_loop(own, roles, numerics, effects=effects, max_effects=1, nonparametric=False)
 
 
 def judged(case: Case, loop: ClosedLoop) -> dict[str, Any]:
@@ -460,13 +467,17 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one flat JSON object")
     parser.add_argument("--case", choices=CASES, help="of one case only")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--seeds", type=int, default=1, help="how many, from that one on")
+    parser.add_argument("--alone", action="store_true", help="offer the true effect only")
     options = parser.parse_args()
     flat: dict[str, Any] = {}
     for name in [options.case] if options.case else CASES:
-        case, begin = CASES[name](), time.perf_counter()
-        result = judged(case, closed(case, options.seed))
-        result["seconds"] = round(time.perf_counter() - begin, 1)
-        flat |= {f"{name}_{key}": value for key, value in result.items()}
+        for seed in range(options.seed, options.seed + options.seeds):
+            case, begin = CASES[name](), time.perf_counter()
+            result = judged(case, closed(case, seed, alone=options.alone))
+            result["seconds"] = round(time.perf_counter() - begin, 1)
+            prefix = name if options.seeds == 1 else f"{name}_{seed}"
+            flat |= {f"{prefix}_{key}": value for key, value in result.items()}
     if options.json:
         print(json.dumps(flat))
     else:

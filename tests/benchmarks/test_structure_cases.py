@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
+from scipy import stats
 from structure_cases import CASES, behind_gap, closed, judged
+
+#: Campaigns over which intervals are judged.
+CAMPAIGNS = 12
 
 
 def test_a_slider_behind_a_gap_gives_way_where_the_gap_is_taken_up():
@@ -17,11 +23,28 @@ def test_a_slider_behind_a_gap_gives_way_where_the_gap_is_taken_up():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", CASES)
-def test_the_effect_is_named_with_its_size_and_the_base(name):
-    """A seed for which every interval of 95 % holds; over seeds one in twenty misses."""
+def test_the_effect_is_named(name, seed):
     case = CASES[name]()
-    found = judged(case, closed(case, seed=2))
+    found = judged(case, closed(case, seed))
     assert found["named"], found["added"]
-    assert found["size_inside"]
-    assert found["base_inside"] >= found["base"] - 1, found["outside"]
+    # Intervals are judged over campaigns, below; one of them misses by three sd in 370.
+    assert found["base_inside"] >= found["base"] - 3, found["outside"]
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", CASES)
+def test_intervals_beside_the_effect_hold_over_campaigns(name):
+    """Each interval of 95 % misses in one campaign of twenty: no parameter misses more often than
+    chance allows once in a thousand times, all parameters of all cases together."""
+    case, missed = CASES[name](), Counter()
+    for seed in range(CAMPAIGNS):
+        found = judged(case, closed(case, seed, alone=True))
+        assert found["first"], (seed, found["added"])
+        missed.update(found["outside"])
+        missed.update([] if found["size_inside"] else [case.size])
+    intervals = len(CASES) * (found["base"] + 1)
+    most = stats.binom.isf(1e-3 / intervals, CAMPAIGNS, 0.05)
+    assert max(missed.values(), default=0) <= most, missed

@@ -151,6 +151,21 @@ def test_an_effect_that_is_in_is_not_offered_again(oscillator):
     assert [o.candidate.target for o in again] == ["force"]
 
 
+def test_only_terms_of_the_declared_model_are_said_to_depend_on_something():
+    """A term that an effect added is a supposition; another one about it would lean on that."""
+    effects = [find_effect(f"{kind}_dependent_term") for kind in ("direction", "stroke")]
+
+    def places(assembly: Assembly) -> set[str]:
+        return {option.candidate.target for option in assembly.options(SCALES, effects)}
+
+    declared = Assembly(system("f16n2d2"), "displacement")
+    grown = add(declared, "coulomb_friction")
+    assert places(declared)
+    assert places(grown) == places(declared)
+    # A user's model that has the term is asked about it.
+    assert places(Assembly(grown.native, "displacement")) > places(declared)
+
+
 def test_options_that_leave_no_inverse_are_skipped():
     """A term in the square of the force has no unique inverse for a displacement drive."""
 

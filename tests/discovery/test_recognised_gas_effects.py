@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._loop import close_loop
 from bayesoleo.discovery._scales import scales_of
 from bayesoleo.discovery._score_tests import classes, score_all
 from bayesoleo.discovery._state import fit_state
@@ -176,15 +177,39 @@ EFFECTS = {
 }
 
 
-#: Gas is heated as it is compressed: what follows the stroke nearly follows the temperature.
-CONFOUNDED = {"stroke_dependent_term": "temperature_dependent_term"}
+#: What follows the stroke nearly follows the temperature of the gas, which compression heats: a
+#: score at the null does not tell them apart, an estimate does.
+ESTIMATED = {"stroke_dependent_term"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", sorted(EFFECTS.keys() - ESTIMATED))
 def test_effect_in_an_oleo_is_first_or_in_the_first_class(effect, tmp_path):
     found, _, _ = first_class(tmp_path, system("f16n2d2"), EFFECTS[effect])
-    assert {effect, CONFOUNDED.get(effect, effect)} & set(found)
+    assert effect in found
+
+
+def first_round(folder, oleo):
+    records = campaign(folder, oleo).records
+    assembly = Assembly(system("f16n2d2"), "displacement")
+    return close_loop(assembly, assign(records), NUMERICS, max_effects=1, nonparametric=False)
+
+
+@pytest.mark.slow
+def test_a_friction_that_changes_along_the_stroke_is_no_other(tmp_path):
+    loop = first_round(tmp_path, EFFECTS["stroke_dependent_term"])
+    assert loop.effects == ("stroke_dependent_term",)
+    assert "temperature_dependent_term" not in loop.rounds[0].accepted.same
+
+
+@pytest.mark.slow
+def test_a_small_change_along_the_stroke_may_follow_the_temperature(tmp_path):
+    """A sixth of that change: the data are about equally likely under both, and a class says so."""
+    weak = Oleo(friction=1e-4, factors=lambda x, v, t, p: (1.0, 1 + 0.5 * x))
+    loop = first_round(tmp_path, weak)
+    found = loop.rounds[0].accepted
+    assert {"stroke_dependent_term", "temperature_dependent_term"} <= {found.effect, *found.same}
+    assert not loop.certain
 
 
 @pytest.mark.slow

@@ -310,6 +310,19 @@ def test_a_first_order_lag_answers_a_sine_as_it_should(scales):
     assert np.allclose(shown(*values.values()), answer.real, atol=1e-12)
 
 
+def test_a_sensor_lags_and_does_not_lead(scales):
+    """A gas that loses heat answers quick strokes more stiffly than slow ones: a sensor that did
+    so would show more than there is."""
+    model = Model(
+        "law",
+        inputs={"position": "m"},
+        parameters={"stiffness": Parameter(1.0, "N/m", sd=1.0)},
+        outputs={"force": "stiffness*position"},
+    )
+    found = find_effect("first_order_lag").extend(model, "force", scales)
+    assert found.sign["first_order_lag_force"] == 1
+
+
 def test_a_gauge_that_senses_the_absolute_pressure(scales):
     effect = find_effect("absolute_pressure_gain")
     model = system("f16n2d2")
