@@ -352,7 +352,11 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
         "headline": sentences.headline(summary),
         "badge": sentences.badge(summary),
-        "structures": {"lines": structures.section(summary), "table": structures.table(summary)},
+        "structures": {
+            "lines": structures.section(summary),
+            "table": structures.table(summary),
+            "parameters": structures.parameters(summary),
+        },
         "extended": sentences.added(summary),
         "unfinished": [*sentences.unfinished(summary), *drawing.failed],
         "role": sentences.role_shown(summary),

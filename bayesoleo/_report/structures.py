@@ -14,6 +14,7 @@ from bayesoleo._report.tables import Table
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.plots._discovery import SHOWN, format_probability, name
+from bayesoleo.plots._style import Scale, engineering, format_number
 
 #: More probable than not.
 LIKELY = 0.5
@@ -195,6 +196,32 @@ def table(summary: Mapping[str, Any]) -> Table | None:
         rows.append(["all others", format_probability(rest), ""])
     head = ["what is missing", "probability", "from"]
     return Table(head, rows, 1, frozenset(marked), LEAD)
+
+
+def parameters(summary: Mapping[str, Any]) -> Table | None:
+    """Parameters of the declared model: its estimate, the final one, and the average."""
+    found = known(summary)
+    if found is None or not found.get("parameters"):
+        return None
+    rows = []
+    for parameter, one in found["parameters"].items():
+        average = one["averaged"]
+        scale = engineering(one["unit"], abs(average["mean"]))
+        cells = [_with_sd(one[key], scale) for key in ("declared", "final", "averaged")]
+        low, high = (
+            format_number(scale.factor * end, scale.factor * average["sd"])
+            for end in average["interval"]
+        )
+        rows.append([parameter, *cells, f"{low} … {high}", scale.unit])
+    head = ["parameter", "declared model", "final model", "averaged", "90 % interval", "unit"]
+    return Table(head, rows)
+
+
+def _with_sd(estimate: Mapping[str, Any] | None, scale: Scale) -> str:
+    if estimate is None:
+        return "–"
+    sd = scale.factor * estimate["sd"]
+    return f"{format_number(scale.factor * estimate['mean'], sd)} ± {sd:.2g}"
 
 
 def section(summary: Mapping[str, Any]) -> list[str]:

@@ -64,6 +64,7 @@ from ._state import (
     fit_state as fit_state,
 )
 from ._structures import (
+    AveragedParameter as AveragedParameter,
     Structure as Structure,
     StructurePosterior as StructurePosterior,
     StructurePrior as StructurePrior,

@@ -1,4 +1,5 @@
-r"""Residuals and changes of the outputs by spectral line, where the noise is independent.
+r"""Residuals, changes of the outputs and linearised models by spectral line, where the noise is
+independent.
 
 Noise that is stationary has nearly independent coefficients in a Fourier basis, each with the
 variance that its spectrum gives. Measured noise of any colour is therefore diagonal here. A
@@ -15,14 +16,16 @@ distribution of the coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.fft
 
 from bayesoleo._types import Array, Integers
+from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.prediction._records import Record
 
 #: Harmonics of a periodic run, and lines of a transient, that are kept at most.
@@ -34,6 +37,8 @@ FEWEST_HARMONICS, BEYOND = 60, 1e-5
 FIRST_COSINES = 300
 #: A measured level of few lines is averaged with that of all lines as if it had so many more.
 PRIOR_LINES = 8.0
+#: Errors of the inputs' harmonics that are kept in a run.
+MOST_INPUTS = 40
 #: Lengths, in cycles, of the squared exponentials whose mean is the spectrum of a smooth remainder.
 SMOOTHNESS = (0.02, 0.05, 0.2)
 
@@ -106,14 +111,23 @@ class RunLines:
         return np.concatenate([chosen.real, chosen.imag], axis=-1)
 
     def level(self, error: RunError) -> Array:
-        """Variance of the noise on each coefficient of an output, SI, shape (size,)."""
-        spectrum = error.spectrum
-        if not self.record.periodic or spectrum is None:
+        """Variance of the noise on each coefficient of an output, SI, shape (size,).
+
+        Rounding that repeats from period to period lies on the harmonics alone, where its power
+        grows with the number of periods.
+        """
+        spectrum, mean = error.spectrum, max(error.average.sigma, 1e-300) ** 2
+        if not self.record.periodic:
             return np.full(self.size, max(error.sigma, 1e-300) ** 2)
-        mean, free = error.sigma**2, max(2.0 * spectrum.lines, 1.0)
+        repeats = np.tile(self.lines % self.record.periods == 0, 2)
+        periods = error.average.samples / max(error.average.number, 1)
+        rounding = np.where(repeats, error.rounding**2 * periods, 0.0)
+        if spectrum is None:
+            return mean + rounding
+        free = max(2.0 * spectrum.lines, 1.0)
         level = (free * spectrum.level + PRIOR_LINES * mean) / (free + PRIOR_LINES)
         chosen = level[np.minimum(self.lines, level.size - 1)]
-        return np.maximum(np.tile(chosen, 2), 1e-6 * max(mean, 1e-300))
+        return np.maximum(np.tile(chosen, 2), 1e-6 * mean) + rounding
 
     def smooth(self) -> Array:
         """Variance on each coefficient of a smooth function of unit mean square, shape (size,)."""
@@ -177,29 +191,145 @@ class SpectralData:
         every = [np.std(run.measured, axis=1) for run in fit.predictor.runs]
         return np.asarray(np.max(every, axis=0))
 
-    def noise(
-        self,
-        errors: Mapping[tuple[str, str], RunError],
-        inputs: Callable[[int], Array] | None = None,
-    ) -> Array:
-        """Variance of the noise on each coefficient, shape (n,), SI.
+    def noise(self, errors: Mapping[tuple[str, str], RunError]) -> Array:
+        """Variance of the outputs' noise on each coefficient, shape (n,), SI.
 
         Parameters
         ----------
         errors : mapping of (run, output) to RunError
-        inputs : callable, optional
-            Change of the outputs ``(outputs, k, N)`` of a run, by its number, by one standard
-            deviation of each of its input's coefficients. Their variances are added; what they
-            have in common over lines and outputs is not counted.
         """
-        parts = []
+        levels = [
+            run.level(errors[run.record.label, output])
+            for run in self.runs
+            for output in self.outputs
+        ]
+        return np.concatenate(levels)
+
+    def input_noise(self, inputs: Callable[[int], Array]) -> tuple[Array, Array]:
+        """Errors of the outputs by noise of measured inputs.
+
+        An input's harmonic has one error, which all outputs and all their harmonics share. The
+        largest of these are therefore kept as they are. For a transient only some draws are known,
+        whose variances are taken.
+
+        Parameters
+        ----------
+        inputs : callable
+            Change of the outputs ``(outputs, k, N)`` of a run, by its number, by one standard
+            deviation of each of its inputs' coefficients, SI.
+
+        Returns
+        -------
+        ndarray, shape (k, n)
+            Changes by one standard deviation of each of the kept errors.
+        ndarray, shape (n,)
+            Variance by the others.
+        """
+        rows, variances = [], []
+        sizes = [run.size * len(self.outputs) for run in self.runs]
         for r, run in enumerate(self.runs):
-            moved = None if inputs is None else run.transformed(inputs(r))
-            for b, output in enumerate(self.outputs):
-                level = run.level(errors[run.record.label, output])
-                parts.append(level if moved is None else level + np.sum(moved[b] ** 2, axis=0))
-        return np.concatenate(parts)
+            moved = np.moveaxis(run.transformed(inputs(r)), 1, 0).reshape(-1, sizes[r])
+            order = np.argsort(-np.sum(moved**2, axis=1))
+            kept = order[: MOST_INPUTS if run.record.periodic else 0]
+            before, after = sum(sizes[:r]), sum(sizes[r + 1 :])
+            rows.append(np.pad(moved[kept], ((0, 0), (before, after))))
+            variances.append(np.sum(moved[order[kept.size :]] ** 2, axis=0))
+        return np.concatenate(rows), np.concatenate(variances)
 
     def smooth(self) -> Array:
         """Variance on each coefficient of a smooth remainder of unit mean square, shape (n,)."""
         return np.concatenate([np.tile(run.smooth(), len(self.outputs)) for run in self.runs])
+
+
+@dataclass(frozen=True)
+class EstimatedModel:
+    """An estimated model, about which structures are compared.
+
+    Parameters
+    ----------
+    fit : ModelFit
+    effects : mapping of (effect, target) to tuple of str
+        Those that it has, with the names of their amplitudes.
+    shapes : mapping of str to tuple of float
+        Scanned values of their shape parameters. A shape has a prior that is normal in its
+        logarithm, with the centre and the spread of the whole scan, as scores have.
+    """
+
+    fit: ModelFit
+    effects: Mapping[Added, tuple[str, ...]]
+    shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Outputs about an estimate.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        With the amplitudes of the anchor's effects at zero.
+    unknowns : ndarray, shape (l, n)
+        Columns of unknowns in units of their priors.
+    offset : ndarray, shape (l,)
+        Centres of their priors.
+    own : ndarray, shape (k, n)
+        Columns of the amplitudes of the anchor's effects.
+    names : tuple of str, length l
+    theta : ndarray, shape (l,)
+        Estimates, SI.
+    change : ndarray, shape (l, l)
+        Changes of the parameters (rows), SI, by the unknowns.
+    """
+
+    residual: Array
+    unknowns: Array
+    offset: Array
+    own: Array
+    names: tuple[str, ...]
+    theta: Array
+    change: Array
+
+
+def linearised(anchor: EstimatedModel, data: SpectralData) -> Linearised:
+    """Residual and columns about an anchor."""
+    fit = anchor.fit
+    problem, theta = fit.problem, fit.point.theta
+    place = [fit.predictor.layout.names.index(name) for name in problem.names]
+    rows = data.columns([p.sensitivity[:, place] for p in fit.predictions])
+    amplitudes = [
+        k
+        for names in anchor.effects.values()
+        for k, name in enumerate(problem.names)
+        if name.split("[")[0] in names
+    ]
+    rest = [k for k in range(len(problem.names)) if k not in amplitudes]
+    scale = PriorScale.of(problem.priors, problem.names)
+    precision = (scale.root.T @ scale.root)[np.ix_(rest, rest)]
+    unit, slope = scale.unit(theta)[rest], np.nan_to_num(scale.slope(theta)[rest])
+    for k, index in enumerate(rest):
+        scan = anchor.shapes.get(problem.names[index])
+        if scan is not None:
+            centre, spread = scan_prior(scan)
+            unit[k], slope[k] = theta[index] * spread, (centre - np.log(theta[index])) / spread
+    root = np.linalg.cholesky(precision)  # lower, of the precision: root' delta has unit variance
+    unknowns = np.linalg.solve(root, rows[rest] * unit[:, None])
+    offset = np.linalg.solve(root, slope)
+    own = rows[amplitudes]
+    return Linearised(
+        # The prior of an effect's amplitude is centred on its absence, not on its estimate.
+        data.residual(fit) + theta[amplitudes] @ own,
+        unknowns,
+        offset,
+        own,
+        tuple(problem.names[k] for k in rest),
+        theta[rest],
+        unit[:, None] * np.linalg.inv(root).T,
+    )
+
+
+def scan_prior(values: Sequence[float]) -> tuple[float, float]:
+    """Centre and standard deviation of the logarithm of a shape, as wide as its scan."""
+    logs = np.log(np.asarray(values, dtype=float))
+    # Each value stands for the range half way to its neighbours.
+    step = np.mean(np.diff(logs)) if logs.size > 1 else 1.0
+    return float(logs.mean()), float((np.ptp(logs) + step) / np.sqrt(12.0))

@@ -34,6 +34,9 @@ from bayesoleo._types import Array, Integers
 SIZES, LAW_SIZES, SMOOTH_SIZES = 10, 5, 5
 #: Standard deviations by which the smallest change of interest differs from nothing.
 VISIBLE = 3.0
+#: Difference of a law from the effect that it resembles, as a part of the effect's size, and the
+#: spread of its logarithm.
+DIFFERENCE, DIFFERENCE_SPREAD = 0.4, 1.0
 _LOG_2 = float(np.log(2.0))
 
 
@@ -205,6 +208,72 @@ class Reduced:
             self.square - np.sum(first**2, axis=1),
             self.log_det + 2.0 * logs,
         )
+
+
+@dataclass(frozen=True)
+class Remainders:
+    """Covariances of what lies outside the catalogue.
+
+    Parameters
+    ----------
+    covariances : Covariances
+    weights : tuple of (pattern, law, weight)
+        Number of a covariance, number of a size of the law or None, and prior probability given
+        that there is something outside; the first of all stands for nothing outside.
+    laws : ndarray
+        Sizes of the law.
+    """
+
+    covariances: Covariances
+    weights: tuple[tuple[int, int | None, float], ...]
+    laws: Array
+
+    @property
+    def power(self) -> Array:
+        """Mean square of each, in units of the noise, shape (parts,)."""
+        covariances = self.covariances
+        levels = np.pad(covariances.levels, ((0, 0), (1, 0)))  # the first is none
+        smooth = np.array(
+            [np.mean([levels[b, k] for b, k in enumerate(p)]) for p in covariances.patterns]
+        )
+        law = [0.0 if j is None else float(self.laws[j] ** 2) for _, j, _ in self.weights]
+        return np.asarray(smooth[[k for k, _, _ in self.weights]] + np.array(law))
+
+    @classmethod
+    def of(cls, covariances: Covariances, laws: Array) -> Remainders:
+        """Half of what is outside is a function of phase alone, half a law with or without one."""
+        patterns, sizes = len(covariances.patterns), laws.size
+        together = range(1, 1 + covariances.levels.shape[1])
+        found: list[tuple[int, int | None, float]] = [(0, None, 0.0)]
+        found += [(k, None, 0.5 / (patterns - 1)) for k in range(1, patterns)]
+        found += [(0, j, 0.25 / sizes) for j in range(sizes)]
+        found += [(k, j, 0.25 / sizes / len(together)) for k in together for j in range(sizes)]
+        return cls(covariances, tuple(found), laws)
+
+    def parts(self, reduced: Reduced, keep: Sequence[int], law: Sequence[int]) -> Reduced:
+        """Some columns for each covariance in turn, after a law is integrated out."""
+        size = len(law)
+        patterns = [k for k, _, _ in self.weights]
+        grown = reduced.of_some(patterns, [*law, *keep])
+        power = np.array([0.0 if j is None else self.laws[j] ** 2 for _, j, _ in self.weights])
+        some = np.repeat(power[:, None], size, axis=1)
+        return grown.with_columns(range(size), some, range(size, size + len(keep)))
+
+    def split(self, logs: Array) -> tuple[Array, Array]:
+        """Log evidence without, and with something outside, from that of all parts (parts, ...)."""
+        weights = np.array([w for _, _, w in self.weights[1:]])
+        shape = (-1, *(1,) * (logs.ndim - 1))
+        return logs[0], logsumexp(logs[1:], axis=0, b=weights.reshape(shape))
+
+    def similar(self, logs: Array, sizes: Array) -> Array:
+        """Log evidence of a law that resembles an effect, from that of all parts and sizes of the
+        effect (parts, ..., sizes): it differs from it by some part of the effect's size."""
+        ratio = np.sqrt(self.power[1:, None]) / sizes
+        share = np.log([w for _, _, w in self.weights[1:]])[:, None]
+        share = share - 0.5 * (np.log(ratio / DIFFERENCE) / DIFFERENCE_SPREAD) ** 2
+        share = share - logsumexp(share, axis=0)
+        shape = (len(share), *(1,) * (logs.ndim - 2), sizes.size)
+        return np.asarray(logsumexp(logs[1:] + share.reshape(shape), axis=0))
 
 
 @dataclass(frozen=True)

@@ -3,40 +3,205 @@
 Scores linearise the model at its estimate without the effects. That is exact enough for small
 effects only, and shapes are scanned on a coarse grid. Structures that may be probable are therefore
 estimated, and compared again about their estimates, until no other one may be.
+
+A law outside the catalogue has no name, but acts alike in all runs. It is represented by a smooth
+function of one quantity of the model, by itself, times the velocity, or by direction of motion, in
+each balance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
+from scipy.special import logsumexp
 
 from bayesoleo._parallel import thread_map
-from bayesoleo._types import ProgressCallback
+from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.discovery._assembly import Added, Assembly
 from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
+from bayesoleo.discovery._nonparametric_search import coarser
 from bayesoleo.discovery._refit import new_parameters, quick_fit
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._structure_curves import curves_of
-from bayesoleo.discovery._structures import (
+from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
+from bayesoleo.discovery._structure_comparison import (
+    Columns,
     Comparison,
-    EstimatedModel,
-    Evidence,
-    StructurePosterior,
-    StructurePrior,
-    scan_prior,
+    Evidences,
+    Key,
+    best_alone,
+    evidences_about,
 )
+from bayesoleo.discovery._structure_parameters import averaged
+from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
+from bayesoleo.effects._nonparametric import Axis, balance_places
 from bayesoleo.errors import ModelError
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import LogNormal
+from bayesoleo.solvers._orbit import Status
 
 #: Structures are estimated this many at a time, so often, where their probability may be more than
 #: this part of the most probable one's.
 AT_A_TIME, TIMES, WORTH = 4, 5, 0.01
 DEFAULT_PRIOR = StructurePrior()
+#: Effects and unnamed functions that are considered beside the effects of an anchor.
+BESIDE, BEST_CURVES = 40, 3
+#: Part of the log evidence for an effect that its score may miss, and what of it does not matter.
+UNSURE, NEGLIGIBLE = 0.03, 0.1
+#: Pieces of the splines: a curve is either fine or coarse.
+FINE, COARSE = 16, 4
+#: Part of the largest velocity within which a change of direction takes place.
+TURNING = 0.02
+_VELOCITY = "velocity of "
+
+#: What a curve is of, and its balance.
+CurveKey = tuple[str, str]
+_Courses = Callable[[int, Array], Array]
+
+
+@dataclass
+class Evidence:
+    """Log evidence of all structures that the anchors so far reach.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    """
+
+    comparison: Comparison
+    columns: Columns = field(init=False)
+    found: Evidences = field(default_factory=dict)
+    _depth: dict[Key, int] = field(default_factory=dict)
+    _curves: list[Added] | None = None
+    _beyond: Evidences = field(default_factory=dict)
+    _chosen: list[Added] | None = None
+    _similar: dict[Added, float] = field(default_factory=dict)
+    _anchors: dict[Key, EstimatedModel] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.columns = self.comparison.columns()
+
+    def add(self, anchor: EstimatedModel) -> None:
+        """Compare structures about one more estimated model; the declared one comes first.
+
+        Where several anchors reach a structure, the one that has more of its effects counts, and
+        of those the one with the larger evidence: it is better linearised.
+        """
+        if not set(anchor.effects) <= set(self.columns.groups):
+            return  # it has effects that were not scored, such as a curve
+        reached = evidences_about(anchor, self.comparison, self.columns, self._chosen, self._curves)
+        result, curves = reached.structures, reached.curves
+        if self._chosen is None:
+            self._chosen = best_alone(result, BESIDE)
+            self._curves = sorted(curves, key=lambda key: -curves[key])[:BEST_CURVES]
+        here = len(anchor.effects)
+        if not np.isfinite(list(result.values())).all():
+            return  # an estimate that failed, about which nothing is known
+        self._similar |= reached.similar
+        for key, value in result.items():
+            there = self._depth.get(key, -1)
+            if here > there or (here == there and value > self.found[key]):
+                self.found[key], self._depth[key] = value, here
+                self._anchors[key] = anchor
+                own = result[frozenset(anchor.effects), key[1]]
+                self._beyond[key] = max(value - own, 0.0)
+
+    def evidence_of(self, key: Key) -> float:
+        """Log evidence of a structure.
+
+        Half of the laws outside the catalogue resemble one of its effects.
+        """
+        effects, outside = key
+        if effects or not outside or not self._similar:
+            return self.found[key]
+        weights = self.comparison.prior.resemblance(self.comparison.families)
+        likely = {k: value for k, value in self._similar.items() if weights.get(k, 0.0) > 0}
+        alike = [np.log(weights[k]) + value for k, value in likely.items()] or [-np.inf]
+        return float(np.logaddexp(self.found[key], logsumexp(alike)) - np.log(2.0))
+
+    def posterior(self) -> StructurePosterior:
+        """Probabilities by the evidence and the prior.
+
+        Raises
+        ------
+        ArithmeticError
+            If not even the declared model could be compared.
+        """
+        if not self.found:
+            raise ArithmeticError("the evidence of the declared model is not a number")
+        prior, weights = self.comparison.prior, self.comparison.weights
+        keys = list(self.found)
+        logs = np.array(
+            [
+                self.evidence_of(key) + prior.log_probability(tuple(key[0]), key[1], weights)
+                for key in keys
+            ]
+        )
+        probability = np.exp(logs - logsumexp(logs))
+        structures = [
+            Structure(
+                tuple(sorted(key[0])), key[1], float(p), self.evidence_of(key), self.estimated(key)
+            )
+            for key, p in zip(keys, probability, strict=True)
+        ]
+        by_probability = sorted(structures, key=lambda item: -item.probability)
+        names = next(iter(self._anchors.values())).fit.problem.names
+        shared = averaged(by_probability, self._anchors, self.comparison, self.columns, names)
+        return StructurePosterior(tuple(by_probability), prior, shared)
+
+    def estimated(self, key: Key) -> bool:
+        """Whether a structure's effects were estimated together."""
+        return self._depth.get(key, -1) == len(key[0])
+
+    def without_outside(self) -> list[tuple[Added, ...]]:
+        """The best sets of effects that explain the data alone, of each number one, where something
+        outside seems more probable.
+
+        Scores of large effects miss much. A function of phase misses nothing, and would be
+        preferred to effects that nobody estimated.
+        """
+        prior, weights = self.comparison.prior, self.comparison.weights
+        best: dict[tuple[int, bool], tuple[float, tuple[Added, ...]]] = {}
+        for key in self.found:
+            effects = tuple(sorted(key[0]))
+            height = self.evidence_of(key) + prior.log_probability(effects, key[1], weights)
+            place = (len(effects), key[1])
+            best[place] = max(best.get(place, (-np.inf, ())), (height, effects))
+        closed = max((item for place, item in best.items() if not place[1]), default=(0.0, ()))
+        if closed[0] > max(item[0] for place, item in best.items() if place[1]):
+            return []
+        found = [effects for (_, outside), (_, effects) in best.items() if not outside]
+        return [e for e in found if e and not self.estimated((frozenset(e), False))]
+
+    def doubtful(self, least: float) -> list[tuple[Added, ...]]:
+        """Sets of effects that may be probable but are known by scores only, best first.
+
+        A score is linear and knows shapes coarsely: of what a set explains beyond the estimate that
+        it was scored at, it may miss a part. Where that part is small no estimate is needed.
+
+        Parameters
+        ----------
+        least : float
+            Logarithm of the smallest ratio to the most probable structure.
+        """
+        prior, weights = self.comparison.prior, self.comparison.weights
+        height: dict[tuple[Added, ...], float] = {}
+        best = -np.inf
+        for key, value in self.found.items():
+            effects, missed = tuple(sorted(key[0])), UNSURE * self._beyond[key]
+            value = value + prior.log_probability(effects, key[1], weights)
+            best = max(best, value)
+            if not self.estimated(key) and missed > NEGLIGIBLE:
+                height[effects] = max(height.get(effects, -np.inf), value + missed)
+        likely = [effects for effects in height if height[effects] > best + least]
+        # An estimate of a part tells whether the whole is worth one.
+        whole = [e for e in likely if any(set(part) < set(e) for part in likely)]
+        return sorted(set(likely) - set(whole), key=lambda effects: -height[effects])
 
 
 def structure_posterior(
@@ -72,20 +237,22 @@ def structure_posterior(
     assert base.data is not None
     by_key = {score.option.key: score for score in scores}
     evidence = Evidence(
-        Comparison.of(base.data, errors, scores, prior, curves_of(base, assembly, numerics.jobs))
+        Comparison.of(base, errors, scores, prior, curves_of(base, assembly, numerics.jobs))
     )
     evidence.add(EstimatedModel(base.fit, {}))
     for grown, fit in known:
         evidence.add(_anchor(grown, fit, by_key))
     tried: set[tuple[Added, ...]] = set()
+    extended = _extended(base, assembly, by_key, numerics)
     for _ in range(TIMES):
         doubtful = [e for e in evidence.doubtful(float(np.log(WORTH))) if e and e not in tried]
-        if not doubtful:
+        chosen = [e for e in evidence.without_outside() if e not in tried]
+        chosen += [e for e in doubtful if e not in chosen][: AT_A_TIME - len(chosen)]
+        if not chosen:
             break
-        callback(f"estimate {len(doubtful[:AT_A_TIME])} structures")
-        tried |= set(doubtful[:AT_A_TIME])
-        extended = _extended(base, assembly, by_key, numerics)
-        for found in thread_map(extended, doubtful[:AT_A_TIME], numerics.jobs):
+        callback(f"estimate {len(chosen)} structures")
+        tried |= set(chosen)
+        for found in thread_map(extended, chosen, numerics.jobs):
             if found is not None:
                 evidence.add(found)
     return evidence.posterior()
@@ -134,3 +301,86 @@ def _extended(
         return _anchor(grown, fit, scores) if solved else None
 
     return estimated
+
+
+def curves_of(
+    base: Base, assembly: Assembly, jobs: int | None = None
+) -> dict[CurveKey, tuple[Array, ...]]:
+    """Changes of the outputs by the splines of each curve, fine and coarse.
+
+    Parameters
+    ----------
+    base : Base
+        The present model at its estimate.
+    assembly : Assembly
+        The same, with its drive.
+    jobs : int, optional
+        Threads.
+
+    Returns
+    -------
+    dict of (curve, balance) to tuple of ndarray, shape (K, n)
+        On the lines of :class:`~bayesoleo.discovery._spectral_data.SpectralData`, per unit of each
+        spline. Balances that could not be solved are left out.
+    """
+    motions = Motions(base.fit, assembly, quantities_of(assembly.native))
+    axes = dict(motions.axes({}))
+    places: list[tuple[str, str, Forced, _Courses]] = []
+    for target in balance_places(assembly.native):
+        try:
+            forced = Forced(base.fit, assembly, target)
+        except ModelError:
+            continue  # nothing is left to solve for with a term there
+        places += [(name, target, forced, courses) for name, courses in _curves(motions, axes)]
+    found = thread_map(lambda place: _columns(base, place[2], place[3]), places, jobs)
+    return {
+        (name, target): (fine, coarser(1, COARSE, FINE).T @ fine)
+        for (name, target, *_), fine in zip(places, found, strict=True)
+        if fine is not None
+    }
+
+
+def _columns(base: Base, forced: Forced, courses: _Courses) -> Array | None:
+    """Changes of the outputs by each spline (K, n); None where they could not be solved for."""
+    assert base.data is not None
+    by_run = []
+    for r in range(len(base.runs)):
+        found = forced.responses(r, partial(courses, r))
+        if isinstance(found, Status) or not np.isfinite(found).all():
+            return None
+        by_run.append(found)
+    return base.data.columns(by_run)
+
+
+def _curves(motions: Motions, axes: Mapping[int, Axis]) -> Iterator[tuple[str, _Courses]]:
+    """Functions by name, each as its splines (K, N) in a run at phases (N,)."""
+    number = {axis.name: k for k, axis in axes.items()}
+
+    def spline(k: int) -> _Courses:
+        return lambda r, phase: axes[k].basis(motions.at(r, k, phase), FINE)
+
+    def times(courses: _Courses, factor: _Courses) -> _Courses:
+        return lambda r, phase: courses(r, phase) * factor(r, phase)
+
+    for k, axis in axes.items():
+        yield axis.name, spline(k)
+        moving = number.get(f"{_VELOCITY}{axis.name}")
+        if moving is None:
+            continue
+        largest = max(abs(axes[moving].low), abs(axes[moving].high))
+        middle, half = 0.5 * (axis.low + axis.high), 0.5 * (axis.high - axis.low)
+
+        def speed(r: int, phase: Array, of: int = moving, unit: float = largest) -> Array:
+            return motions.at(r, of, phase) / unit
+
+        def direction(r: int, phase: Array, of: int = moving, unit: float = largest) -> Array:
+            return np.tanh(motions.at(r, of, phase) / (TURNING * unit))
+
+        def place(
+            r: int, phase: Array, of: int = k, zero: float = middle, unit: float = half
+        ) -> Array:
+            return (motions.at(r, of, phase) - zero) / unit
+
+        yield f"{axis.name} times velocity", times(spline(k), speed)
+        yield f"{axis.name} by direction", times(spline(k), direction)
+        yield f"{axes[moving].name} times position", times(spline(moving), place)

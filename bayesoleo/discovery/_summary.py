@@ -130,7 +130,34 @@ def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, A
             }
             for one in shown
         ],
+        "parameters": _averages(loop, found),
     }
+
+
+def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
+    """Parameters of the declared model: its estimate, that of the final model, and the average over
+    structures, SI; the final model may have a parameter by run instead."""
+    states = {"declared": loop.rounds[0].before if loop.rounds else loop.final, "final": loop.final}
+    entries: dict[str, Any] = {}
+    for name, one in found.parameters.items():
+        entries[name] = {"unit": loop.final.assembly.model().parameters[name.split("[")[0]].unit}
+        for key, state in states.items():
+            names, point = list(state.fit.problem.names), state.fit.point
+            k = names.index(name) if name in names else None
+            entries[name][key] = (
+                None
+                if k is None
+                else {
+                    "mean": float(point.theta[k]),
+                    "sd": float(np.sqrt(point.covariance[k, k])),
+                }
+            )
+        entries[name]["averaged"] = {
+            "mean": one.mean,
+            "sd": one.sd,
+            "interval": [one.low, one.high],
+        }
+    return entries
 
 
 def _classes(loop: ClosedLoop, found: StructurePosterior) -> list[dict[str, Any]]:

@@ -1,8 +1,11 @@
-"""Measure the coverage of intervals, and what honest error models cost.
+"""Measure the coverage of intervals, what honest error models cost, and how often probabilities of
+structures are right.
 
 Run with ``python tests/benchmarks/structures.py --json`` for one flat object, or without ``--json``
 for a table; the keys are explained in the files that measure them, :mod:`structures_coverage`.
-``--count`` is the number of campaigns of each question, ``--only`` names keys.
+Those of probabilities come from the stored table of ``studies/structure_probabilities.py``, with
+its command, seed and version. ``--count`` is the number of campaigns of each question, ``--only``
+names keys.
 """
 
 from __future__ import annotations
@@ -12,11 +15,14 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import structures_coverage as coverage
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
+import structure_figures
 
 from bayesoleo._workflow.model_files import load_model
 from bayesoleo._workflow.settings import Settings
@@ -56,15 +62,41 @@ def density_ratio(count: int) -> dict[str, float]:
     return {"density_ratio": spent["catalogue"] / spent["independent"]}
 
 
+#: Keys of the stored study of probabilities.
+PROBABILITIES = ("calibration_error", "brier_ratio", "sure_and_wrong", "outside_called_outside")
+
+
+def probabilities(_: int) -> dict[str, float | str]:
+    """Reliability of probabilities of structures, from the stored table; empty without one."""
+    table = structure_figures.stored()
+    if table is None:
+        return {}
+    found = structure_figures.figures(table["rows"])
+    kept: dict[str, float | str] = {
+        key: value
+        for key, value in found.items()
+        if key in PROBABILITIES or key.startswith("statements_")
+    }
+    return kept | {
+        f"structure_{key}": table[key]
+        for key in ("campaigns", "failed", "command", "seed", "version")
+    }
+
+
 #: What is measured, by the keys that it gives.
-MEASURED: dict[tuple[str, ...], Callable[[int], dict[str, float]]] = {
+MEASURED: dict[tuple[str, ...], Callable[[int], Mapping[str, float | str]]] = {
     ("coverage_inside",): lambda count: coverage.inside(count, SEED),
     ("coverage_outside",): lambda count: coverage.outside(count, SEED),
     ("coverage_plain", "width_plain"): lambda count: coverage.plain(count, SEED),
     ("coverage_coloured",): lambda count: coverage.coloured(count, SEED),
     ("coverage_prediction",): lambda count: coverage.prediction(count, SEED),
     ("density_ratio",): density_ratio,
+    PROBABILITIES: probabilities,
 }
+
+
+def _short(value: float | str) -> float | str:
+    return round(value, 4) if isinstance(value, float) else value
 
 
 def main() -> None:
@@ -74,17 +106,17 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="campaigns of each question")
     parser.add_argument("--only", nargs="+", default=[], metavar="KEY")
     chosen = parser.parse_args()
-    found: dict[str, float] = {}
+    found: dict[str, float | str] = {}
     for keys, measure in MEASURED.items():
         if chosen.only and not set(keys) & set(chosen.only):
             continue
         print(f"measure {', '.join(keys)}", file=sys.stderr)
         found |= measure(chosen.count)
     if chosen.json:
-        print(json.dumps({key: round(value, 4) for key, value in found.items()}))
+        print(json.dumps({key: _short(value) for key, value in found.items()}))
         return
     for key, value in found.items():
-        print(f"{key:24} {value:.3f}")
+        print(f"{key:24} {_short(value)}")
 
 
 if __name__ == "__main__":

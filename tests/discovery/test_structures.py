@@ -7,20 +7,26 @@ import pytest
 from discovery.fitted_states import NUMERICS, fitted
 from scipy import stats
 from scipy.special import logsumexp
-from small_campaigns import damper, damper_campaign, spring_damper_force
+from small_campaigns import (
+    CUBIC,
+    DAMPING,
+    STIFFNESS,
+    damper,
+    damper_campaign,
+    spring_damper_force,
+)
 
 from bayesoleo.discovery import StructurePosterior, StructurePrior
 from bayesoleo.discovery._ranking import score_candidates
+from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
-from bayesoleo.discovery._structure_evidence import Likelihood, fewer
-from bayesoleo.discovery._structure_search import _extended, structure_posterior
-from bayesoleo.discovery._structures import (
+from bayesoleo.discovery._structure_comparison import (
     Comparison,
-    EstimatedModel,
-    Evidence,
-    _grids,
-    scan_prior,
+    grids_of,
 )
+from bayesoleo.discovery._structure_evidence import Likelihood, fewer
+from bayesoleo.discovery._structure_parameters import _summary
+from bayesoleo.discovery._structure_search import Evidence, _extended, structure_posterior
 from bayesoleo.effects import find_effect
 
 FEW = ("coulomb_friction", "quadratic_damping", "preload", "quadratic_stiffness", "sensor_gain")
@@ -100,7 +106,7 @@ def test_evidence_about_an_estimate_is_that_of_importance_sampling(tmp_path):
     base = rubbing.base()
     scores, _ = score_candidates(base, rubbing.assembly, [find_effect(FRICTION[0])], 1)
     errors = {(entry.run, entry.output): entry for entry in rubbing.fit_errors.entries}
-    evidence = Evidence(Comparison.of(base.data, errors, scores, StructurePrior()))
+    evidence = Evidence(Comparison.of(base, errors, scores, StructurePrior()))
     evidence.add(EstimatedModel(base.fit, {}))
     (score,) = scores
     anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)((FRICTION,))
@@ -114,7 +120,7 @@ def _sampled(comparison: Comparison, anchor) -> float:
     rng, fit, data = np.random.default_rng(4), anchor.fit, comparison.data
     names, theta = list(fit.problem.names), fit.point.theta
     likelihood = Likelihood(comparison.variance.size, comparison.freedom)
-    _, sizes = _grids(comparison, data.signal(fit))
+    _, sizes = grids_of(comparison, data.signal(fit))
     columns = data.columns([p.sensitivity for p in fit.predictions])
     amplitude = names.index("coulomb_friction")
     unit = comparison.unit(columns[[amplitude]])[0]
@@ -148,3 +154,45 @@ def _sampled(comparison: Comparison, anchor) -> float:
             else:
                 logs[n] += fit.problem.priors[k].log_density(draw[None, k])[0]
     return float(logsumexp(logs - proposal) - np.log(len(draws)))
+
+
+def test_where_nothing_is_missing_averages_are_those_of_the_fit(plain):
+    sure = StructurePrior(nothing=0.999, catalogue=0.0005, outside=0.0005)
+    found = compared(plain, prior=sure).parameters
+    sd = np.sqrt(np.diag(plain.fit.point.covariance))
+    assert set(found) == set(plain.fit.problem.names)
+    for name, estimate, own in zip(plain.fit.problem.names, plain.fit.point.theta, sd, strict=True):
+        shown = found[name]
+        assert abs(shown.mean - estimate) < 0.5 * own
+        # Noise is weighted by its spectrum here and is white there.
+        assert shown.high - shown.low == pytest.approx(2 * 1.645 * own, rel=0.1)
+
+
+def test_an_average_over_two_structures_contains_both():
+    """Two normal densities of equal weight, ten standard deviations apart."""
+    found = _summary(np.array([[0.5, -5.0, 1.0], [0.5, 5.0, 1.0]]))
+    assert found.mean == pytest.approx(0.0)
+    assert found.sd == pytest.approx(np.sqrt(26.0))
+    # Five per cent of the mixture are ten of the lower part, whose quantile is -1.2816.
+    assert (found.low, found.high) == pytest.approx((-6.2816, 6.2816), abs=1e-4)
+    alone = _summary(np.array([[0.5, 3.0, 2.0]]))
+    assert (alone.low, alone.high) == pytest.approx((3 - 2 * 1.64485, 3 + 2 * 1.64485), abs=1e-4)
+
+
+def test_averages_cover_where_effects_cannot_be_told_apart(tmp_path):
+    """A stop whose spring hardens or not: the estimate of the declared model is far off."""
+
+    def stopped(x, v, t):
+        return spring_damper_force(x, v, t) + 1500.0 * np.maximum(x - 0.006, 0.0)
+
+    state = fitted(damper_campaign(tmp_path, stopped), damper())
+    found = compared(state, ("end_stop_upper", "hertzian_contact_upper", "quadratic_stiffness"))
+    assert found.nothing < 0.01
+    truth, off = {"damping": DAMPING, "stiffness": STIFFNESS, "cubic": CUBIC}, []
+    sd = np.sqrt(np.diag(state.fit.point.covariance))
+    for name, estimate, own in zip(state.fit.problem.names, state.fit.point.theta, sd, strict=True):
+        shown = found.parameters[name]
+        off.append(abs(estimate - truth[name]) / own)
+        # Three standard deviations: three parameters of one seed are no test of coverage.
+        assert abs(shown.mean - truth[name]) < 3 * shown.sd
+    assert max(off) > 4

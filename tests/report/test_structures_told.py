@@ -221,3 +221,24 @@ def test_labelled_arrays_of_a_session_repeat_the_summary(weighed):
     assert member == pytest.approx(data["probability"].values)
     assert float(data["nothing"]) == 0.01
     assert "Dahl friction (stroke) and something outside" in structures_text(summary)
+
+
+def test_averaged_parameters_stand_beside_the_estimates():
+    one = {
+        "unit": "N/m",
+        "declared": {"mean": 1520.0, "sd": 4.0},
+        "final": None,
+        "averaged": {"mean": 1500.0, "sd": 12.0, "interval": [1480.0, 1521.0]},
+    }
+    table = structures.parameters({"structures": {"parameters": {"stiffness": one}}})
+    assert table is not None
+    ((name, declared, final, averaged, interval, unit),) = table.rows
+    assert (name, final, unit) == ("stiffness", "–", "kN/m")
+    assert declared.startswith("1.520")
+    assert averaged.startswith("1.500")
+    assert interval == "1.480 … 1.521"
+
+
+def test_results_without_averages_have_no_table_of_them():
+    assert structures.parameters({"structures": {"nothing": 1.0}}) is None
+    assert structures.parameters({}) is None

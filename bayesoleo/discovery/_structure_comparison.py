@@ -1,0 +1,452 @@
+"""Marginal likelihoods of all structures about estimated models.
+
+Every model that the search has estimated is an anchor: about it the marginal likelihoods of the
+structures with no more, one more or two more effects follow from the columns of the scores. Where
+several anchors reach a structure, the one that has estimated most of its effects counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+from scipy.special import logsumexp
+
+from bayesoleo._types import Array
+from bayesoleo.discovery._assembly import Added
+from bayesoleo.discovery._error_table import RunError
+from bayesoleo.discovery._score_basis import Base, present_constants
+from bayesoleo.discovery._score_tests import Score
+from bayesoleo.discovery._spectral_data import EstimatedModel, SpectralData, linearised
+from bayesoleo.discovery._structure_evidence import (
+    Covariances,
+    Group,
+    Likelihood,
+    Reduced,
+    Remainders,
+    effect_evidence,
+    fewer,
+    mean_of,
+    pair_evidence,
+    sizes_between,
+)
+from bayesoleo.discovery._structures import StructurePrior
+from bayesoleo.prediction._run_errors import input_columns
+
+#: Effects whose pairs are considered, and directions that a law outside the catalogue is made of.
+IN_PAIRS, DIRECTIONS = 10, 40
+_LOG_2 = float(np.log(2.0))
+#: Columns whose products with each other are kept at a time.
+CHUNK = 64
+#: A direction of the law weaker than this part of the strongest is left out.
+WEAKEST = 1e-4
+#: Noise whose degrees of freedom are more than this is known.
+KNOWN = 1e5
+#: Squared change of the outputs by an input's error, in units of the noise, that is not counted.
+NEGLIGIBLE_INPUT = 1e-2
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Changes of the outputs by candidates, scaled to unit size in units of the noise.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (k, n)
+    groups : mapping of (effect, target) to tuple of Group
+        One for each set of shapes.
+    law : ndarray, shape (m, n)
+        Directions of a law that resembles many effects, by their prior weights.
+    curves : mapping of (curve, balance) to tuple of Group
+        One for each fineness.
+    """
+
+    rows: Array
+    groups: Mapping[Added, tuple[Group, ...]]
+    law: Array
+    curves: Mapping[Added, tuple[Group, ...]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What all anchors have in common: data, noise, candidates and prior.
+
+    Parameters
+    ----------
+    data : SpectralData
+    variance : ndarray, shape (n,)
+        Of the noise, SI.
+    shared : ndarray, shape (k, n)
+        Changes of the outputs by one standard deviation of each error of a measured input, SI.
+    freedom : float
+        Degrees of freedom with which the noise is known.
+    scores : sequence of Score
+        Candidates, with their columns.
+    prior : StructurePrior
+    curves : mapping of (curve, balance) to tuple of ndarray, shape (K, n)
+        Changes of the outputs by unnamed functions, fine and coarse.
+    """
+
+    data: SpectralData
+    variance: Array
+    shared: Array
+    freedom: float
+    scores: Sequence[Score]
+    prior: StructurePrior
+    curves: Mapping[tuple[str, str], tuple[Array, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        base: Base,
+        errors: Mapping[tuple[str, str], RunError],
+        scores: Sequence[Score],
+        prior: StructurePrior,
+        curves: Mapping[tuple[str, str], tuple[Array, ...]] | None = None,
+    ) -> Comparison:
+        """With the noise of an error table, and that of the inputs about an estimate."""
+        fit, data = base.fit, base.data
+        assert data is not None
+
+        def inputs(r: int) -> Array:
+            label = fit.records[r].label
+            scale = np.array([errors[label, output].input_scale for output in data.outputs])
+            columns = input_columns(fit.predictor.runs[r], present_constants(fit, r))
+            return np.asarray(columns * scale[:, None, None])
+
+        used = [errors[r.record.label, o] for r in data.runs for o in data.outputs]
+        freedom = float(sum(max(entry.free, 1.0) for entry in used))
+        shared, rest = data.input_noise(inputs)
+        variance = data.noise(errors) + rest
+        seen = np.sum(shared**2 / variance, axis=1) > NEGLIGIBLE_INPUT
+        return cls(data, variance, shared[seen], min(freedom, KNOWN), scores, prior, curves or {})
+
+    @property
+    def weights(self) -> dict[Added, float]:
+        """Prior probability of each candidate as the only effect."""
+        return self.prior.weights(self.families)
+
+    @property
+    def families(self) -> dict[Added, str]:
+        """Family of each candidate."""
+        return {s.option.key: s.option.candidate.family for s in self.scores}
+
+    def unit(self, rows: Array) -> Array:
+        """Factors ``(k,)`` that scale rows ``(k, n)`` to unit size in units of the noise."""
+        norms = np.sqrt(np.sum(rows**2 / self.variance, axis=1) / self.data.samples)
+        return 1.0 / np.where(norms > 0, norms, np.inf)
+
+    def columns(self) -> Columns:
+        """Those of all candidates, and of curves."""
+        rows: list[Array] = [np.zeros((0, self.variance.size))]
+        groups: dict[Added, tuple[Group, ...]] = {}
+        law, weights, start = [rows[0]], self.weights, 0
+        for score in self.scores:
+            own = score.signature.astype(float)
+            own = own * self.unit(own)[:, None]
+            law.append(own * np.sqrt(weights[score.option.key] / max(len(own), 1)))
+            size, shapes = len(score.names), score.option.candidate.shapes
+            if size == 1 and len(shapes) == 1 and len(own) > 1:
+                own = self._finer(own)
+            sign = score.option.candidate.sign.get(score.names[0], 0) if size == 1 else 0
+            groups[score.option.key] = tuple(
+                Group(tuple(range(start + k, start + k + size)), sign)
+                for k in range(0, len(own), size)
+            )
+            rows.append(own)
+            start += len(own)
+        curves: dict[Added, tuple[Group, ...]] = {}
+        for key, finenesses in self.curves.items():
+            for own in finenesses:
+                rows.append(own * self.unit(own)[:, None])
+                index = tuple(range(start, start + len(own)))
+                curves[key] = (*curves.get(key, ()), Group(index))
+                start += len(own)
+        directions = _directions(np.concatenate(law), self.variance)
+        return Columns(np.concatenate(rows), groups, directions, curves)
+
+    def _finer(self, rows: Array) -> Array:
+        """Columns at the values of a scan, and between each two of them."""
+        between = 0.5 * (rows[:-1] + rows[1:])
+        between = between * self.unit(between)[:, None]
+        found = np.empty((2 * len(rows) - 1, rows.shape[1]))
+        found[::2], found[1::2] = rows, between
+        return found
+
+
+def _directions(rows: Array, variance: Array) -> Array:
+    """The strongest directions ``(m, n)`` of rows ``(k, n)``, with the same sum of squares."""
+    if not len(rows):
+        return rows
+    white = rows / np.sqrt(variance)
+    values, vectors = np.linalg.eigh(white @ white.T)
+    order = np.argsort(-values)[:DIRECTIONS]
+    order = order[values[order] > WEAKEST * max(float(values.max()), 1e-300)]
+    return np.asarray(vectors[:, order].T @ rows)
+
+
+#: Effects that act, and whether there is something outside the catalogue.
+Key = tuple[frozenset[Added], bool]
+#: Log evidence of structures.
+Evidences = dict[Key, float]
+
+
+@dataclass(frozen=True)
+class Reached:
+    """What follows about one anchor.
+
+    Parameters
+    ----------
+    structures : mapping of (effects, outside) to float
+        Log evidence.
+    curves : mapping of (curve, balance) to float
+        Log evidence of unnamed functions beside the anchor's effects.
+    similar : mapping of (effect, target) to float
+        Log evidence of a law outside the catalogue that resembles an effect, and of nothing else.
+    """
+
+    structures: Evidences
+    curves: dict[Added, float]
+    similar: dict[Added, float]
+
+
+@dataclass(frozen=True)
+class _At:
+    """An anchor with its columns, ready to be compared.
+
+    Parameters
+    ----------
+    reduced : Reduced
+        By covariance of noise and remainder; own columns first, then candidates, then the law.
+    remainders : Remainders
+    likelihood : Likelihood
+    sizes : ndarray
+        Of an effect.
+    own : tuple of Group
+        Of the anchor's effects.
+    groups : mapping of (effect, target) to list of Group
+        Of candidates.
+    curves : mapping of (curve, balance) to list of Group
+        Of unnamed functions.
+    law : list of int
+        Columns of the law.
+    """
+
+    reduced: Reduced
+    remainders: Remainders
+    likelihood: Likelihood
+    sizes: Array
+    own: tuple[Group, ...]
+    groups: dict[Added, list[Group]]
+    curves: dict[Added, list[Group]]
+    law: list[int]
+
+    def parts(self, columns: Sequence[int]) -> list[Reduced]:
+        """Some columns by remainder, once for each set of sizes of the anchor's own effects."""
+        own = [c for group in self.own for c in group.columns]
+        parts = self.remainders.parts(self.reduced, [*own, *columns], self.law)
+        if not own:
+            return [parts]
+        rest = range(len(own), parts.size)
+        return [parts.with_columns(range(len(own)), power, rest) for power in self._powers()]
+
+    def _powers(self) -> list[Array]:
+        """Variances of the anchor's own columns, over a grid of sizes."""
+        few, number = fewer(self.sizes), len(self.own)
+        if number == 2:
+            grid = [(one, other) for one in few for other in few]
+        else:
+            grid = [(size,) * number for size in few]
+        counts = [len(group.columns) for group in self.own]
+        return [np.repeat(np.array(chosen) ** 2 / counts, counts) for chosen in grid]
+
+
+def best_alone(evidences: Evidences, count: int) -> list[Added]:
+    """Effects with the largest evidence as the only ones."""
+    height: dict[Added, float] = {}
+    for (effects, _), value in evidences.items():
+        if len(effects) == 1:
+            (key,) = effects
+            height[key] = max(value, height.get(key, -np.inf))
+    return sorted(height, key=lambda key: -height[key])[:count]
+
+
+def evidences_about(
+    anchor: EstimatedModel,
+    comparison: Comparison,
+    columns: Columns,
+    chosen: Sequence[Added] | None,
+    best_curves: Sequence[Added] | None,
+) -> Reached:
+    """Log evidence of all structures that an anchor reaches, with all candidates and unnamed
+    functions or only with those that are chosen."""
+    beside = [key for key in columns.groups if chosen is None or key in chosen]
+    beside = [key for key in beside if key not in anchor.effects]
+    tried = [key for key in columns.curves if best_curves is None or key in best_curves]
+    at = _anchored(anchor, comparison, columns, beside, tried)
+    own = frozenset(anchor.effects)
+    totals = np.stack([at.likelihood(p.square, p.log_det) for p in at.parts([])], axis=1)
+    found: Evidences = {}
+    for outside, value in zip((False, True), at.remainders.split(totals), strict=True):
+        found[own, outside] = mean_of(value)
+    similar: dict[Added, float] = {}
+    if len(own) == 1:
+        (only,) = own
+        similar[only] = mean_of(at.remainders.similar(totals, fewer(at.sizes)))
+    for some in _chunks(at.groups):
+        more, alike = _one_more(at, some)
+        found |= {(own | {key}, outside): value for (key, outside), value in more.items()}
+        similar |= {} if own else alike
+    if chosen is None:
+        found |= _pairs(at, best_alone(found, IN_PAIRS))
+    curves = {key: _curve(at, groups) for key, groups in at.curves.items()}
+    if curves:
+        # Half of what is outside the catalogue is a function of one quantity; those that are not
+        # tried here explain next to nothing.
+        total = logsumexp(list(curves.values())) - np.log(len(columns.curves))
+        found[own, True] = float(np.logaddexp(found[own, True], total) - _LOG_2)
+    return Reached(found, curves, similar)
+
+
+def _curve(at: _At, groups: Sequence[Group]) -> float:
+    """Log evidence of the anchor's structure with an unnamed function."""
+    values = []
+    for group in groups:
+        local = Group(tuple(range(len(group.columns))))
+        noise = [part.of_some([0], local.columns) for part in at.parts(group.columns)]
+        values += [effect_evidence(part, at.likelihood, [local], at.sizes) for part in noise]
+    return mean_of(np.array(values))
+
+
+def _chunks(groups: Mapping[Added, Sequence[Group]]) -> list[list[Added]]:
+    """Effects a few at a time, so that products of all their columns need little memory."""
+    chunks: list[list[Added]] = [[]]
+    count = 0
+    for key, own in groups.items():
+        count += sum(len(group.columns) for group in own)
+        if count > CHUNK and chunks[-1]:
+            chunks.append([])
+            count = sum(len(group.columns) for group in own)
+        chunks[-1].append(key)
+    return chunks
+
+
+def _one_more(
+    at: _At, keys: Sequence[Added]
+) -> tuple[dict[tuple[Added, bool], float], dict[Added, float]]:
+    """Log evidence of the anchor's structure with one more effect, and with a law like it."""
+    columns, groups = _local(at, keys)
+    flat = [(key, group) for key in keys for group in groups[key]]
+    if not flat:
+        return {}, {}
+    own = [group for _, group in flat]
+    logs = np.stack(
+        [effect_evidence(p, at.likelihood, own, at.sizes) for p in at.parts(columns)], axis=1
+    )  # (remainders, own sizes, groups, sizes)
+    without, outside = at.remainders.split(logs)
+    alike = at.remainders.similar(logs, at.sizes)
+    found, similar = {}, {}
+    for key in keys:
+        index = [k for k, (other, _) in enumerate(flat) if other == key]
+        found[key, False], found[key, True] = mean_of(without[:, index]), mean_of(outside[:, index])
+        similar[key] = mean_of(alike[:, index])
+    return found, similar
+
+
+def _local(at: _At, keys: Sequence[Added]) -> tuple[list[int], dict[Added, list[Group]]]:
+    """Columns of some effects, and their groups among these."""
+    columns = [c for key in keys for group in at.groups[key] for c in group.columns]
+    place = {column: k for k, column in enumerate(columns)}
+    groups = {
+        key: [Group(tuple(place[c] for c in g.columns), g.sign) for g in at.groups[key]]
+        for key in keys
+    }
+    return columns, groups
+
+
+def grids_of(comparison: Comparison, reach: Array) -> tuple[Remainders, Array]:
+    """Remainders, and sizes of an effect."""
+    data, variance = comparison.data, comparison.variance
+    outputs = len(data.outputs)
+    unit = np.array([np.sqrt(variance[data.output_of == b].mean()) for b in range(outputs)])
+    sizes = sizes_between(float(np.max(reach / unit)), data.samples)
+    covariances = Covariances.of(
+        variance, data.smooth(), data.output_of, reach, data.samples // outputs
+    )
+    return Remainders.of(covariances, fewer(sizes)), sizes
+
+
+def _anchored(
+    anchor: EstimatedModel,
+    comparison: Comparison,
+    columns: Columns,
+    beside: Sequence[Added],
+    tried: Sequence[Added],
+) -> _At:
+    """Products of residual, unknowns and columns about an anchor, unknowns integrated out."""
+    fit, data = anchor.fit, comparison.data
+    here = linearised(anchor, data)
+    own = here.own
+    # Errors of the inputs are unknowns as well.
+    unknowns = np.concatenate([here.unknowns, comparison.shared])
+    offset = np.concatenate([here.offset, np.zeros(len(comparison.shared))])
+    index: list[int] = []
+
+    def placed(chosen: Sequence[Group]) -> list[Group]:
+        """Groups with their columns in the order in which these are used."""
+        found = []
+        for group in chosen:
+            start = len(own) + len(index)
+            index.extend(group.columns)
+            found.append(Group(tuple(range(start, start + len(group.columns))), group.sign))
+        return found
+
+    groups = {key: placed(columns.groups[key]) for key in beside}
+    curves = {key: placed(columns.curves[key]) for key in tried}
+    scale = comparison.unit(own)[:, None]
+    rows = [here.residual[None], unknowns, own * scale, columns.rows[index], columns.law]
+    remainders, sizes = grids_of(comparison, data.signal(fit))
+    products, logs = remainders.covariances.products(np.concatenate(rows))
+    count = len(own) + len(index)
+    return _At(
+        Reduced.of(products, logs, len(unknowns), offset),
+        remainders,
+        Likelihood(comparison.variance.size, comparison.freedom),
+        sizes,
+        own_groups(anchor),
+        groups,
+        curves,
+        list(range(count, count + len(columns.law))),
+    )
+
+
+def own_groups(anchor: EstimatedModel) -> tuple[Group, ...]:
+    """Columns of each of an anchor's effects, in the order of :func:`linearised`."""
+    found, start = [], 0
+    for names in anchor.effects.values():
+        size = sum(name.split("[")[0] in names for name in anchor.fit.problem.names)
+        found.append(Group(tuple(range(start, start + size))))
+        start += size
+    return tuple(found)
+
+
+def _pairs(at: _At, best: Sequence[Added]) -> Evidences:
+    """Log evidence of pairs of some effects with one unknown each."""
+    able = [key for key in best if all(len(group.columns) == 1 for group in at.groups[key])]
+    columns, groups = _local(at, able)
+    found: Evidences = {}
+    (parts,), few = at.parts(columns), fewer(at.sizes)
+    for first, second in combinations(able, 2):
+        logs = np.stack(
+            [
+                pair_evidence(parts, at.likelihood, one, other, few)
+                for one in groups[first]
+                for other in groups[second]
+            ],
+            axis=1,
+        )
+        for outside, value in zip((False, True), at.remainders.split(logs), strict=True):
+            found[frozenset({first, second}), outside] = mean_of(value)
+    return found

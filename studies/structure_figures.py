@@ -1,0 +1,129 @@
+"""Reliability of the probabilities of structures, from the stored table of a long study.
+
+The table is written by ``structure_probabilities.py``, a row for each simulated campaign.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+OUTSIDE = "outside"
+#: Bands of probabilities in which statements are held against the truth.
+BANDS = ((0.5, 0.8), (0.8, 0.95), (0.95, 1.0001))
+#: Finer ones for the figure.
+FINE = (0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0001)
+TABLE = Path(__file__).resolve().parent / "tables" / "structures.json"
+
+
+def stored() -> dict[str, Any] | None:
+    """The table of the last run; None if there is none."""
+    return json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else None
+
+
+def statements(row: Mapping[str, Any]) -> list[tuple[float, bool]]:
+    """Each thing that is said of a campaign with its probability, and whether it is true."""
+    said = [
+        (row["nothing"], row["what"] == "nothing"),
+        (row["only_outside"], row["what"] == OUTSIDE),
+    ]
+    return said + [(p, name in row["truth"]) for name, p in row["effects"].items()]
+
+
+def brier(row: Mapping[str, Any]) -> tuple[float, float]:
+    """Brier score of the probabilities, and of the most probable structure taken for certain."""
+    effects, outside, _ = row["best"][0]
+    truth = {"nothing": row["what"] == "nothing", OUTSIDE: row["what"] == OUTSIDE}
+    truth |= dict.fromkeys(row["truth"], True)
+    said = {"nothing": row["nothing"], OUTSIDE: row["only_outside"], **row["effects"]}
+    taken = dict.fromkeys(effects, 1.0) or {OUTSIDE if outside else "nothing": 1.0}
+    names = {*truth, *said, *taken}
+    scores = [
+        sum((given.get(name, 0.0) - truth.get(name, False)) ** 2 for name in names)
+        for given in (said, taken)
+    ]
+    return scores[0], scores[1]
+
+
+def log_score(row: Mapping[str, Any]) -> float:
+    """Mean of minus the logarithm of the probability given to what is true of each statement."""
+    said = statements(row)
+    chances = [p if true else 1.0 - p for p, true in said]
+    return float(-np.mean(np.log(np.maximum(chances, 1e-6))))
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Reliability of all statements, and how campaigns with something outside are called."""
+    done = [row for row in rows if "failed" not in row]
+    said = np.array([item for row in done for item in statements(row)], dtype=float)
+    table: dict[str, float] = {
+        "structure_campaigns": len(done),
+        "structure_failed": len(rows) - len(done),
+    }
+    errors = []
+    for low, high in BANDS:
+        band = said[(said[:, 0] >= low) & (said[:, 0] < high)]
+        key = f"{low:g}_to_{min(high, 1.0):g}"
+        table[f"statements_{key}"] = len(band)
+        if len(band):
+            table[f"said_{key}"], table[f"true_{key}"] = map(float, band.mean(axis=0))
+            errors.append(abs(float(band[:, 0].mean() - band[:, 1].mean())))
+    table["calibration_error"] = max(errors, default=float("nan"))
+    table["sure_and_wrong"] = 1.0 - table.get(f"true_{BANDS[-1][0]:g}_to_1", float("nan"))
+    scores = np.array([brier(row) for row in done])
+    table["brier"], table["brier_winner"] = map(float, scores.mean(axis=0))
+    winner = table["brier_winner"]
+    table["brier_ratio"] = table["brier"] / winner if winner else float("nan")
+    table["log_score"] = float(np.mean([log_score(row) for row in done]))
+    strange = [row["outside"] > 0.5 for row in done if row["what"] == OUTSIDE]
+    table["outside_called_outside"] = float(np.mean(strange)) if strange else float("nan")
+    table["structure_seconds"] = float(np.mean([row["seconds"] for row in done]))
+    return table
+
+
+def reliability_figure() -> Figure | None:
+    """How often statements are true, by the probability with which they were made."""
+    table = stored()
+    if table is None:
+        return None
+    said = np.array([item for row in table["rows"] for item in statements(row)], dtype=float)
+    figure = Figure(figsize=(5, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.6", lw=0.8)
+    for low, high in pairwise(FINE):
+        band = said[(said[:, 0] >= low) & (said[:, 0] < high)]
+        if not len(band):
+            continue
+        mean, true = band.mean(axis=0)
+        # Wilson's interval of 90 %.
+        z, count = 1.645, len(band)
+        centre = (true + z**2 / (2 * count)) / (1 + z**2 / count)
+        half = z * np.sqrt(true * (1 - true) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
+        axes.plot([mean, mean], [centre - half, centre + half], color="#0072b2", lw=1.4)
+        axes.plot(mean, true, "o", color="#0072b2", ms=5)
+        axes.annotate(f"{count}", (mean, true), (6, -10), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="probability that was stated", ylabel="part of the statements that is true")
+    axes.set(xlim=(0, 1.02), ylim=(0, 1.02))
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def print_figures() -> None:
+    """Calibration error, scores, and what was wrong, with counts."""
+    table = stored()
+    if table is None:
+        return
+    found = figures(table["rows"])
+    print(f"{table['campaigns']} campaigns, {table['failed']} more could not be simulated")
+    for low, high in BANDS:
+        key = f"{low:g}_to_{min(high, 1.0):g}"
+        count, true = found[f"statements_{key}"], found.get(f"true_{key}", float("nan"))
+        print(f"stated {low:.2f} to {min(high, 1.0):.2f}: {count:4d} statements, {true:.3f} true")
+    for key in ("calibration_error", "sure_and_wrong", "brier_ratio", "outside_called_outside"):
+        print(f"{key.replace('_', ' '):24} {found[key]:.3f}")
