@@ -35,8 +35,9 @@ def add_propose(app: typer.Typer) -> None:
 
 
 @options.of_settings(
-    "seed", "jobs", "effects", "without", *options.SOLVED, "nuisance", "disturbances"
-)
+    "seed", "jobs", "effects", "without", *options.SOLVED, "nuisance", "disturbances",
+    "structure_prior", "next_run",
+)  # fmt: skip
 def propose(
     campaign: options.CampaignPath,
     model: options.ModelText,
@@ -45,8 +46,8 @@ def propose(
         options.option(
             "--rivals",
             "ID,…",
-            "Effects to be told apart, by their ids, or id@target; by default those that "
-            "might be what is missing.",
+            "Effects to be told apart, by their ids, or id@target; by default the most "
+            "probable structures.",
             options.RUNNING,
         ),
     ] = "",
@@ -68,18 +69,19 @@ def propose(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Say which run to make next: the one that best tells apart what might be missing.
+    """Say which run to make next: the one that is expected to tell most of what might be missing.
 
-    Candidate effects that these runs cannot decide between are estimated, each foresees the runs
-    that the rig can do, with all that is not known of its parameters, and the runs are ranked by
-    what they are expected to tell. The rig can do what it did, unless the campaign or --limit says
-    otherwise. Periodic runs and models with one input only.
+    Structures that these runs cannot decide between are estimated, each foresees the runs that the
+    rig can do, with all that is not known of its parameters, and the runs are ranked by what they
+    are expected to tell, in bits. The rig can do what it did, unless the campaign or --limit says
+    otherwise. Transients, and runs with several inputs, vary those that were measured.
 
     \b
     Examples:
       bayesoleo propose shaker --model f16n2d2
       bayesoleo propose shaker --model f16n2d2 --limit amplitude=2:60mm --limit frequency=:10Hz
       bayesoleo propose shaker --model f16n2d2 --rivals oil_compressibility,frame_compliance
+      bayesoleo propose shaker --model f16n2d2 --next-run parameters
     """
     from bayesoleo import _workflow as workflow, plots
     from bayesoleo._workflow.model_files import load_model
@@ -106,7 +108,7 @@ def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -
 
     console = shell.console()
     if not entries:
-        console.print("Nothing is left to be told apart: fewer than two candidates stand.")
+        console.print("Nothing is left to be told apart: one structure is nearly certain.")
     for entry in entries:
         for line in proposal_lines(entry, titles):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -218,7 +220,7 @@ def _is_demo(folder: Path, name: str) -> bool:
 
 @options.of_settings(
     *options.SAMPLED, "max_effects", "effects", "without", *options.SOLVED,
-    "nuisance", "disturbances", "error_model", "between_runs", "structure_prior",
+    "nuisance", "disturbances", "error_model", "between_runs", "structure_prior", "next_run",
 )  # fmt: skip
 def close(
     campaign: options.CampaignPath,

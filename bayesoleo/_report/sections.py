@@ -256,7 +256,11 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Caption
     if entry["round"] not in rounds:
         return []
     titles = reading.summary(tree).get("titles", {})
-    rivals = listed([called(one, titles) for one in entry["rivals"]])
+    names = dict.fromkeys(e for one in entry["rivals"] for e in one.split(" + "))
+    rivals = listed([called(one, titles) for one in names])
+    if entry["question"] == "parameters":
+        caption = "Information of a run on the parameters. Where it is blank the rig cannot go."
+        return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
     caption = (
         "Standard deviations by which a run would separate the least separated pair of "
         f"{rivals}, at the mean position that is best for it. Where it is blank the rig cannot go."

@@ -383,7 +383,7 @@ def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[st
     """The entry with rivals as they are called."""
 
     def words(names: Sequence[str]) -> list[str]:
-        return [called(one, titles) for one in names]
+        return [" with ".join(called(e, titles) for e in one.split(" + ")) for one in names]
 
     def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
         if found is None:
@@ -416,25 +416,62 @@ def proposal_table(
     if not entry["runs"] or _all_alike(entry):
         return None
     entry = _with_titles(entry, titles or {})
-    scale = _scale(entry)
-    unit = f" [{scale.unit}]" if scale.unit else ""
-    pairs = entry["runs"][0]["pairs"]
-    by_pair = len(pairs) <= MOST_PAIRS
-    named = [f"{' / '.join(pair['rivals'])} [σ]" for pair in pairs]
-    head = ["run", "frequency [Hz]", f"mean{unit}", f"amplitude{unit}", "information [bit]"]
-    head += named if by_pair else ["least separated pair [σ]"]
+    head = ["run", *_place_head(entry), "information [bit]", *_told_head(entry)]
     shown = [(f"{number}", run) for number, run in enumerate(entry["runs"], start=1)]
     if entry["repeat"]:
         shown.append((f"{entry['repeat']['run']} once more", entry["repeat"]))
-    rows = []
-    for label, run in shown:
-        values = [pair["sigma"] for pair in run["pairs"]] if by_pair else [run["sigma"]]
-        place = [scale.factor * run[key] for key in ("mean", "amplitude")]
-        rows.append(
-            [label, *map(format_short, (run["frequency"], *place)), f"{run['information']:.2f}"]
-            + [format_sigma(value) for value in values]
-        )
+    rows = [
+        [label, *_place(entry, run), f"{run['information']:.2f}", *_told(entry, run)]
+        for label, run in shown
+    ]
     return Table(head, rows, 1, frozenset({0}))
+
+
+def _varies(entry: Mapping[str, Any]) -> bool:
+    """Whether proposed runs vary measured ones."""
+    return bool(entry["runs"][0].get("change"))
+
+
+def _place_head(entry: Mapping[str, Any]) -> list[str]:
+    """Heads of the columns that say which run it is."""
+    if _varies(entry):
+        return ["as run", "changed"]
+    unit = _scale(entry).unit
+    unit = f" [{unit}]" if unit else ""
+    return ["frequency [Hz]", f"mean{unit}", f"amplitude{unit}"]
+
+
+def _place(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    if _varies(entry):
+        return [run["like"], run["change"] or "nothing"]
+    factor = _scale(entry).factor
+    place = [factor * run[key] for key in ("mean", "amplitude")]
+    return [format_short(value) for value in (run["frequency"], *place)]
+
+
+def _told_head(entry: Mapping[str, Any]) -> list[str]:
+    """Heads of the columns that say how far a run separates rivals, or which parameters it makes
+    more precise."""
+    pairs = entry["runs"][0]["pairs"]
+    if not pairs:
+        return [f"sd of {name} [%]" for name in _most_improved(entry)]
+    by_pair = len(pairs) <= MOST_PAIRS
+    named = [f"{' / '.join(pair['rivals'])} [σ]" for pair in pairs]
+    return named if by_pair else ["least separated pair [σ]"]
+
+
+def _told(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    if not run["pairs"]:
+        return [f"{100 * run['sd_ratio'][name]:.0f}" for name in _most_improved(entry)]
+    by_pair = len(run["pairs"]) <= MOST_PAIRS
+    values = [pair["sigma"] for pair in run["pairs"]] if by_pair else [run["sigma"]]
+    return [format_sigma(value) for value in values]
+
+
+def _most_improved(entry: Mapping[str, Any]) -> list[str]:
+    """Parameters whose standard deviations the best run reduces most."""
+    ratio = entry["runs"][0].get("sd_ratio", {})
+    return sorted(ratio, key=lambda name: float(ratio[name]))[:MOST_PAIRS]
 
 
 def format_sigma(value: float) -> str:
@@ -443,19 +480,29 @@ def format_sigma(value: float) -> str:
 
 
 def run_text(run: Mapping[str, Any], scale: Scale) -> str:
-    """A run in words: ``2.00 Hz, mean 120 mm, amplitude 30.0 mm``."""
+    """A run in words: ``at 2.00 Hz, mean 120 mm, amplitude 30.0 mm``."""
+    if run.get("change"):
+        return f"like {run['like']} with {run['change']}"
     mean, amplitude = (format_short(scale.factor * run[key]) for key in ("mean", "amplitude"))
     unit = f" {scale.unit}" if scale.unit else ""
-    return f"{format_short(run['frequency'])} Hz, mean {mean}{unit}, amplitude {amplitude}{unit}"
+    place = f"mean {mean}{unit}, amplitude {amplitude}{unit}"
+    return f"at {format_short(run['frequency'])} Hz, {place}"
 
 
 def _scale(entry: Mapping[str, Any]) -> Scale:
-    sizes = [max(abs(run["mean"]), run["amplitude"]) for run in entry["runs"]]
+    sizes = [max(abs(run["mean"] or 0.0), run["amplitude"] or 0.0) for run in entry["runs"]]
     return engineering(entry["unit"], max(sizes, default=0.0))
 
 
 def _question(entry: Mapping[str, Any]) -> str:
     names = listed(entry["rivals"])
+    if entry["question"] == "parameters":
+        what = entry.get("parameter") or "the parameters"
+        return f"To know {what} more precisely:"
+    if entry["question"] == "structures":
+        pairs = zip(entry["rivals"], entry.get("probabilities") or [], strict=False)
+        known = [f"{name} ({chance:.2f})" for name, chance in pairs]
+        return f"What is missing, by probability: {listed(known or entry['rivals'])}."
     if entry["question"] == "indistinguishable":
         first, *others = entry["rivals"]
         return f"These data cannot tell {first}, which was added, from {listed(others)}."
@@ -471,18 +518,20 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
             "No run within the limits of the rig would separate them by one standard deviation:"
             " they are one law in other words, or differ beyond these limits or in other channels."
         ]
-    pairs = [pair for pair in best["pairs"] if pair["rivals"] not in apart]
-    weakest = min(pair["sigma"] for pair in pairs)
-    two = len(entry["rivals"]) == 2
-    whom = listed(entry["rivals"], " from ") if two else "each pair of them"
-    if apart:
-        whom = "the others"
-    least = "" if two else "at least "
-    text = f"A run at {run_text(best, _scale(entry))} would separate {whom}"
-    text += f" by {least}{format_sigma(weakest)} standard deviations"
-    if repeat:
-        same = [pair["sigma"] for pair in repeat["pairs"] if pair["rivals"] not in apart]
-        text += f"; no present run, made once more, by more than {format_sigma(min(same))}"
+    gain = "is expected to tell"
+    text = f"A run {run_text(best, _scale(entry))} {gain} {best['information']:.2f} bits"
+    if best["pairs"]:
+        text += f" of the {entry['entropy']:.2f} that are open"
+    else:
+        name = _most_improved(entry)[0]
+        text += f" and to leave {100 * best['sd_ratio'][name]:.0f} % of the standard deviation"
+        text += f" of {name}"
+    if repeat and repeat["information"] > best["information"]:
+        text = f"{repeat['run']}, made once more, {gain} {repeat['information']:.2f} bits, more"
+        text += f" than any new run: one {run_text(best, _scale(entry))} {gain}"
+        text += f" {best['information']:.2f}"
+    elif repeat:
+        text += f"; no present run, made once more, more than {repeat['information']:.2f}"
     lines = [f"{text}."]
     for pair in apart:
         lines.append(
@@ -494,4 +543,5 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
 
 def _all_alike(entry: Mapping[str, Any]) -> bool:
     """Whether no pair is separated by any run, so that there is nothing to choose."""
-    return len(entry["inseparable"]) == len(entry["runs"][0]["pairs"])
+    pairs = len(entry["runs"][0]["pairs"])
+    return pairs > 0 and len(entry["inseparable"]) == pairs

@@ -21,7 +21,8 @@ from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array, Integers
 from bayesoleo._workflow.estimating import draw_from
 from bayesoleo._workflow.settings import Settings
-from bayesoleo.discovery._inference import function_errors
+from bayesoleo.discovery._inference import effective_at, function_errors
+from bayesoleo.error_models._power import PowerErrors
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._function_problem import FunctionProblem
@@ -455,6 +456,8 @@ class FunctionWork:
         """The tree with the posterior."""
         settings, problem = self.settings, fit.problem
         word, reason = function_errors(problem, fit.point.theta, settings.error_model)
+        if word == PowerErrors.word:
+            problem.effective = effective_at(problem, fit.point.theta)
         density = LogDensity(problem, settings.jobs, errors=word)
         of = ["" if out is None else digest((self.table, self.call, self.parameters))]
         samples = draw_from(

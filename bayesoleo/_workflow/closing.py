@@ -28,7 +28,7 @@ from bayesoleo._workflow.result import Drawn, report_what_is_there, result_tree,
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of
-from bayesoleo.discovery._next_experiment import check_periodic
+from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
@@ -55,6 +55,7 @@ def trace(
     """
     output = ResultFolder.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
+    _check_aim(task)
     stages = Stages(callback)
     loop, questions = search(task, 0, stages, output)
     return written(task, loop, None, output, stages, questions)
@@ -106,6 +107,7 @@ def close(
     """
     output = ResultFolder.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
+    _check_aim(task)
     with output.alone():
         stages = Stages(callback)
         loop, questions = search(task, settings.max_effects, stages, output, resume=True)
@@ -299,8 +301,17 @@ def what_next(
     limits : mapping of str to (float, float), optional
         Of the rig, SI, before those of the campaign.
     """
-    rig = {**task.campaign.rig, **(limits or {})}
-    return questions_of(loop, rig, task.settings.numerics, effects=rivals, callback=callback)
+    rig, settings = {**task.campaign.rig, **(limits or {})}, task.settings
+    return questions_of(
+        loop, rig, settings.numerics, aim=settings.next_run, effects=rivals, callback=callback
+    )
+
+
+def _check_aim(task: Task) -> None:
+    """Raise where there is no parameter that the next run is to make more precise."""
+    model = task.assembly.model()
+    shared = [name for name in model.estimated() if not model.parameters[name].by_run]
+    check_aim(task.settings.next_run, shared)
 
 
 def propose(
@@ -312,18 +323,21 @@ def propose(
     limits: Mapping[str, tuple[float, float]] | None = None,
     callback: ProgressCallback = silent,
 ) -> xr.DataTree:
-    """Rank the runs that a rig can do by how well they would tell candidate effects apart.
+    """Rank the runs that a rig can do by what they are expected to tell.
 
-    Each of the rivals is estimated from the runs that there are. What it foresees of a new run is
-    uncertain by what these leave unknown of its parameters; the noise is that of the others.
+    They tell which of several structures is true, weighted by their probabilities, or make the
+    parameters more precise (``Settings(next_run="parameters")``). Each of the rivals is estimated
+    from the runs that there are. What it foresees of a new run is uncertain by what these leave
+    unknown of its parameters; the noise is that of the others. Transients, and runs with several
+    inputs, vary those that were measured.
 
     Parameters
     ----------
     campaign, model, settings
         See :func:`close`. No effect is added to the model.
     rivals : sequence of str, optional
-        Ids of effects, or ``effect@target`` where one has several places. By default those that are
-        significant and explain a part of what is left.
+        Ids of effects, or ``effect@target`` where one has several places. By default the most
+        probable structures, nothing included.
     limits : mapping of str to (float, float), optional
         What the rig can do, in place of what the campaign says and its runs suggest:
         ``amplitude``, ``frequency``, ``mean``, ``travel``, ``rate`` or an output, SI; infinite
@@ -339,14 +353,15 @@ def propose(
     Raises
     ------
     InputError
-        If there is no such effect or limit, runs are transient, or the model has several inputs.
+        If there is no such effect, limit or parameter.
 
     References
     ----------
-    Box and Hill (1967), Technometrics 9, 57-71; Kolchinsky and Tracey (2017), Entropy 19, 361.
+    Lindley (1956), Annals of Mathematical Statistics 27, 986-1005; Box and Hill (1967),
+    Technometrics 9, 57-71; Chaloner and Verdinelli (1995), Statistical Science 10, 273-304.
     """
     task = prepare(campaign, model, settings)
-    check_periodic(task.reduced.records)  # before anything is estimated for nothing
+    _check_aim(task)  # before anything is estimated for nothing
     output, stages = ResultFolder(None), Stages(callback)
     loop = run_loop(task, 0, stages, output)
     found = what_next(task, loop, callback, rivals=rivals, limits=limits)

@@ -256,6 +256,9 @@ class Settings:
         (:func:`bayesoleo.posterior.hierarchical`).
     disturbances : tuple of {"drift", "tone", "tails"}
         What is looked for in the outputs of periodic runs, and removed before physics is named.
+    next_run : str
+        What the next run is proposed for: ``"structures"``, which one is true; ``"parameters"``,
+        the precision of all parameters; or the name of one parameter.
     policy : SearchPolicy
         The numbers by which the search for missing effects decides.
     structure_prior : StructurePrior
@@ -308,8 +311,8 @@ class Settings:
         "What errors have in common: independent (one variance an output), per-run, full "
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
         "shared-discrepancy (and is partly alike in all runs), catalogue (all effects that the "
-        "model might lack). The default, auto, chooses among independent, correlated and "
-        "catalogue by what the data show, and says why.",
+        "model might lack), power (independent, by effective samples). The default, auto, "
+        "chooses among independent, correlated and catalogue by what the data show, and says why.",
         metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(
@@ -337,6 +340,12 @@ class Settings:
         "What is no physics and is removed from the outputs of periodic runs where it is found: "
         "drift, tone (no harmonic), tails (outliers); 'none' for nothing.",
         read=_disturbances, metavar="drift,tone,tails",
+    )  # fmt: skip
+    next_run: str = _setting(
+        "structures", str, RUNNING,
+        "What the next run is proposed for: structures (which one is true), parameters (all more "
+        "precise), or the name of one parameter.",
+        metavar="structures|parameters|NAME",
     )  # fmt: skip
     policy: SearchPolicy = field(default_factory=_search_policy)
     structure_prior: StructurePrior = field(

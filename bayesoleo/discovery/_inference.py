@@ -27,6 +27,7 @@ from bayesoleo.error_models._catalogue import CatalogueErrors, Linearised
 from bayesoleo.error_models._correlated import CorrelatedErrors
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.error_models._independent import IndependentErrors
+from bayesoleo.error_models._power import PowerErrors, effective_samples
 from bayesoleo.error_models._registry import AUTO, ERROR_MODELS, check_word
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -122,7 +123,15 @@ class Inference:
                 problem, self.between_runs, theta=point.theta, errors=self.error_model
             )
         problem.freeze(point.theta)
+        if self.error_model == PowerErrors.word:
+            problem.effective = effective_at(problem, point.theta)
         return LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
+
+
+def effective_at(problem: ResidualProblem, theta: Array) -> Array:
+    """Effective numbers of samples (N, s) by the residual at an estimate."""
+    errors = [problem.residuals(theta[None], run)[0][0] for run in range(len(problem.runs))]
+    return effective_samples(errors, problem.samples)
 
 
 #: Log odds of the data above which noise alone does not explain a residual.

@@ -17,26 +17,43 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._error_table import ErrorTable, error_table
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_error import predict_fitted
-from bayesoleo.discovery._loop import ClosedLoop
-from bayesoleo.discovery._next_experiment import Proposals, ProposedRun, drive_of, propose_runs
+from bayesoleo.discovery._loop import SURE, ClosedLoop
+from bayesoleo.discovery._next_experiment import (
+    PARAMETERS,
+    STRUCTURES,
+    Proposals,
+    ProposedRun,
+    check_aim,
+    drive_of,
+    limits_of,
+    propose_runs,
+)
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._predicted_experiment import Limits, Range, Rival
+from bayesoleo.discovery._predicted_experiment import Range, Rival, sizes_of
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit, refit
 from bayesoleo.discovery._round import Round
+from bayesoleo.discovery._structure_search import structure_fits
+from bayesoleo.discovery._structures import StructurePosterior
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.prediction._records import Record
 
 #: Reasons to distinguish effects.
 ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
+#: A structure that is as probable as this is decided; one that is less probable than that is no
+#: rival.
+DECIDED, LEAST = SURE, 0.01
+#: Name of the structure without effects.
+NOTHING = "nothing"
 #: Runs that the summary lists.
 LISTED = 5
 #: Unit and meaning of what the group holds for each run.
 ABOUT = {
-    "information": ("bit", "least expected information about which rival is true"),
+    "information": ("bit", "expected information about which rival is true, or on parameters"),
     "sigma": ("1", "standard deviations that separate the least separated pair"),
     "rank": ("1", "place among all runs, from 1"),
 }
@@ -143,14 +160,18 @@ class Question:
     ----------
     number : int
         Number of the round, from 1.
-    kind : {"indistinguishable", "open", "asked"}
-        Whether the round accepted one of them, accepted none, or the user named them.
+    kind : {"structures", "parameters", "indistinguishable", "open", "asked"}
+        Whether structures are to be told apart by their probabilities, or parameters to be more
+        precise. Where there are no probabilities: whether the round accepted one of the effects,
+        accepted none, or the user named them.
     rivals : tuple of str
         The effects.
     proposals : Proposals or None
         ``None`` where no run can be predicted.
     note : str
         The reason, or the effects that were left out.
+    aim : str
+        The parameter that is to be more precise; empty for all.
     """
 
     number: int
@@ -158,6 +179,7 @@ class Question:
     rivals: tuple[str, ...]
     proposals: Proposals | None
     note: str = ""
+    aim: str = ""
 
 
 def questions_of(
@@ -165,10 +187,11 @@ def questions_of(
     rig: Mapping[str, Range],
     numerics: Numerics,
     *,
+    aim: str = STRUCTURES,
     effects: Sequence[str] = (),
     callback: ProgressCallback = lambda _: None,
 ) -> tuple[Question, ...]:
-    """The effects that each round leaves undecided, with proposed runs.
+    """What the data leave open, with proposed runs.
 
     Parameters
     ----------
@@ -179,51 +202,140 @@ def questions_of(
         them.
     numerics : Numerics
         Scheme, threads.
+    aim : str
+        ``"structures"``, ``"parameters"`` or the name of one parameter.
     effects : sequence of str, optional
         Effects of the last round to distinguish instead.
     callback : callable
         Receives a message at each step.
     """
-    records = [*loop.roles.fitted, *loop.roles.held_out]
-    records = list({record.label: record for record in records}.values())
+    every = [*loop.roles.fitted, *loop.roles.held_out]
+    records = list({record.label: record for record in every}.values())
+    plan = _Plan(records, rig, numerics, callback)
+    if effects:
+        item, number = loop.rounds[-1], len(loop.rounds)
+        return (_of_round(number, ASKED, item, named(item, effects), plan),)
+    if aim != STRUCTURES:
+        return (_of_parameters(loop, aim, plan),)
+    if loop.structures is not None:
+        return _of_structures(loop, loop.structures, plan)
     found, stayed = [], set(loop.final.assembly.added)
     for number, item in enumerate(loop.rounds, start=1):
-        last = number == len(loop.rounds)
-        if effects and not last:
-            continue
         if item.accepted and (item.accepted.effect, item.accepted.target) not in stayed:
             continue  # the effect was removed again
-        chosen = named(item, effects) if effects else standing(item, policy=numerics.policy)
+        chosen = standing(item, policy=numerics.policy)
         if chosen:
-            kind = ASKED if effects else OPEN if item.accepted is None else ALIKE
-            found.append(_answer(number, kind, item, chosen, records, rig, numerics, callback))
+            kind = OPEN if item.accepted is None else ALIKE
+            found.append(_of_round(number, kind, item, chosen, plan))
     return tuple(found)
 
 
-def _answer(
-    number: int,
-    kind: str,
-    item: Round,
-    chosen: Sequence[Ranked],
-    records: Sequence[Record],
-    rig: Mapping[str, Range],
-    numerics: Numerics,
-    callback: ProgressCallback,
-) -> Question:
-    names = tuple(label(one, chosen) for one in chosen)
-    callback(f"look for a run that distinguishes {', '.join(names)}")
+@dataclass(frozen=True)
+class _Plan:
+    """What all questions share: existing runs, limits, and how models are solved."""
+
+    records: Sequence[Record]
+    rig: Mapping[str, Range]
+    numerics: Numerics
+    callback: ProgressCallback
+
+    def proposed(
+        self, rivals: Sequence[Rival], errors: ErrorTable, aim: str = STRUCTURES
+    ) -> tuple[Proposals, str]:
+        """Proposals, and what of the rig's limits does not count."""
+        drive, outputs = drive_of(rivals, self.records), rivals[0].fit.predictor.outputs
+        limits, note = limits_of(self.records, drive, outputs), ""
+        rig = dict(self.rig)
+        if not drive:
+            unused = [name for name in rig if name not in outputs]
+            rig = {name: value for name, value in rig.items() if name in outputs}
+            if unused:
+                note = f"measured runs are varied; limits of {', '.join(unused)} do not apply"
+        found = propose_runs(
+            rivals, self.records, errors, limits.given(rig), aim=aim, jobs=self.numerics.jobs
+        )
+        return found, note
+
+
+def _of_structures(
+    loop: ClosedLoop, structures: StructurePosterior, plan: _Plan
+) -> tuple[Question, ...]:
+    """The question which of the most probable structures is true; none where that is decided, or
+    most probably nothing is missing."""
+    weights: dict[tuple[Added, ...], float] = {}
+    for one in structures.structures:
+        if one.effects or not one.outside:
+            weights[one.effects] = weights.get(one.effects, 0.0) + one.probability
+    ordered = sorted(weights, key=lambda effects: -weights[effects])
+    leading = [e for e in ordered if weights[e] >= LEAST][: plan.numerics.policy.proposal_rivals]
+    chosen = leading if len(leading) > 1 else ordered[:2]
+    total = sum(weights.values())
+    if len(chosen) < 2 or weights[chosen[0]] > DECIDED * total or structures.nothing > 0.5 * total:
+        return ()
+    names = tuple(structure_label(effects, chosen) for effects in chosen)
+    number = len(loop.rounds)
+    plan.callback(f"look for a run that distinguishes {', '.join(names)}")
     try:
-        # A campaign without a possible next run fails before rivals are estimated.
-        drive_of([Rival("", item.before.fit)] * 2, records)
-        rivals, failed = rivals_of(item, chosen, numerics)
-        note = "; ".join(f"{name} could not be estimated: {why}" for name, why in failed.items())
+        first = loop.first
+        scores = [item.score for item in loop.rounds[0].ranking]
+        fits = structure_fits(first.base(), first.assembly, scores, chosen, plan.numerics)
+        rivals, failed = [], []
+        for effects, name, found in zip(chosen, names, fits, strict=True):
+            if found is not None and np.isfinite(found.fit.point.covariance).all():
+                own = tuple(unknown for key in found.effects.values() for unknown in key)
+                sizes = sizes_of(found.fit, own, int(found.fit.problem.counts.sum()))
+                rivals.append(Rival(name, found.fit, weights[effects], sizes))
+            else:
+                failed.append(name)
+        if len(rivals) < 2:
+            raise ModelError(f"{', '.join(failed)} could not be estimated", hint="name others")
+        proposals, unused = plan.proposed(rivals, loop.final.fit_errors)
+    except InputError as error:
+        return (Question(number, STRUCTURES, names, None, error.problem),)
+    notes = [f"{name}, which could not be estimated" for name in failed]
+    rest = 1.0 - sum(weights[effects] for effects in chosen)
+    if rest > LEAST:
+        notes.append(f"other structures, and what predicts nothing (probability {rest:.2f})")
+    notes += [unused] if unused else []
+    return (Question(number, STRUCTURES, proposals.rivals, proposals, "; ".join(notes)),)
+
+
+def structure_label(effects: Sequence[Added], among: Sequence[Sequence[Added]]) -> str:
+    """Ids of a structure's effects, with their targets where an effect has several."""
+    every = {key for other in among for key in other}
+    several = {effect for effect, _ in every if sum(e == effect for e, _ in every) > 1}
+    names = [f"{effect} @ {target}" if effect in several else effect for effect, target in effects]
+    return " + ".join(names) or NOTHING
+
+
+def _of_parameters(loop: ClosedLoop, aim: str, plan: _Plan) -> Question:
+    """The question which run makes the final model's parameters more precise."""
+    number, name = len(loop.rounds), structure_label(loop.final.assembly.added, ())
+    own = "" if aim == PARAMETERS else aim
+    plan.callback(f"look for a run that makes {own or 'parameters'} more precise")
+    try:
+        check_aim(aim, tuple(loop.final.fit.shared))
+        rivals = [Rival(name or NOTHING, loop.final.fit)]
+        found, note = plan.proposed(rivals, loop.final.fit_errors, aim)
+        return Question(number, PARAMETERS, (name,), found, note, own)
+    except InputError as error:
+        return Question(number, PARAMETERS, (name,), None, error.problem, own)
+
+
+def _of_round(
+    number: int, kind: str, item: Round, chosen: Sequence[Ranked], plan: _Plan
+) -> Question:
+    """The question which of some candidates of a round is true."""
+    names = tuple(label(one, chosen) for one in chosen)
+    plan.callback(f"look for a run that distinguishes {', '.join(names)}")
+    try:
+        rivals, failed = rivals_of(item, chosen, plan.numerics)
+        notes = [f"{name} could not be estimated: {why}" for name, why in failed.items()]
         if len(rivals) < 2 and failed:
-            raise ModelError(f"fewer than two rivals are left: {note}", hint="name others")
-        drive = drive_of(rivals, records)
-        limits = Limits.of(records, drive, rivals[0].fit.predictor.outputs).given(rig)
-        errors = _left(item, rivals[0], numerics)
-        found = propose_runs(rivals, records, errors, limits, jobs=numerics.jobs)
-        return Question(number, kind, found.rivals, found, note)
+            raise ModelError(f"fewer than two rivals are left: {notes[0]}", hint="name others")
+        found, unused = plan.proposed(rivals, _left(item, rivals[0], plan.numerics))
+        notes += [unused] if unused else []
+        return Question(number, kind, found.rivals, found, "; ".join(notes))
     except InputError as error:
         if kind == ASKED:
             raise
@@ -252,9 +364,12 @@ def proposals_entry(question: Question, unit: str) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "round": question.number,
         "question": question.kind,
+        "parameter": question.aim,
         "rivals": list(question.rivals),
+        "probabilities": [] if found is None else list(found.weights),
+        "entropy": 0.0 if found is None else found.entropy,
         "note": question.note,
-        "drive": None if found is None else found.drive,
+        "drive": found.drive or None if found is not None else None,
         "unit": unit,
         "runs": [],
         "repeat": None,
@@ -274,18 +389,28 @@ def proposals_entry(question: Question, unit: str) -> dict[str, Any]:
 
 def _trial(found: Proposals, trial: ProposedRun) -> dict[str, Any]:
     first, second = np.triu_indices(len(found.rivals), 1)
-    sigma = trial.separation.sigma
-    pairs = [
-        {"rivals": [found.rivals[i], found.rivals[j]], "sigma": float(sigma[i, j])}
-        for i, j in zip(first, second, strict=True)
-    ]
+    pairs = []
+    if trial.separation is not None:
+        sigma = trial.separation.sigma
+        pairs = [
+            {"rivals": [found.rivals[i], found.rivals[j]], "sigma": float(sigma[i, j])}
+            for i, j in zip(first, second, strict=True)
+        ]
+    ratios = {} if trial.precision is None else trial.precision.ratio
+
+    def number(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
     return {
-        "frequency": trial.frequency,
-        "mean": trial.mean,
-        "amplitude": trial.amplitude,
-        "information": trial.separation.information,
-        "sigma": trial.separation.weakest,
+        "like": trial.like,
+        "change": trial.change,
+        "frequency": number(trial.frequency),
+        "mean": number(trial.mean),
+        "amplitude": number(trial.amplitude),
+        "information": trial.information,
+        "sigma": trial.weakest if trial.separation is not None else None,
         "pairs": pairs,
+        "sd_ratio": ratios,
     }
 
 
@@ -295,7 +420,7 @@ def proposals_group(questions: Sequence[Question], unit: str) -> dict[str, xr.Da
     Parameters
     ----------
     questions : sequence of Question
-        Those without an answer are left out.
+        Those without an answer are left out, and those whose runs vary measured ones.
     unit : str
         SI unit of the channel that drives the model.
 
@@ -304,7 +429,11 @@ def proposals_group(questions: Sequence[Question], unit: str) -> dict[str, xr.Da
     dict of str to Dataset
         Empty where no question was answered.
     """
-    answered = [(q, q.proposals) for q in questions if q.proposals and q.proposals.trials]
+    answered = [
+        (q, q.proposals)
+        for q in questions
+        if q.proposals and q.proposals.trials and q.proposals.drive
+    ]
     if not answered:
         return {}
     keys = ("mean", "amplitude", "frequency")
@@ -315,7 +444,8 @@ def proposals_group(questions: Sequence[Question], unit: str) -> dict[str, xr.Da
     for k, (_, found) in enumerate(answered):
         for rank, trial in enumerate(found.trials, start=1):
             place = [axis.index(getattr(trial, key)) for axis, key in zip(axes, keys, strict=True)]
-            values = (trial.separation.information, trial.separation.weakest, rank)
+            sigma = np.nan if trial.separation is None else trial.weakest
+            values = (trial.information, sigma, rank)
             for name, value in zip(ABOUT, values, strict=True):
                 found_at[name][(k, *place)] = value
     dims = (schema.ROUND, schema.MEAN, schema.AMPLITUDE, schema.FREQUENCY)

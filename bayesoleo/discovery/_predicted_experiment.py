@@ -1,20 +1,8 @@
-"""Feasible runs, their predictive distributions, and how well they separate rivals.
+"""Feasible runs, and what rival models predict of them.
 
 The rig limits the amplitude, frequency and mean of the imposed motion, and the range of the rig and
-the specimen.
-
-Rival ``i`` predicts the outputs as normal, ``N(m_i, I + A_i' A_i)`` in units of the noise: the
-noise of the samples plus the remaining uncertainty of its parameters. If ``i`` is true, the
-expected logarithm of the Bayes factor against ``j`` is the Kullback-Leibler divergence
-
-    KL(i, j) = [tr(S_j^-1 S_i) - n + d' S_j^-1 d + ln(|S_j| / |S_i|)] / 2,   d = m_i - m_j.
-
-The Bhattacharyya distances bound the expected information on *which* of several rivals is true from
-below. Unlike a sum over pairs, this bound cannot be large because of one pair alone.
-
-References
-----------
-Box and Hill (1967), Technometrics 9, 57-71; Kolchinsky and Tracey (2017), Entropy 19, 361.
+the specimen. A rival predicts the outputs as normal, linearised about its estimate, in units of the
+noise that the average over a new run's periods would have.
 """
 
 from __future__ import annotations
@@ -25,9 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.discovery._expected_information import PredictiveDistribution
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._structure_evidence import sizes_between
 from bayesoleo.errors import InputError
 from bayesoleo.model._expressions import COSINE, SINE, WITHIN
+from bayesoleo.model._initial_states import START
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._predictor import Layout, Predictor
 from bayesoleo.prediction._records import Harmonics, Record
@@ -290,98 +281,74 @@ def _even(limits: Range, count: int, size: float) -> Array:
 
 
 @dataclass(frozen=True)
-class PredictiveDistribution:
-    """Predictive distribution of an experiment by one rival, in units of the noise.
+class Size:
+    """An amplitude, if its prior has a certain size.
 
     Parameters
     ----------
-    mean : ndarray, shape (n,)
-        Outputs.
-    spread : ndarray, shape (r, n)
-        Their change by one standard deviation in each of ``r`` independent uncertain directions.
+    name : str
+        Of the amplitude.
+    weight : float
+        Probability of the size.
+    mean, sd : float
+        Of the amplitude, given the size.
     """
 
-    mean: Array
-    spread: Array
+    name: str
+    weight: float
+    mean: float
+    sd: float
 
 
-@dataclass(frozen=True)
-class Separation:
-    """Separation of ``k`` rivals by an experiment.
+#: Sizes that a prior is a mixture of, and the least probability of one.
+SIZES, RARE = 8, 1e-3
+
+
+def sizes_of(fit: ModelFit, amplitudes: Sequence[str], samples: int) -> tuple[Size, ...]:
+    """What the least certain amplitude of an estimated structure is a mixture of.
+
+    Probabilities of structures rest on a prior of sizes that reaches from the smallest visible
+    change of the outputs to the signal itself. A better run shows smaller changes, and that prior
+    then begins lower. The part of a structure's probability that it would have if its effect were
+    absent is therefore not lowered by any run: it belongs to sizes that none shows, and predicts
+    what the structure without the effect does.
 
     Parameters
     ----------
-    log_bayes_factor : ndarray, shape (k, k)
-        Expected value, in nats, for the rival of the row against that of the column if the former
-        is true.
-    information : float
-        Lower bound of the expected information on which of them is true, with equal prior
-        probabilities, in bits.
+    fit : ModelFit
+        Of the structure.
+    amplitudes : sequence of str
+        Unknowns of its effects' amplitudes.
+    samples : int
+        Of all runs and outputs.
     """
-
-    log_bayes_factor: Array
-    information: float
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations by which each pair is separated, shape (k, k).
-
-        ``sqrt(2 L)`` with the smaller of the pair's two expected log Bayes factors ``L``: with all
-        parameters known, the distance of the two predictions in units of the noise.
-        """
-        smaller = np.minimum(self.log_bayes_factor, self.log_bayes_factor.T)
-        return np.sqrt(2.0 * smaller)
-
-    @property
-    def weakest(self) -> float:
-        """Separation of the weakest pair, in standard deviations."""
-        return float(self.sigma[np.triu_indices(len(self.sigma), 1)].min())
-
-
-def separate(rivals: Sequence[PredictiveDistribution]) -> Separation:
-    """Expected log Bayes factors between all rivals, and the information about which is true.
-
-    Parameters
-    ----------
-    rivals : sequence of PredictiveDistribution
-        Two or more, of the same experiment in the same units.
-
-    Returns
-    -------
-    Separation
-    """
-    means, spreads = _reduced(rivals)
-    size, count = means.shape[1], len(rivals)
-    covariances = [np.eye(size) + spread.T @ spread for spread in spreads]
-    logs = [float(np.linalg.slogdet(S)[1]) for S in covariances]
-    factor, overlap = np.zeros((count, count)), np.ones((count, count))
-    for i in range(count):
-        for j in range(count):
-            if i == j:
-                continue
-            S, d = covariances[j], means[i] - means[j]
-            solved = np.linalg.solve(S, np.column_stack([covariances[i], d]))
-            twice = np.trace(solved[:, :-1]) - size + d @ solved[:, -1] + logs[j] - logs[i]
-            factor[i, j] = max(twice / 2, 0.0)  # round-off may make zero negative
-            overlap[i, j] = np.exp(-_bhattacharyya(covariances[i], S, d, logs[i], logs[j]))
-    information = float(-np.mean(np.log2(overlap.mean(axis=1))))
-    return Separation(factor, max(information, 0.0))
-
-
-def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Array]]:
-    """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are
-    uncertain; in all others their predictions are equal."""
-    moved = [rival.mean - rivals[0].mean for rival in rivals]
-    rows = np.concatenate([np.stack(moved), *(rival.spread for rival in rivals)])
-    basis, _ = np.linalg.qr(rows.T)
-    return np.stack(moved) @ basis, [rival.spread @ basis for rival in rivals]
-
-
-def _bhattacharyya(A: Array, B: Array, d: Array, log_a: float, log_b: float) -> float:
-    """Bhattacharyya distance of two normal densities, from the logarithms of their determinants."""
-    mean = (A + B) / 2
-    between = float(np.linalg.slogdet(mean)[1]) - (log_a + log_b) / 2
-    return max(float(d @ np.linalg.solve(mean, d)) / 8 + between / 2, 0.0)
+    names, covariance = fit.problem.names, fit.point.covariance
+    place = [names.index(name) for name in amplitudes if name in names]
+    if not place:
+        return ()
+    sd = np.sqrt(np.diag(covariance))
+    k = min(place, key=lambda k: abs(fit.point.theta[k]) / sd[k])
+    # The likelihood alone: the estimate without the prior of its own fit.
+    prior = 1.0 / float(fit.problem.priors[k].sd) ** 2
+    precision = max(1.0 / sd[k] ** 2 - prior, 1e-6 / sd[k] ** 2)
+    mean, error = fit.point.theta[k] / sd[k] ** 2 / precision, 1.0 / np.sqrt(precision)
+    column = fit.predictor.layout.names.index(names[k])
+    seen = [p.sensitivity[:, column] for p in fit.predictions]
+    signal = [run.measured for run in fit.predictor.runs]
+    noise = np.sqrt(fit.point.variance)
+    norm = np.sqrt(sum(np.sum((s / noise[:, None]) ** 2) for s in seen))
+    reach = max(float(np.max(np.std(y, axis=1) / noise)) for y in signal)
+    sizes = sizes_between(reach, samples, SIZES) * np.sqrt(samples) / norm
+    whole = sizes**2 + error**2
+    logs = -0.5 * (mean**2 / whole + np.log(whole))
+    shown = np.exp(logs - logs.max())
+    absent = np.exp(-0.5 * (mean**2 / error**2 + np.log(whole)) - logs.max()).sum()
+    unseen = min(float(absent / shown.sum()), 1.0)
+    weights = (1.0 - unseen) * shown / shown.sum()
+    means, sds = mean * sizes**2 / whole, sizes * error / np.sqrt(whole)
+    rows = zip(weights, means, sds, strict=True)
+    found = [Size(names[k], float(w), float(m), float(s)) for w, m, s in rows if w > RARE]
+    return (Size(names[k], max(unseen, RARE), 0.0, 0.0), *found)
 
 
 @dataclass(frozen=True)
@@ -391,13 +358,52 @@ class Rival:
     Parameters
     ----------
     name : str
-        The effect by which it differs.
+        The effects by which it differs.
     fit : ModelFit
         Its fit to the existing runs.
+    weight : float
+        Its probability, but for a factor that all rivals share.
+    sizes : tuple of Size
+        What its least certain amplitude is a mixture of; none where it is as estimated.
     """
 
     name: str
     fit: ModelFit
+    weight: float = 1.0
+    sizes: tuple[Size, ...] = ()
+
+
+@dataclass(frozen=True)
+class NewRunNoise:
+    """Noise that an output would have in a new run.
+
+    Parameters
+    ----------
+    frequency : ndarray, shape (f,)
+        Hz, ascending.
+    variance : ndarray, shape (f,)
+        Of an orthonormal Fourier coefficient, at that frequency, of the average over the run's
+        periods at :data:`POINTS` points, SI.
+    sample : float
+        Standard deviation of a single sample of a transient, SI.
+    """
+
+    frequency: Array
+    variance: Array
+    sample: float
+
+    def divided(self, values: Array, record: Record) -> Array:
+        """Signals ``(..., n)`` of an output in units of the noise: coefficients ``(..., n)`` of a
+        periodic run, samples of a transient."""
+        if not record.periodic:
+            return values / self.sample
+        size = values.shape[-1]
+        orders = np.arange(size // 2 + 1)
+        single = (orders == 0) | (2 * orders == size)
+        found = np.fft.rfft(values, norm="ortho", axis=-1)
+        level = np.interp(orders * record.frequency, self.frequency, self.variance)
+        found = found * np.where(single, 1.0, np.sqrt(2.0)) / np.sqrt(level)
+        return np.concatenate([found.real, found.imag[..., ~single]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -411,16 +417,29 @@ class Knowledge:
     root : ndarray, shape (r, l)
         Their change by one standard deviation in each independent direction.
     model : Model
+    names : tuple of str
+        The ``l`` unknowns.
     """
 
     theta: Array
     root: Array
     model: Model
+    names: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, fit: ModelFit) -> Knowledge:
+    def of(cls, fit: ModelFit, like: str = "", start: float = 1.0) -> Knowledge:
         """The distribution by the fit. Shared parameters have their posterior, by-run parameters
-        the scatter between the runs, or their priors where there are few runs."""
+        the scatter between the runs, or their priors where there are few runs.
+
+        Parameters
+        ----------
+        fit : ModelFit
+        like : str
+            Run that the new one varies: its by-run parameters are expected again. The start of a
+            transient is known no better than by its prior.
+        start : float
+            Factor of that run's estimated start.
+        """
         model = fit.model
         layout = Layout.of(model, ["any"])
         values, names = fit.values, fit.problem.names
@@ -435,10 +454,13 @@ class Knowledge:
                         covariance[k, j] = fit.point.covariance[a, b]
             elif model.parameters[owner].by_run:
                 own = [value for key, value in values.items() if key.startswith(f"{owner}[")]
+                begins = owner.startswith(START)
                 theta[k] = np.mean(own) if own else theta[k]
-                if len(own) >= fit.policy.enough_runs and not model.parameters[owner].measured:
+                theta[k] = values.get(f"{owner}[{like}]", theta[k]) * (start if begins else 1.0)
+                known = len(own) >= fit.policy.enough_runs and not begins
+                if known and not model.parameters[owner].measured:
                     covariance[k, k] = np.var(own, ddof=1) * (1 + 1 / len(own))
-        return cls(theta, _root(covariance), model)
+        return cls(theta, _root(covariance), model, layout.names)
 
 
 def _root(covariance: Array) -> Array:
@@ -484,32 +506,33 @@ def blank_record(
 
 
 def predictive_distribution(
-    rival: Rival, known: Knowledge, record: Record, noise: Mapping[str, float]
+    fit: ModelFit, known: Knowledge, record: Record, noise: Mapping[str, NewRunNoise]
 ) -> tuple[PredictiveDistribution, Array] | Status:
     """Predictive distribution of a run by one rival.
 
     Parameters
     ----------
-    rival : Rival
+    fit : ModelFit
+        Of the rival.
     known : Knowledge
         Distribution of its parameters.
     record : Record
-        From :func:`blank_record`.
-    noise : mapping of str to float
-        Standard deviation of the average over the run's periods at each point, by output, SI.
+        From :func:`blank_record`, or a variation of a run that was measured.
+    noise : mapping of str to NewRunNoise
+        By output.
 
     Returns
     -------
     PredictiveDistribution
         In units of the noise, outputs one after the other.
-    ndarray, shape (ny, POINTS)
+    ndarray, shape (ny, n)
         Outputs, SI.
 
     If there is no solution, its status is returned instead.
     """
-    fit = rival.fit
     fed_back = [name for name in known.model.inputs if WITHIN in name]
     fed_back = [name for name in fed_back if not name.startswith((COSINE, SINE))]
+    fed_back = fed_back if record.periodic else []
     record = replace(record, harmonics={**record.harmonics, **_nothing(fed_back)})
     for _ in range(PASSES if fed_back else 1):
         predictor = Predictor(
@@ -521,15 +544,18 @@ def predictive_distribution(
         record = replace(
             record, harmonics={**record.harmonics, **_responses(predictor, found.y, fed_back)}
         )
-    scale = np.array([1.0 / noise[name] for name in predictor.outputs])[:, None]
-    sure = np.einsum("rl,yln->ryn", known.root, found.sensitivity) * scale
+
+    def divided(values: Array) -> Array:
+        """Signals (ny, ..., n) in units of the noise, outputs one after the other."""
+        pairs = zip(predictor.outputs, values, strict=True)
+        return np.concatenate([noise[name].divided(rows, record) for name, rows in pairs], axis=-1)
+
+    sure = np.einsum("rl,yln->yrn", known.root, found.sensitivity)
     entered = input_columns(predictor.runs[0], predictor.constants(known.theta[None], 0)[0])
-    entered = np.moveaxis(entered, 1, 0) * scale
-    size = found.y.size
-    spread = np.concatenate([sure.reshape(-1, size), entered.reshape(-1, size)])
+    spread = np.concatenate([divided(sure), divided(entered)])
     if not (np.isfinite(spread).all() and np.isfinite(found.y).all()):
         return Status.INADMISSIBLE
-    return PredictiveDistribution((found.y * scale).ravel(), spread), found.y
+    return PredictiveDistribution(divided(found.y), spread, len(known.root)), found.y
 
 
 def _nothing(fed_back: list[str]) -> dict[str, Harmonics]:

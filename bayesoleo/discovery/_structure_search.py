@@ -303,6 +303,22 @@ def _extended(
     return estimated
 
 
+def structure_fits(
+    base: Base,
+    assembly: Assembly,
+    scores: Sequence[Score],
+    structures: Sequence[tuple[Added, ...]],
+    numerics: Numerics,
+) -> list[EstimatedModel | None]:
+    """Estimates of some structures; None where one failed. No effects are the base itself."""
+    extended = _extended(base, assembly, {s.option.key: s for s in scores}, numerics)
+
+    def fitted(effects: tuple[Added, ...]) -> EstimatedModel | None:
+        return extended(effects) if effects else EstimatedModel(base.fit, {})
+
+    return thread_map(fitted, list(structures), numerics.jobs)
+
+
 def curves_of(
     base: Base, assembly: Assembly, jobs: int | None = None
 ) -> dict[CurveKey, tuple[Array, ...]]:

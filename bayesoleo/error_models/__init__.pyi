@@ -32,6 +32,10 @@ from ._independent import (
     output_counts as output_counts,
     staged_variance as staged_variance,
 )
+from ._power import (
+    PowerErrors as PowerErrors,
+    effective_samples as effective_samples,
+)
 from ._registry import (
     ERROR_MODELS as ERROR_MODELS,
     error_model as error_model,

@@ -162,6 +162,8 @@ class Frame:
         Prior of the logarithm of an output's variance where it is not flat.
     signatures : Signatures or None
         Of the effects that the model might lack, if they are known.
+    effective : ndarray, shape (N, s), or None
+        Effective number of independent samples, if it is known.
     """
 
     outputs: tuple[str, ...]
@@ -170,6 +172,7 @@ class Frame:
     samples: tuple[RunSamples, ...] | None
     log_variance_prior: Mapping[str, Prior]
     signatures: Signatures | None = None
+    effective: Array | None = None
 
     @classmethod
     def of(cls, problem: Measured, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
@@ -182,6 +185,7 @@ class Frame:
             None if samples is None else tuple(samples),
             dict(log_variance_prior or {}),
             getattr(problem, "signatures", None),
+            getattr(problem, "effective", None),
         )
 
     def log_variances(self) -> tuple[Quantity, ...]:

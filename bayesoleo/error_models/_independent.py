@@ -249,15 +249,17 @@ def log_likelihood(sums: Array, variance: Array, counts: Integers) -> float:
         return float(-0.5 * np.sum(counts * np.log(variance) + sums / variance))
 
 
-def log_likelihood_by_run(sum_of_squares: Array, counts: Integers, log_variance: Array) -> Array:
+def log_likelihood_by_run(
+    sum_of_squares: Array, counts: Integers | Array, log_variance: Array
+) -> Array:
     """Normalised log-likelihood of every run.
 
     Parameters
     ----------
     sum_of_squares : ndarray, shape (L, N, s)
         Sums of squared residuals by parameter vector, run and output.
-    counts : ndarray of int, shape (N, s)
-        Number of samples by run and output.
+    counts : ndarray, shape (N, s)
+        Number of samples by run and output; of a power of the likelihood, the effective number.
     log_variance : ndarray, shape (L, s)
         Natural logarithm of each output's error variance.
 

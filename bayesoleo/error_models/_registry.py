@@ -14,6 +14,7 @@ word                   errors
 ``discrepancy``        white noise and a periodic Gaussian process over phase, for each output
 ``shared-discrepancy`` as ``discrepancy``, with a part of the process that all runs share
 ``catalogue``          all effects that the model might lack, and a smooth remainder
+``power``              as ``independent``, the likelihood to the power of the effective samples
 ====================== =============================================================================
 """
 
@@ -33,6 +34,7 @@ from bayesoleo.error_models._independent import (
     ProfiledCommonErrors,
     ProfiledIndependentErrors,
 )
+from bayesoleo.error_models._power import PowerErrors
 from bayesoleo.errors import InputError, choose
 from bayesoleo.model._priors import Prior
 
@@ -53,6 +55,7 @@ _REGISTRY = {
     "discrepancy": _Forms(DiscrepancyErrors, None),
     "shared-discrepancy": _Forms(SharedDiscrepancyErrors, None),
     "catalogue": _Forms(CatalogueErrors, None),
+    "power": _Forms(PowerErrors, None),
     "common": _Forms(None, ProfiledCommonErrors),
     "given": _Forms(None, GivenErrors),
 }

@@ -42,6 +42,8 @@ class CampaignProblem:
         self._last: tuple[Array, Evaluation] | None = None
         #: Of the effects that the model might lack, if they were computed.
         self.signatures: Signatures | None = None
+        #: Effective number of samples by run and output, if it was computed.
+        self.effective: Array | None = None
         layout = predictor.layout
         self._all_priors = layout.priors(predictor.model)
         self._free = np.arange(len(layout.names)) if free is None else free

@@ -181,6 +181,8 @@ class FunctionProblem:
         if isinstance(x, np.ndarray | list | tuple) and len(x) != self._y.size and length:
             self._prediction.one(self._start)
         self._output = output
+        #: Effective number of samples by run and output, if it was computed.
+        self.effective: Array | None = None
         self._sd = np.array([prior.sd for prior in self._priors])
         self._support = np.array([prior.support for prior in self._priors])
 

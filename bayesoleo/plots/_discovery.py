@@ -287,7 +287,8 @@ def proposal(tree: xr.DataTree, number: int = 0) -> Figure:
         the best of those that were not.
     """
     data = tree[schema.PROPOSAL].to_dataset().isel({schema.ROUND: number})
-    sigma = data["sigma"].max(schema.MEAN)
+    told = data["sigma"] if np.isfinite(data["sigma"]).any() else data["information"]
+    sigma = told.max(schema.MEAN)
     scale = engineering(reading.unit(data[schema.AMPLITUDE]), float(data[schema.AMPLITUDE].max()))
     height = PROPOSAL_TOP + HIGH + PROPOSAL_BOTTOM
     figure = style.blank(style.WIDTH * 0.72, height)
@@ -310,7 +311,8 @@ def proposal(tree: xr.DataTree, number: int = 0) -> Figure:
     bar = figure.colorbar(
         mesh, cax=figure.add_axes((1 - 0.95 / width, box[1], 0.16 / width, box[3]))
     )
-    bar.set_label("separation in standard deviations", fontsize=style.SMALL)
+    label = "separation in standard deviations" if told.name == "sigma" else "information in bits"
+    bar.set_label(label, fontsize=style.SMALL)
     bar.ax.tick_params(labelsize=style.SMALL)
     bar.ax.yaxis.set_major_formatter("{x:g}")
     _marks(axes, tree, data, scale)
@@ -321,7 +323,8 @@ def proposal(tree: xr.DataTree, number: int = 0) -> Figure:
     drive = tree[schema.PROPOSAL].attrs["drive"]
     axes.set_ylabel(scale.label(f"amplitude of {drive}"), fontsize=style.TEXT)
     titles = reading.summary(tree).get("titles", {})
-    rivals = listed([called(one, titles) for one in json.loads(str(data["rivals"].values))])
+    names = [e for one in json.loads(str(data["rivals"].values)) for e in one.split(" + ")]
+    rivals = listed([called(one, titles) for one in dict.fromkeys(names)])
     handles = [
         Line2D([], [], color=style.INK, marker="o", ms=4, ls="", label="runs made"),
         Line2D([], [], color=style.BEFORE, marker="*", ms=11, ls="", label="best run"),

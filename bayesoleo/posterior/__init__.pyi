@@ -1,3 +1,7 @@
+from ._bayesbag import (
+    BayesBag as BayesBag,
+    bayesbag as bayesbag,
+)
 from ._comparison import (
     DRAWS as DRAWS,
     Uniformity as Uniformity,

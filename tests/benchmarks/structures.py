@@ -90,6 +90,11 @@ MEASURED: dict[tuple[str, ...], Callable[[int], Mapping[str, float | str]]] = {
     ("coverage_plain", "width_plain"): lambda count: coverage.plain(count, SEED),
     ("coverage_coloured",): lambda count: coverage.coloured(count, SEED),
     ("coverage_prediction",): lambda count: coverage.prediction(count, SEED),
+    tuple(
+        f"{key}_{word}"
+        for word in coverage.WORDS
+        for key in ("coverage_inside", "coverage_outside", "width_inside")
+    ): lambda count: coverage.side_by_side(count, SEED),
     ("density_ratio",): density_ratio,
     PROBABILITIES: probabilities,
 }

@@ -20,6 +20,9 @@ coverage_coloured    nothing is missing, AR(1) noise of coefficient 0, 0.5 or 0.
 coverage_prediction  samples of a held-out run within their predictive intervals, effect missing
 ==================== ===============================================================================
 
+``coverage_inside_<word>`` and ``coverage_outside_<word>`` are the first two by an error model of a
+user's choice, or BayesBag, on the same campaigns; ``width_inside_<word>`` the widths.
+
 ``width_plain`` is the mean width over that under independent errors where nothing is missing.
 """
 
@@ -45,9 +48,10 @@ from bayesoleo.discovery._signatures import Lines, colour_of, lines_of, noise_of
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.error_models._catalogue import Linearised
+from bayesoleo.error_models._power import effective_samples
 from bayesoleo.estimation._problem import Evaluation, Misfit
 from bayesoleo.model import Normal
-from bayesoleo.posterior import LogDensity
+from bayesoleo.posterior import LogDensity, bayesbag
 from bayesoleo.posterior._laplace import Mode, find_mode, start_coordinates
 from bayesoleo.solvers._orbit import Status
 
@@ -153,6 +157,7 @@ class Campaign:
         self.priors = tuple(Normal(0.0, 1.0) for _ in self.names)
         self.start = np.zeros(len(self.names))
         self.samples = base.samples
+        self.effective: Array | None = None
         self.counts = np.array([[one.shape[1]] * len(self.outputs) for one in self.y])
 
     def residuals(self, theta: Array, run: int) -> tuple[Array, NDArray[np.int64]]:
@@ -353,6 +358,67 @@ def _linearised(
     campaign.signatures = None
     sensitivity = [list(j) for j in campaign.base.sensitivity]
     return errors.linearised(sensitivity, [list(e) for e in left], np.eye(len(theta)), -theta)
+
+
+#: Ways to intervals that are shown side by side.
+WORDS = ("independent", "discrepancy", "catalogue", "power", "bayesbag")
+
+
+def by_word(found: Drawn, word: str, signatures: Signatures | None) -> Analysed:
+    """The estimate under an error model of a user's choice, or by BayesBag over runs."""
+    campaign = found.campaign
+    plain = LogDensity(campaign)
+    first = find_mode(plain, start_coordinates(plain, np.zeros(len(campaign.names))))
+    size = len(campaign.names)
+    theta = plain.natural(first.centre[None])[0, :size]
+    left = [campaign.residuals(theta[None], r)[0][0] for r in range(len(campaign.runs))]
+    if word == "independent":
+        return Analysed(plain, first.centre, first.covariance, word)
+    covariance = np.zeros((len(first.centre), len(first.centre)))
+    if word == "bayesbag":
+        bag = bayesbag(campaign, theta)
+        covariance[:size, :size] = bag.covariance
+        return Analysed(plain, np.concatenate([bag.mean, first.centre[size:]]), covariance, word)
+    if word == "catalogue":
+        white = tuple((0.0, 1.0) for _ in campaign.outputs)
+        given = replace(signatures or campaign.base.signatures, colour=white)
+        kept = _linearised(campaign, given, theta, left)
+        covariance[:size, :size] = kept.covariance
+        centre = np.concatenate([theta + kept.shift, first.centre[size:]])
+        return Analysed(plain, centre, covariance, word)
+    campaign.effective = effective_samples(left, campaign.samples)
+    density = LogDensity(campaign, errors=word)
+    mode = find_mode(density, start_coordinates(density, theta))
+    return Analysed(density, mode.centre, mode.covariance, word)
+
+
+def side_by_side(
+    count: int,
+    seed: int,
+    words: Sequence[str] = WORDS,
+    kinds: Sequence[str] = KINDS,
+    seeds: Sequence[int] = (1, 2),
+) -> dict[str, float]:
+    """Coverage and median half width, in prior deviations, of each word on the same campaigns.
+
+    Keys are ``coverage_inside_<word>``, ``coverage_outside_<word>`` and ``width_inside_<word>``.
+    Only the catalogue's differ between inside and outside: no other word knows signatures.
+    """
+    inside: dict[str, list[float]] = {}
+    for number in range(count):
+        kind = kinds[number % len(kinds)]
+        rng = np.random.default_rng([seed, number, 0])
+        found = drawn(kind, seeds[number // len(kinds) % len(seeds)], rng, effect=True)
+        assert found.column is not None
+        for word in words:
+            for where in ("inside", "outside"):
+                known = None if where == "inside" else without(found.campaign.base, found.column)
+                if where == "inside" or word == "catalogue":
+                    hits, half = covered(found, by_word(found, word, known))
+                inside.setdefault(f"coverage_{where}_{word}", []).extend(hits.astype(float))
+                if where == "inside":
+                    inside.setdefault(f"width_inside_{word}", []).append(float(np.median(half)))
+    return {key: float(np.mean(values)) for key, values in inside.items()}
 
 
 def covered(found: Drawn, mode: Analysed | Mode) -> tuple[Array, Array]:

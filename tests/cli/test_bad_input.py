@@ -43,17 +43,16 @@ def test_bad_records(refused, campaign, model, name):
     assert message in refused("close", campaign, "--model", model)
 
 
-def test_a_transient_to_propose_from_is_refused_before_anything_is_estimated(
+def test_an_unknown_aim_is_refused_before_anything_is_estimated(
     refused, campaign, model, monkeypatch
 ):
     def estimated(*_):
         raise AssertionError
 
     monkeypatch.setattr("bayesoleo._workflow.closing.run_loop", estimated)
-    for frequency in ("frequency = 1.0", "frequency = 2.0"):
-        change(campaign / "campaign.toml", frequency, 'kind = "transient"')
-    message = "the next run can be proposed for periodic runs only"
-    assert message in refused("propose", campaign, "--model", model)
+    told = refused("propose", campaign, "--model", model, "--next-run", "stifness")
+    assert "unknown aim" in told
+    assert "structures, parameters" in told
 
 
 BAD_TOML = {

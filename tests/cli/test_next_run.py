@@ -45,14 +45,14 @@ def test_the_run_that_separates_is_printed_and_drawn(run, springs, tmp_path):
     ask = ("propose", springs, "--model", springs / "model.py", "--limit", "force=:", *SPRINGS)
     result = run(*ask, "--figure", tmp_path / "map.png")
     assert result.exit_code == 0, result.output
-    assert "mean 0 mm, amplitude 50.0 mm would separate linear stiffness from" in result.stdout
+    assert "mean 0 mm, amplitude 50.0 mm is expected to tell" in result.stdout
     assert (tmp_path / "map.png").stat().st_size > 10_000
     # The command line goes before the campaign.
     result = run(*ask, "--limit", "amplitude=5:20mm", "--json")
     (entry,) = json.loads(result.stdout)["proposals"]
     assert entry["runs"][0]["amplitude"] == pytest.approx(0.02)
     assert entry["question"] == "asked"
-    assert entry["repeat"]["sigma"] < entry["runs"][0]["sigma"]
+    assert entry["repeat"]["information"] < entry["runs"][0]["information"]
 
 
 @pytest.mark.parametrize(

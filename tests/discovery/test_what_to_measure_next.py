@@ -9,14 +9,18 @@ import pytest
 from fitted_states import NUMERICS, fitted
 from small_campaigns import damper, damper_campaign, oscillator_campaign
 
+from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import fit_model
-from bayesoleo.discovery._next_experiment import propose_runs
+from bayesoleo.discovery._next_experiment import expected_noise, propose_runs
 from bayesoleo.discovery._open_questions import named, rivals_of, standing
-from bayesoleo.discovery._predicted_experiment import Limits, Motion, Rival, planned_runs
+from bayesoleo.discovery._predicted_experiment import POINTS, Limits, Motion, Rival, planned_runs
 from bayesoleo.discovery._round import examine
+from bayesoleo.discovery._state import fit_state
+from bayesoleo.discovery._varied_runs import REACH, stretched, varied_runs
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
-from bayesoleo.model import Output
+from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._records import transient_record
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of
 from bayesoleo.systems import system
 
@@ -88,7 +92,7 @@ def test_without_larger_motions_the_best_run_is_hardly_better_than_those_made(sp
 def test_the_shortlist_has_one_run_a_frequency_and_is_ordered(proposals):
     short = proposals.shortlist(4)
     assert len({trial.frequency for trial in short}) == len(short) == 4
-    information = [round(trial.separation.information, 2) for trial in proposals.trials]
+    information = [trial.information for trial in proposals.trials]
     assert information == sorted(information, reverse=True)
 
 
@@ -207,35 +211,155 @@ def test_the_noise_of_a_mean_is_not_asked_of_a_rig(means, planned):
     assert run.mean == pytest.approx(planned)
 
 
-def test_transients_are_refused_by_name(springs):
+def test_probabilities_weigh_the_rivals(springs):
+    """What is nearly decided leaves little to be told."""
     reduced, outcome, rivals = springs
-    transient = replace(reduced.records[0], kind="transient", label="drop 1")
-    with pytest.raises(InputError, match="periodic runs only"):
-        propose_runs(rivals, [transient], outcome.before.fit_errors)
+    errors = outcome.before.fit_errors
+    sure = [replace(rivals[0], weight=0.98), replace(rivals[1], weight=0.02)]
+    equal, weighted = (propose_runs(r, reduced.records, errors, jobs=1) for r in (rivals, sure))
+    assert weighted.weights == pytest.approx((0.98, 0.02))
+    assert weighted.entropy < 0.15 < equal.entropy == pytest.approx(1.0)
+    assert all(trial.information <= weighted.entropy for trial in weighted.trials)
+    assert weighted.trials[0].information < equal.trials[0].information
 
 
-def test_a_model_with_two_measured_inputs_is_refused_by_their_names(springs):
-    reduced, outcome, _ = springs
-    two = damper(cubic=False)
+def test_the_noise_of_a_new_run_has_the_colour_of_the_measured_one(tmp_path):
+    """Against the spectrum of an AR(1) process, by frequency."""
+    coefficient, size, periods, per_period = 0.9, 5.0, 40, 100.37
+    reduced = damper_campaign(
+        tmp_path, truth, runs=RUNS[:2], noise=size, periods=periods, coloured=coefficient
+    )
+    state = fit_state(Assembly(damper(cubic=False)), _roles_of(reduced.records), NUMERICS)
+    noise = expected_noise(state.fit_errors, reduced.records[:1])["force"]
+    hertz = np.array([2.0, 5.0, 10.0, 20.0])  # of a run at 1 Hz
+    turn = np.exp(-2j * np.pi * hertz / per_period)
+    density = size**2 * (1 - coefficient**2) / np.abs(1 - coefficient * turn) ** 2
+    expected = POINTS * density / (periods * per_period)
+    found = np.interp(hertz, noise.frequency, noise.variance)
+    # A level is a mean over some forty lines, known to a fifth, and is drawn towards white noise.
+    np.testing.assert_allclose(found, expected, rtol=0.6)
+    assert found[0] > 10 * found[-1]
+
+
+def two_inputs(reduced):
+    """The damper with a second measured input, and records with it."""
+    one = damper(cubic=False)
+    terms = {**one.outputs["force"].terms, "warm": "warm*temperature"}
     two = replace(
-        two,
+        one,
         inputs={"displacement": "m", "temperature": "K"},
-        outputs={
-            "force": Output({**two.outputs["force"].terms, "warm": "damping*temperature"}, "N")
-        },
+        outputs={"force": Output(terms, "N")},
+        parameters={**one.parameters, "warm": Parameter(1.0, "N/K", sd=100.0)},
     )
     records = [
         replace(
             record,
-            samples={**record.samples, "temperature": record.samples["displacement"]},
-            harmonics={**record.harmonics, "temperature": record.harmonics["displacement"]},
+            samples={**record.samples, "temperature": 100 * record.samples["displacement"]},
+            harmonics={
+                **record.harmonics,
+                "temperature": replace(
+                    record.harmonics["displacement"],
+                    coefficients=100 * record.harmonics["displacement"].coefficients,
+                ),
+            },
             signal_noise={**record.signal_noise, "temperature": 0.0},
         )
         for record in reduced.records
     ]
-    rival = Rival("two inputs", fit_model(two, records, NUMERICS))
-    with pytest.raises(InputError, match=r"one input only.*temperature"):
-        propose_runs([rival, rival], records, outcome.before.fit_errors)
+    return two, records
+
+
+def test_of_two_inputs_the_phase_is_varied(springs):
+    """Inputs in phase cannot tell their parameters apart; another phase does."""
+    reduced, outcome, _ = springs
+    model, records = two_inputs(reduced)
+    fit = fit_model(model, records, NUMERICS)
+    rival, errors = Rival("two inputs", fit), outcome.before.fit_errors
+    found = propose_runs([rival], records, errors, aim="warm", jobs=1)
+    best = found.trials[0]
+    assert found.drive == ""
+    assert "cycles ahead" in best.change
+    assert best.information > found.best_repeat.information + 1
+    swings = {name: max(np.ptp(r.samples[name]) for r in records) for name in model.inputs}
+    for item in varied_runs(records, model, ("force",)):
+        for name, swing in swings.items():
+            # A finite grid of a period finds the extremes to a few parts in a thousand.
+            assert np.ptp(item.record.samples[name]) <= REACH * swing * 1.01
+
+
+def free_decay(label, start, stiffness=100.0):
+    """A mass on a spring with a damper, let go at a distance from its rest."""
+    time = np.arange(400) * 0.01
+    rate, omega = 0.4, np.sqrt(stiffness - 0.16)
+    x = start * np.exp(-rate * time) * (np.cos(omega * time) + rate / omega * np.sin(omega * time))
+    noise = 1e-3 * np.random.default_rng(len(label)).standard_normal(time.size)
+    return transient_record(label, time, {"displacement": x + noise})
+
+
+def test_a_transient_is_varied_by_its_start():
+    model = Model(
+        "decay",
+        dofs={"x": Dof("m")},
+        equations={
+            "x": {"inertia": "mass*ddot(x)", "damper": "damping*dot(x)", "spring": "stiffness*x"}
+        },
+        outputs={"displacement": Output({"x": "x"}, "m")},
+        parameters={
+            "mass": Parameter(1.0, "kg", fixed=True),
+            "damping": Parameter(1.0, "N*s/m", sd=1.0),
+            "stiffness": Parameter(90.0, "N/m", sd=50.0),
+        },
+    )
+    records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
+    state = fit_state(Assembly(model), _roles_of(records), NUMERICS)
+    rival = Rival("decay", state.fit)
+    found = propose_runs([rival], records, state.fit_errors, aim="stiffness", jobs=1)
+    best = found.trials[0]
+    assert best.like
+    assert best.change.startswith("start ×")
+    # The information on the stiffness rises with the square of the start: the largest is best.
+    largest = max(found.trials, key=lambda t: _start_of(t, {"a": 0.1, "bb": 0.2}))
+    assert _start_of(best, {"a": 0.1, "bb": 0.2}) == pytest.approx(
+        _start_of(largest, {"a": 0.1, "bb": 0.2}), rel=0.05
+    )
+    assert _start_of(best, {"a": 0.1, "bb": 0.2}) <= REACH * 0.2 * 1.05
+    assert best.information > found.best_repeat.information
+
+
+def _start_of(trial, starts):
+    factor = float(trial.change.rpartition("×")[2]) if "start" in trial.change else 1.0
+    return factor * starts[trial.like]
+
+
+def _roles_of(records):
+    from bayesoleo.discovery._assembly import Roles
+
+    return Roles(tuple(records), (), "all", ())
+
+
+def test_where_nothing_moves_it_is_said(springs):
+    reduced, _, _ = springs
+    model, records = two_inputs(reduced)
+    still = [
+        replace(r, samples={name: np.zeros_like(v) for name, v in r.samples.items()})
+        for r in records
+    ]
+    with pytest.raises(InputError, match="no input moves"):
+        varied_runs(still, model, ("force",))
+
+
+def test_a_curve_is_scaled_about_a_value_and_stretched_in_time():
+    time = np.arange(200) * 0.01
+    record = transient_record("a", time, {"x": np.sin(8 * time)})
+    curve = record.smoothed["x"]
+    found = stretched(curve, 1.5, 0.2, 2.0)
+    inside = np.linspace(0.3, 1.6, 50)
+    for derivative in (0, 1, 2):
+        expected = 1.5 * curve.at(inside, derivative) / 2.0**derivative
+        if derivative == 0:
+            expected = expected - 0.1
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found.at(2.0 * inside, derivative), expected, atol=1e-9 * scale)
 
 
 @pytest.mark.parametrize(

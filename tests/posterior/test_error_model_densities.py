@@ -24,9 +24,12 @@ class Campaign:
     lengths: tuple = (41, 60)
     frequency: float | None = 0.5
     counts: np.ndarray = field(init=False)
+    effective: np.ndarray = field(init=False)
 
     def __post_init__(self):
         self.counts = np.array([[n] * len(self.outputs) for n in self.lengths])
+        # Of the power likelihood.
+        self.effective = 0.4 * self.counts
 
     @property
     def samples(self):

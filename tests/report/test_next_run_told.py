@@ -5,13 +5,13 @@ from __future__ import annotations
 from bayesoleo._report.sentences import proposal_lines, proposal_table
 
 
-def trial(sigmas, amplitude=0.05, run=None):
+def trial(sigmas, amplitude=0.05, run=None, information=0.9):
     pairs = [{"rivals": list(pair), "sigma": sigma} for pair, sigma in sigmas.items()]
     entry = {
         "frequency": 2.0,
         "mean": 0.12,
         "amplitude": amplitude,
-        "information": 0.9,
+        "information": information,
         "sigma": min(sigmas.values()),
         "pairs": pairs,
     }
@@ -26,7 +26,9 @@ def entry(**changed):
         "drive": "displacement",
         "unit": "m",
         "runs": [trial({("a", "b"): 8.25})],
-        "repeat": trial({("a", "b"): 0.4}, 0.02, "run 3"),
+        "repeat": trial({("a", "b"): 0.4}, 0.02, "run 3", 0.1),
+        "entropy": 0.98,
+        "probabilities": [0.6, 0.4],
         "inseparable": [],
         "left_out": {},
         "note": "",
@@ -37,8 +39,49 @@ def entry(**changed):
 def test_two_rivals_are_told_with_the_run_in_an_engineers_units():
     question, answer = proposal_lines(entry())
     assert question == "These data cannot tell a, which was added, from b."
-    assert "2.00 Hz, mean 120 mm, amplitude 50.0 mm would separate a from b by 8.2 " in answer
-    assert "no present run, made once more, by more than 0.4." in answer
+    assert "A run at 2.00 Hz, mean 120 mm, amplitude 50.0 mm is expected to tell 0.90 " in answer
+    assert "bits of the 0.98 that are open; " in answer
+    assert "no present run, made once more, more than 0.10." in answer
+
+
+def test_what_is_told_of_the_best_run_is_what_it_was_ranked_by():
+    """A repetition may separate the weakest pair further and tell less."""
+    given = entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.5))
+    assert "0.90 bits" in proposal_lines(given)[1]
+    assert "more than 0.50" in proposal_lines(given)[1]
+
+
+def test_a_repetition_that_tells_more_than_any_new_run_is_told_first():
+    line = proposal_lines(entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.95)))[1]
+    assert line.startswith("run 3, made once more, is expected to tell 0.95 bits")
+    assert "one at 2.00 Hz" in line
+
+
+def test_probabilities_of_structures_are_told():
+    given = entry(question="structures", rivals=["a + c", "nothing"])
+    question = proposal_lines(given)[0]
+    assert question == "What is missing, by probability: a with c (0.60) and nothing (0.40)."
+
+
+def test_a_variation_of_a_measured_run_is_told_by_what_it_changes():
+    runs = [trial({("a", "b"): 3.0}) | {"like": "drop 2", "change": "force × 1.2, duration × 2"}]
+    repeat = trial({("a", "b"): 1.0}, run="drop 1", information=0.2)
+    repeat |= {"like": "drop 1", "change": "", "frequency": None, "mean": None, "amplitude": None}
+    given = entry(runs=runs, repeat=repeat, drive=None)
+    assert "like drop 2 with force × 1.2, duration × 2 is" in proposal_lines(given)[1]
+    table = proposal_table(given)
+    assert table.head[:3] == ["run", "as run", "changed"]
+    assert [row[2] for row in table.rows] == ["force × 1.2, duration × 2", "nothing"]
+
+
+def test_of_parameters_the_most_improved_are_told():
+    best = trial({("a", "b"): 0.0}) | {"pairs": [], "sigma": None}
+    best["sd_ratio"] = {"mass": 0.9, "damping": 0.25}
+    given = entry(question="parameters", parameter="", rivals=["nothing"], runs=[best], repeat=None)
+    question, answer = proposal_lines(given)
+    assert question == "To know the parameters more precisely:"
+    assert "leave 25 % of the standard deviation of damping" in answer
+    assert proposal_table(given).head[-2:] == ["sd of damping [%]", "sd of mass [%]"]
 
 
 def test_table_lists_runs_and_the_best_one_that_was_made():
@@ -54,11 +97,11 @@ def test_of_three_the_least_separated_pair_counts_and_an_inseparable_one_is_name
         entry(
             rivals=["a", "b", "c"],
             runs=[trial(sigmas)],
-            repeat=trial(dict.fromkeys(sigmas, 0.0), run="x"),
+            repeat=trial(dict.fromkeys(sigmas, 0.0), run="x", information=0.0),
             inseparable=[["a", "b"]],
         )
     )
-    assert "would separate the others by at least 5.0" in lines[1]
+    assert "is expected to tell 0.90 bits" in lines[1]
     assert "separates a from b" in lines[2]
 
 

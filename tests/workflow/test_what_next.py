@@ -41,8 +41,8 @@ def test_the_group_holds_every_run_with_its_place(proposed):
     assert group["amplitude"].attrs["units"] == "m"
     ranks = group["rank"].values[np.isfinite(group["rank"].values)]
     assert sorted(ranks) == list(range(1, ranks.size + 1))
-    best = group["sigma"].values[group["rank"].values == 1]
-    assert best == pytest.approx(np.nanmax(group["sigma"].values), rel=1e-3)
+    best = group["information"].values[group["rank"].values == 1]
+    assert best == np.nanmax(group["information"].values)
 
 
 def test_summary_and_group_agree(proposed):
@@ -52,14 +52,17 @@ def test_summary_and_group_agree(proposed):
     at = group.sel({key: first[key] for key in ("mean", "amplitude", "frequency")})
     assert float(at["rank"]) == 1
     assert float(at["sigma"]) == pytest.approx(first["sigma"])
-    assert entry["question"] == "open"
-    assert set(entry["rivals"]) == {"linear_stiffness", "cubic_stiffness"}
+    assert entry["question"] == "structures"
+    assert {"linear_stiffness", "cubic_stiffness"} <= set(entry["rivals"])
+    assert sum(entry["probabilities"]) == pytest.approx(1.0)
+    assert first["information"] >= entry["repeat"]["information"]
+    assert first["information"] <= entry["entropy"] + 1e-9
 
 
 def test_page_and_figure_show_it(proposed):
     page = render_report(proposed)
     assert "What to measure next" in page
-    assert "amplitude 50.0 mm would separate" in page
+    assert "amplitude 50.0 mm is expected to tell" in page
     figure = plots.proposal(proposed)
     assert figure.axes[0].get_ylabel() == "amplitude of displacement in mm"
 
@@ -83,3 +86,29 @@ def test_a_limit_of_no_channel_is_refused(reduced):
             reduced, damper(cubic=False, linear=False), SETTINGS,
             rivals=["linear_stiffness", "cubic_stiffness"], limits={"stroke": (0.0, 1.0)},
         )  # fmt: skip
+
+
+def test_parameters_are_asked_for_by_a_setting(reduced):
+    found = workflow.propose(
+        reduced, damper(cubic=False), Settings(jobs=1, effects=SPRINGS, next_run="parameters")
+    )
+    (entry,) = json.loads(found.attrs[schema.SUMMARY])["proposals"]
+    assert entry["question"] == "parameters"
+    ratio = entry["runs"][0]["sd_ratio"]
+    assert set(ratio) == {"damping", "stiffness"}
+    # A third run beside the two that were fitted has a third of the information or more.
+    assert all(0.3 < value < 1.0 for value in ratio.values())
+    assert min(ratio.values()) < np.sqrt(2 / 3) + 0.05
+    page = render_report(found)
+    assert "To know the parameters more precisely" in page
+
+
+def test_one_parameter_is_asked_for_by_its_name(reduced):
+    settings = Settings(jobs=1, effects=SPRINGS, next_run="stiffness")
+    found = workflow.trace(reduced, damper(cubic=False), settings)
+    (entry,) = json.loads(found.attrs[schema.SUMMARY])["proposals"]
+    best = entry["runs"][0]
+    assert list(best["sd_ratio"]) == ["stiffness"]
+    assert best["information"] == pytest.approx(-np.log2(best["sd_ratio"]["stiffness"]))
+    with pytest.raises(InputError, match=r"next_run: unknown aim.*mean stiffness"):
+        workflow.trace(reduced, damper(cubic=False), Settings(jobs=1, next_run="stifness"))
