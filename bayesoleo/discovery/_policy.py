@@ -325,9 +325,6 @@ class SearchPolicy:
     separable: float = _value(
         1.0, "Standard deviations below which no run separates a pair of rivals."
     )
-    equal_information: float = _value(
-        0.01, "Difference in bits within which two runs are equal and their weakest pair decides."
-    )
     enough_runs: int = _value(
         3,
         "Smallest number of runs whose scatter of a by-run parameter predicts its value in a new"

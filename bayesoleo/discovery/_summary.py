@@ -137,6 +137,8 @@ def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, A
 def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
     """Parameters of the declared model: its estimate, that of the final model, and the average over
     structures, SI; the final model may have a parameter by run instead."""
+    if not found.parameters:
+        return {}
     states = {"declared": loop.rounds[0].before if loop.rounds else loop.final, "final": loop.final}
     entries: dict[str, Any] = {}
     for name, one in found.parameters.items():
