@@ -362,6 +362,14 @@ class Shared:
         All other coefficients are integrated out.
         """
         count = columns.shape[1]
+        deviation = self.deviation[:count]
+        if np.all(deviation > 0):
+            # With D inner D + I = L L', the information is D^-1 (I - (L L')^-1) D^-1.
+            padded = np.zeros((len(self.factor), len(columns)), order="F")
+            padded[:count] = columns.T / deviation[:, None]
+            turned = forward(self.factor, padded)
+            information = np.sum(padded * padded, axis=0) - np.sum(turned * turned, axis=0)
+            return information, self.half @ turned
         seen = self.inner[:, :count] @ columns.T
         turned = forward(self.factor, self.deviation[:, None] * seen)
         information = np.sum(columns.T * seen[:count], axis=0) - np.sum(turned * turned, axis=0)
