@@ -260,8 +260,10 @@ class _Plan:
 def _of_structures(
     loop: ClosedLoop, structures: StructurePosterior, plan: _Plan
 ) -> tuple[Question, ...]:
-    """The question which of the most probable structures is true; none where that is decided, or
-    most probably nothing is missing."""
+    """The question which of the most probable structures is true; none where that is decided, the
+    name of the one effect is certain, or most probably nothing is missing."""
+    if loop.certain:
+        return ()
     weights: dict[tuple[Added, ...], float] = {}
     for one in structures.structures:
         if one.effects or not one.outside:
