@@ -199,36 +199,56 @@ def more_than_noise_p(fit: ModelFit, noise: Noise) -> float:
     noise : Noise
         Of the outputs.
     """
-    chances = [1.0]
+    lines: list[list[tuple[Array, float]]] = []
     for b in range(len(fit.predictor.outputs)):
-        powers, free = [], 0.0
+        lines.append([])
         for r, record in enumerate(fit.records):
             left = fit.predictor.runs[r].measured[b] - fit.predictions[r].y[b]
-            power, own = _line_powers(record, without_masked(record, left), noise, b)
-            powers.append(power)
-            free += own
+            lines[b].append(_line_powers(record, without_masked(record, left), noise, b))
+    return slow_lines_p(lines)
+
+
+def slow_lines_p(lines: Sequence[Sequence[tuple[Array, float]]]) -> float:
+    """The least probability by noise alone of any sum over the slowest lines.
+
+    Parameters
+    ----------
+    lines : sequence over outputs of sequence over runs of (ndarray, float)
+        Power by line in units of the noise, each of two real coefficients, and degrees of freedom
+        with which the noise is known.
+    """
+    chances = [1.0]
+    for runs in lines:
+        free = sum(own for _, own in runs)
         for count in LEADING:
-            some = np.concatenate([power[:count] for power in powers])
+            some = np.concatenate([power[:count] for power, _ in runs])
             chances.append(float(stats.f.sf(some.mean(), 2 * some.size, free)))
     return min(chances)
 
 
 def _line_powers(record: Record, left: Array, noise: Noise, b: int) -> tuple[Array, float]:
-    """Power of what is left of an output by line, in units of its noise, and how well that is
-    known in degrees of freedom."""
+    """Power of what is left of an output by line, and degrees of freedom of its noise."""
     if not record.periodic:
         power = scipy.fft.dct(left, norm="ortho")[: 2 * (left.size // 2)] ** 2
         return np.asarray(power.reshape(-1, 2).mean(axis=1) / noise.sigma[b] ** 2), float(left.size)
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    average = periodic_average(left, step, record.frequency)
+    coloured = noise.colour[b][0] > 0
+    return harmonic_powers(left, step, record.frequency, record.periods, coloured=coloured)
+
+
+def harmonic_powers(
+    left: Array, step: float, frequency: float, periods: int, *, coloured: bool
+) -> tuple[Array, float]:
+    """Power of what repeats of a signal (N,) by harmonic in units of its noise, which is that of
+    all lines or, where coloured, of the lines next to a harmonic; and its degrees of freedom."""
+    average = periodic_average(left, step, frequency)
     power = np.abs(average.coefficients[1:]) ** 2 * average.samples / 4
-    if not noise.colour[b][0] > 0:
+    if not coloured:
         return power / average.sigma**2, float(average.samples - average.number)
-    # The noise of the run itself next to each harmonic, of which less is known.
-    level = noise_spectrum(left - average.values, record.periods).level
+    level = noise_spectrum(left - average.values, periods).level
     order = np.arange(1, average.coefficients.size)
-    near = level[np.minimum(order * record.periods, level.size - 1)]
-    return power / np.maximum(near, 1e-300), 4.0 * HARMONICS * (record.periods - 1)
+    near = level[np.minimum(order * periods, level.size - 1)]
+    return power / np.maximum(near, 1e-300), 4.0 * HARMONICS * (periods - 1)
 
 
 # -- signatures ------------------------------------------------------------------------------------

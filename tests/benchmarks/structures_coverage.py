@@ -43,8 +43,16 @@ from bayesoleo._workflow.task import prepare
 from bayesoleo.data._noise import periodic_average
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._hold_out_error import predict_held_out
-from bayesoleo.discovery._inference import error_model_by
-from bayesoleo.discovery._signatures import Lines, colour_of, lines_of, noise_of, signatures_of
+from bayesoleo.discovery._inference import LOOKED_FOR, error_model_by
+from bayesoleo.discovery._signatures import (
+    Lines,
+    colour_of,
+    harmonic_powers,
+    lines_of,
+    noise_of,
+    signatures_of,
+    slow_lines_p,
+)
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.error_models._catalogue import Linearised
@@ -324,10 +332,13 @@ def analysed(found: Drawn, signatures: Signatures | None) -> Analysed:
     left = [campaign.residuals(theta[None], r)[0][0] for r in range(len(campaign.runs))]
     colours, chances = measured_colour(campaign, left)
     white = tuple((0.0, 1.0) for _ in colours)
+    looked_for = _slow_lines(campaign, left, chances.min() < 1e-3)
     given = signatures or campaign.base.signatures
     kept: list[Linearised] = []
 
     def log_odds(coloured: bool) -> float:
+        if looked_for > LOOKED_FOR:
+            return -np.inf
         kept.append(
             _linearised(
                 campaign, replace(given, colour=colours if coloured else white), theta, left
@@ -348,6 +359,18 @@ def analysed(found: Drawn, signatures: Signatures | None) -> Analysed:
     density = LogDensity(campaign, errors=word)
     mode = find_mode(density, start_coordinates(density, theta))
     return Analysed(density, mode.centre, mode.covariance, word)
+
+
+def _slow_lines(campaign: Campaign, left: Sequence[Array], coloured: bool) -> float:
+    """Probability of the residuals by noise alone, as a user's estimate looks at it first."""
+    lines = []
+    for b in range(len(campaign.outputs)):
+        lines.append([])
+        for e, when in zip(left, campaign.samples, strict=True):
+            step = float((when.time[-1] - when.time[0]) / (when.time.size - 1))
+            found = harmonic_powers(e[b], step, when.frequency, PLAN.periods, coloured=coloured)
+            lines[b].append(found)
+    return slow_lines_p(lines)
 
 
 def _linearised(
