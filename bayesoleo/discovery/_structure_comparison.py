@@ -301,7 +301,8 @@ def evidences_about(
         similar |= {} if own else alike
     if chosen is None:
         found |= _pairs(at, best_alone(found, IN_PAIRS))
-    curves = {key: _curve(at, groups) for key, groups in at.curves.items()}
+    every = {key: _curve(at, groups) for key, groups in at.curves.items()}
+    curves = {key: value for key, value in every.items() if np.isfinite(value)}
     if curves:
         # Half of what is outside the catalogue is a function of one quantity; those that are not
         # tried here explain next to nothing.

@@ -94,22 +94,28 @@ class Evidence:
         """
         if not set(anchor.effects) <= set(self.columns.groups):
             return  # it has effects that were not scored, such as a curve
-        reached = evidences_about(anchor, self.comparison, self.columns, self._chosen, self._curves)
+        # What cannot be computed about a poor estimate is no number; the rest counts.
+        with np.errstate(all="ignore"):
+            reached = evidences_about(
+                anchor, self.comparison, self.columns, self._chosen, self._curves
+            )
         result, curves = reached.structures, reached.curves
+        own = frozenset(anchor.effects)
+        if not np.isfinite([result[own, False], result[own, True]]).all():
+            return  # an estimate that failed, about which nothing is known
+        result = {key: value for key, value in result.items() if np.isfinite(value)}
         if self._chosen is None:
             self._chosen = best_alone(result, BESIDE)
             self._curves = sorted(curves, key=lambda key: -curves[key])[:BEST_CURVES]
         here = len(anchor.effects)
-        if not np.isfinite(list(result.values())).all():
-            return  # an estimate that failed, about which nothing is known
-        self._similar |= reached.similar
+        finite = {key: value for key, value in reached.similar.items() if np.isfinite(value)}
+        self._similar |= finite
         for key, value in result.items():
             there = self._depth.get(key, -1)
             if here > there or (here == there and value > self.found[key]):
                 self.found[key], self._depth[key] = value, here
                 self._anchors[key] = anchor
-                own = result[frozenset(anchor.effects), key[1]]
-                self._beyond[key] = max(value - own, 0.0)
+                self._beyond[key] = max(value - result[own, key[1]], 0.0)
 
     def evidence_of(self, key: Key) -> float:
         """Log evidence of a structure.
