@@ -10,8 +10,8 @@ import xarray as xr
 from bayesoleo._dask import connected
 from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.data import dataset_folder
+from bayesoleo.data._campaign_folders import VARIABLE
 from bayesoleo.data._files import read_columns
-from bayesoleo.data._registry import VARIABLE
 from bayesoleo.errors import BayesoleoError, MissingExtraError
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]

@@ -75,7 +75,7 @@ def systems(
       bayesoleo systems model.py:model --json
     """
     from bayesoleo._workflow.model_files import load_model
-    from bayesoleo.model._drive import possible_drives
+    from bayesoleo.model._drive_and_start import possible_drives
     from bayesoleo.systems._systems import describe, systems as names
 
     def facts(text: str) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from bayesoleo._types import Array, Integers
 from bayesoleo._workflow.estimating import draw_from
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.discovery._inference import effective_at, function_errors
-from bayesoleo.error_models._power import PowerErrors
+from bayesoleo.error_models._correlated import PowerErrors
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._function_problem import FunctionProblem

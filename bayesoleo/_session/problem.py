@@ -7,8 +7,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bayesoleo import data as measured
-from bayesoleo._session.campaign import DELAY, Campaign, status_line
-from bayesoleo._session.campaign_work import CampaignWork, changed, check_text
+from bayesoleo._session.campaign import (
+    DELAY,
+    Campaign,
+    CampaignWork,
+    changed,
+    check_text,
+    status_line,
+)
 from bayesoleo._session.display import Showing, kept
 from bayesoleo._session.function_work import (
     FunctionWork,

@@ -24,13 +24,15 @@ from bayesoleo._report.sentences import certainty
 from bayesoleo._report.structures import structures_data, structures_text
 from bayesoleo._report.terminal import print_summary
 from bayesoleo._session import display
-from bayesoleo._session.campaign import DELAY, Campaign, status_line
-from bayesoleo._session.campaign_work import (
+from bayesoleo._session.campaign import (
+    DELAY,
     SAMPLING,
     SEARCHING,
+    Campaign,
     CampaignSearch,
     CampaignWork,
     changed,
+    status_line,
 )
 from bayesoleo._session.display import Result, Showing, html, kept, number, result
 from bayesoleo._session.function_work import FunctionWork

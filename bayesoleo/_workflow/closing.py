@@ -20,11 +20,14 @@ from bayesoleo._workflow.output import (
     PROPOSALS_STAGE,
     REPORT_STAGE,
     SEARCH_STAGE,
+    Drawn,
     ResultFolder,
     Stages,
     reason_of,
+    report_what_is_there,
+    result_tree,
+    write_result,
 )
-from bayesoleo._workflow.result import Drawn, report_what_is_there, result_tree, write_result
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of

@@ -17,8 +17,14 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, ProgressCallback
-from bayesoleo._workflow.output import POSTERIOR_STAGE, PREDICTIONS_STAGE, ResultFolder, Stages
-from bayesoleo._workflow.result import finish, mark_unfinished
+from bayesoleo._workflow.output import (
+    POSTERIOR_STAGE,
+    PREDICTIONS_STAGE,
+    ResultFolder,
+    Stages,
+    finish,
+    mark_unfinished,
+)
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._assembly import Assembly

@@ -19,16 +19,16 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._storage.files import check_writable
+from bayesoleo._workflow.model_files import from_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, choose_drive, reduce
 from bayesoleo.data._campaign import CampaignData
-from bayesoleo.data._write_campaign import SimulatedRun, write_campaign
+from bayesoleo.data._campaign_folders import SimulatedRun, write_campaign
 from bayesoleo.effects._catalogue import find_effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation._nuisance import uncertain_conditions
-from bayesoleo.model._documents import from_document
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._simulate import STEPS, RunPlan, Simulation, motion, simulate_run

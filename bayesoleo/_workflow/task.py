@@ -27,7 +27,7 @@ from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._dimensions import check_dimensions
-from bayesoleo.model._drive import driven_by, possible_drives
+from bayesoleo.model._drive_and_start import driven_by, possible_drives
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import Invented, Lost, lost_inputs, without_invented
 from bayesoleo.prediction._predictor import Predictor

@@ -3,6 +3,11 @@ from ._campaign import (
     Run as Run,
     load_campaign as load_campaign,
 )
+from ._campaign_folders import (
+    SimulatedRun as SimulatedRun,
+    dataset_folder as dataset_folder,
+    write_campaign as write_campaign,
+)
 from ._campaign_toml import (
     Channel as Channel,
 )
@@ -30,9 +35,6 @@ from ._reduction import (
     on_grid as on_grid,
     reduce_campaign as reduce_campaign,
 )
-from ._registry import (
-    dataset_folder as dataset_folder,
-)
 from ._residual_time_shift import (
     Frequency as Frequency,
     PeriodSearch as PeriodSearch,
@@ -40,8 +42,4 @@ from ._residual_time_shift import (
     find_frequency as find_frequency,
     period_search as period_search,
     residual_time_shift as residual_time_shift,
-)
-from ._write_campaign import (
-    SimulatedRun as SimulatedRun,
-    write_campaign as write_campaign,
 )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Float
+from bayesoleo.data._campaign_folders import dataset_folder
 from bayesoleo.data._campaign_toml import (
     FILE,
     Channel,
@@ -23,7 +24,6 @@ from bayesoleo.data._campaign_toml import (
     read_declaration,
 )
 from bayesoleo.data._files import read_columns
-from bayesoleo.data._registry import dataset_folder
 from bayesoleo.data._sample_quality import Stretches, bridged, impossible_sample, masked
 from bayesoleo.errors import CampaignError, check_path, choose
 

@@ -34,6 +34,7 @@ from ._policy import (
 )
 from ._ranking import (
     Ranked as Ranked,
+    scales_of as scales_of,
 )
 from ._refit import (
     Refit as Refit,
@@ -41,9 +42,6 @@ from ._refit import (
 from ._round import (
     Progress as Progress,
     Round as Round,
-)
-from ._scales import (
-    scales_of as scales_of,
 )
 from ._score_basis import (
     Base as Base,

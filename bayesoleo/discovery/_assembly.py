@@ -21,9 +21,8 @@ from bayesoleo.effects._places import PART
 from bayesoleo.effects._terms import FAMILY as TERMS, terms_of
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.estimation._nuisance import Nuisance
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by, with_estimated_starts
 from bayesoleo.model._expressions import split_derivative
-from bayesoleo.model._initial_states import with_estimated_starts
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.prediction._records import Record

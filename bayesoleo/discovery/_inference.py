@@ -24,15 +24,14 @@ from bayesoleo.discovery._signatures import (
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._base import Frame
 from bayesoleo.error_models._catalogue import CatalogueErrors, Linearised
-from bayesoleo.error_models._correlated import CorrelatedErrors
+from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors, effective_samples
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.error_models._independent import IndependentErrors
-from bayesoleo.error_models._power import PowerErrors, effective_samples
 from bayesoleo.error_models._registry import AUTO, ERROR_MODELS, check_word
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._identifiability import multistart
 from bayesoleo.estimation._least_squares import PriorScale
-from bayesoleo.estimation._multistart import multistart
 from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._hierarchy import hierarchical
@@ -43,9 +42,8 @@ from bayesoleo.posterior._laplace import (
     mixture_of,
     start_coordinates,
 )
-from bayesoleo.posterior._log_density import LogDensity
+from bayesoleo.posterior._log_density import LogDensity, PlainUnknowns
 from bayesoleo.posterior._mixture import Mixture
-from bayesoleo.posterior._unknowns import PlainUnknowns
 from bayesoleo.solvers._orbit import Status
 
 #: The error model that needs signatures.

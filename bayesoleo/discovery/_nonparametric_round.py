@@ -25,10 +25,9 @@ from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
 from bayesoleo.discovery._nonparametric_quantities import ranges
 from bayesoleo.discovery._nonparametric_search import CurveSearch, Tried, closest, search
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, scales_of
 from bayesoleo.discovery._refit import Refit, fall_from, refit
 from bayesoleo.discovery._round import Round
-from bayesoleo.discovery._scales import scales_of
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._state import State
 from bayesoleo.effects._nonparametric import FAMILY, Axis

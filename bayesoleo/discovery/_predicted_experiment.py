@@ -17,8 +17,8 @@ from bayesoleo.discovery._expected_information import PredictiveDistribution
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._structure_evidence import sizes_between
 from bayesoleo.errors import InputError
+from bayesoleo.model._drive_and_start import START
 from bayesoleo.model._expressions import COSINE, SINE, WITHIN
-from bayesoleo.model._initial_states import START
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._predictor import Layout, Predictor
 from bayesoleo.prediction._records import Harmonics, Record

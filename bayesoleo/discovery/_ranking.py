@@ -1,20 +1,201 @@
-"""Candidate effects, scored and ranked for one round of the search."""
+"""Candidate effects, placed by the sizes of the motion, scored and ranked for one round.
+
+The sizes of the estimated motion place the scan grids of effects.
+
+The frequency of a periodic force is undefined at the null, and a coarse grid cannot scan it: the
+score has a peak as narrow as the reciprocal of the record's length. The highest line of the
+residual's spectrum is taken instead, if the probability of such a line by chance is less than one
+in a thousand. Without one no periodic force is scored, and the search needs no correction for it.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage, optimize, stats
 
-from bayesoleo._types import ProgressCallback
+from bayesoleo._types import Array, ProgressCallback
+from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._assembly import Assembly, Option
+from bayesoleo.discovery._fit import ModelFit, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import Refit
-from bayesoleo.discovery._scales import scales_of
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score, classes, corrected_p, score_all, without_twins
 from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._parts import Scales
+from bayesoleo.effects._places import BETWEEN
+from bayesoleo.prediction._records import Record
+
+#: Lines on either side whose median is the level beside a line; cycles over the record below which
+#: a line is a drift.
+_BESIDE, _FEWEST = 25, 5
+#: Width in bins of a line with the window that limits the leakage of strong lines.
+_WIDE = 3
+
+POINTS = 512
+
+
+def dominant_residual_frequency(fit: ModelFit) -> float | None:
+    """Dominant frequency of the residuals of transients, Hz; None without a significant line."""
+    best: tuple[float, float] = (FALSE_ALARM, 0.0)
+    for r, record in enumerate(fit.records):
+        if record.periodic:
+            continue
+        e = fit.predictor.runs[r].measured - fit.predictions[r].y
+        e = np.where(weights(record) > 0, e, 0.0)
+        inputs = [record.samples[n] for n in fit.model.inputs if n in record.samples]
+        for values in e:
+            found = line_of(values, inputs, _step(record))
+            if found is not None:
+                best = min(best, found)
+    return best[1] if best[1] > 0 else None
+
+
+def line_of(values: Array, inputs: Sequence[Array], step: float) -> tuple[float, float] | None:
+    """Probability and frequency of the highest line of a signal that no input shares.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    inputs : sequence of ndarray, shape (N,)
+    step : float
+        Sampling interval, s.
+
+    Returns
+    -------
+    (p-value, frequency in Hz), or None where the record is too short.
+    """
+    own = _over_level(values)
+    if own is None:
+        return None
+    shared = np.zeros(own.size, dtype=bool)
+    for item in inputs:
+        level = _over_level(item)
+        if level is not None:
+            strong = level > stats.f.isf(FALSE_ALARM, 2, _BESIDE)
+            shared |= ndimage.binary_dilation(strong, iterations=_WIDE)
+    own[shared] = 0.0
+    k = int(np.argmax(own))
+    if own[k] == 0:
+        return None
+    p = float(-np.expm1(own.size * np.log1p(-stats.f.sf(own[k], 2, _BESIDE))))
+    return p, _refined(values, k) / (values.size * step)
+
+
+def _over_level(values: Array) -> Array | None:
+    """Powers of a windowed signal over the level of their neighbours."""
+    window = np.hanning(values.size)
+    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
+    if power.size < 4 * _BESIDE or not power.any():
+        return None
+    # The median of exponentially distributed powers is ln 2 times the mean.
+    level = ndimage.median_filter(power, 2 * _BESIDE + 1, mode="reflect") / np.log(2.0)
+    ratio: Array = power / np.maximum(level, 1e-9 * power.mean())
+    ratio[:_FEWEST] = 0.0
+    return ratio
+
+
+def _refined(values: Array, k: int) -> float:
+    """Cycles over the record at which the windowed signal's power is highest, near a bin."""
+    shown = (values - values.mean()) * np.hanning(values.size)
+    turn = -2j * np.pi * np.arange(values.size) / values.size
+
+    def less(cycles: float) -> float:
+        return -float(np.abs(np.exp(turn * cycles) @ shown))
+
+    found = optimize.minimize_scalar(less, bounds=(k - 1.0, k + 1.0), method="bounded")
+    return float(found.x)
+
+
+def _step(record: Record) -> float:
+    return float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+
+
+def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:
+    """Ranges of every coordinate over all fitted runs.
+
+    A dof that the drive replaced has the motion of the driving channel, up to small offsets and
+    gains.
+    """
+    position: dict[str, tuple[float, float]] = {}
+    velocity: dict[str, float] = {}
+
+    def add(name: str, values: np.ndarray, rates: np.ndarray) -> None:
+        low, high = position.get(name, (np.inf, -np.inf))
+        position[name] = (min(low, float(values.min())), max(high, float(values.max())))
+        velocity[name] = max(velocity.get(name, 0.0), float(np.abs(rates).max()))
+
+    for run, record in zip(fit.predictor.runs, fit.records, strict=True):
+        phase = _places(record)
+        rows_of: dict[str, tuple[Array, Array]] = {}
+        for dof, motion in run.known_motions().items():
+            rows = motion(phase)
+            rows_of[dof] = rows[0], rows[1]
+            add(dof, rows[0], rows[1])
+        for channel, item in record.signals.items():
+            values, rates = (item.evaluate(phase, record.rate, k) for k in (0, 1))
+            rows_of[channel] = values, rates
+            add(channel, values, rates)
+            if channel == drive:
+                for dof in native_dofs:
+                    if dof not in run.known_motions():
+                        rows_of[dof] = values, rates
+                        add(dof, values, rates)
+        for (one, here), (other, there) in itertools.permutations(rows_of.items(), 2):
+            if one in native_dofs:
+                add(f"{one}{BETWEEN}{other}", here[0] - there[0], here[1] - there[1])
+    outputs = {
+        name: max(
+            float(np.ptp(run.measured[k][weights(run.record) > 0])) for run in fit.predictor.runs
+        )
+        for k, name in enumerate(fit.predictor.outputs)
+    }
+    periods = [time for record in fit.records for time in _times(record)]
+    ranges = {
+        name: (
+            min(float(run.measured[k].min()) for run in fit.predictor.runs),
+            max(float(run.measured[k].max()) for run in fit.predictor.runs),
+        )
+        for k, name in enumerate(fit.predictor.outputs)
+    }
+    kinds = frozenset(record.kind for record in fit.records)
+    times = min(periods), max(periods)
+    stated = [record.conditions for record in fit.records]
+    shared = set.intersection(*map(set, stated))
+    conditions = {name: float(np.mean([run[name] for run in stated])) for name in shared}
+    return Scales(
+        position,
+        velocity,
+        outputs,
+        *times,
+        ranges,
+        kinds,
+        dominant_residual_frequency(fit),
+        conditions,
+    )
+
+
+def _places(record: Record) -> np.ndarray:
+    """Where the motion is evaluated: over a period, or at the samples of a transient."""
+    return np.arange(POINTS) / POINTS if record.periodic else record.position
+
+
+def _times(record: Record) -> tuple[float, ...]:
+    """Time scales of a run: the period, or for a transient its length and, for each channel, the
+    period of a harmonic motion with the same ratio of rate to size."""
+    if record.periodic:
+        return (record.span,)
+    found = [record.span]
+    for item in record.signals.values():
+        values, rates = (item.evaluate(record.position, record.rate, k) for k in (0, 1))
+        if np.std(values) > 0 and np.std(rates) > 0:
+            found.append(float(min(record.span, 2 * np.pi * np.std(values) / np.std(rates))))
+    return tuple(found)
+
 
 #: Absorbing families, whose effects absorb a part of any model error: parameters that vary from run
 #: to run, and forces that repeat with the drive.

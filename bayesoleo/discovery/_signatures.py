@@ -21,7 +21,7 @@ from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, pe
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, without_masked
 from bayesoleo.discovery._hold_out_error import Prediction, sample_noise
-from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._score_basis import LEAST, Block, coefficients, sensitivities_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares

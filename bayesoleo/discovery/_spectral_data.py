@@ -261,7 +261,7 @@ class EstimatedModel:
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedModel:
     """Outputs about an estimate.
 
     Parameters
@@ -290,7 +290,7 @@ class Linearised:
     change: Array
 
 
-def linearised(anchor: EstimatedModel, data: SpectralData) -> Linearised:
+def linearised(anchor: EstimatedModel, data: SpectralData) -> LinearisedModel:
     """Residual and columns about an anchor."""
     fit = anchor.fit
     problem, theta = fit.problem, fit.point.theta
@@ -315,7 +315,7 @@ def linearised(anchor: EstimatedModel, data: SpectralData) -> Linearised:
     unknowns = np.linalg.solve(root, rows[rest] * unit[:, None])
     offset = np.linalg.solve(root, slope)
     own = rows[amplitudes]
-    return Linearised(
+    return LinearisedModel(
         # The prior of an effect's amplitude is centred on its absence, not on its estimate.
         data.residual(fit) + theta[amplitudes] @ own,
         unknowns,

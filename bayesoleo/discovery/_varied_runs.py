@@ -18,7 +18,7 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.discovery._predicted_experiment import GRID_POINTS, POINTS
 from bayesoleo.errors import CampaignError
-from bayesoleo.model._initial_states import START, start_of
+from bayesoleo.model._drive_and_start import START, start_of
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._band_limited import Smoothed
 from bayesoleo.prediction._records import Harmonics, Record

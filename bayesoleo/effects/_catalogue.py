@@ -11,10 +11,9 @@ from functools import cache
 from typing import Any
 
 from bayesoleo.effects import (
-    _damping,
+    _damping_and_friction,
     _end_stop,
     _forces,
-    _friction,
     _gas,
     _heat,
     _sensors,
@@ -27,10 +26,10 @@ from bayesoleo.model._model import Model
 
 #: The effects of each file, by family.
 _EFFECTS = (
-    _damping.EFFECTS,
-    _friction.EFFECTS,
-    _friction.DYNAMIC_FRICTION_EFFECTS,
-    _damping.STIFFNESS_EFFECTS,
+    _damping_and_friction.DAMPING_EFFECTS,
+    _damping_and_friction.FRICTION_EFFECTS,
+    _damping_and_friction.DYNAMIC_FRICTION_EFFECTS,
+    _damping_and_friction.STIFFNESS_EFFECTS,
     _end_stop.CONTACT_EFFECTS,
     _terms.EFFECTS,
     _forces.EFFECTS,

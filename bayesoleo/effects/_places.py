@@ -18,8 +18,8 @@ import sympy as sp
 
 from bayesoleo._units import dimensions
 from bayesoleo.errors import ModelError
+from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
-from bayesoleo.model._initial_states import with_starts
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
 

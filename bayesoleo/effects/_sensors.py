@@ -27,7 +27,7 @@ from bayesoleo.effects._parts import (
     period_grid,
 )
 from bayesoleo.effects._places import is_quantity, substitute
-from bayesoleo.model._drive import possible_drives
+from bayesoleo.model._drive_and_start import possible_drives
 from bayesoleo.model._expressions import (
     TIME,
     WITHIN,

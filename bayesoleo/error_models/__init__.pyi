@@ -14,6 +14,8 @@ from ._catalogue import (
 )
 from ._correlated import (
     CorrelatedErrors as CorrelatedErrors,
+    PowerErrors as PowerErrors,
+    effective_samples as effective_samples,
 )
 from ._discrepancy import (
     DiscrepancyErrors as DiscrepancyErrors,
@@ -31,10 +33,6 @@ from ._independent import (
     log_likelihood as log_likelihood,
     output_counts as output_counts,
     staged_variance as staged_variance,
-)
-from ._power import (
-    PowerErrors as PowerErrors,
-    effective_samples as effective_samples,
 )
 from ._registry import (
     ERROR_MODELS as ERROR_MODELS,

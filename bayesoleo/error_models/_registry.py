@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 from bayesoleo.error_models._base import ErrorModel, Frame, Measured, ProfiledErrorModel
 from bayesoleo.error_models._catalogue import CatalogueErrors
-from bayesoleo.error_models._correlated import CorrelatedErrors
+from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors
 from bayesoleo.error_models._discrepancy import DiscrepancyErrors, SharedDiscrepancyErrors
 from bayesoleo.error_models._full import FullErrors, GivenErrors, ProfiledFullErrors
 from bayesoleo.error_models._independent import (
@@ -34,7 +34,6 @@ from bayesoleo.error_models._independent import (
     ProfiledCommonErrors,
     ProfiledIndependentErrors,
 )
-from bayesoleo.error_models._power import PowerErrors
 from bayesoleo.errors import InputError, choose
 from bayesoleo.model._priors import Prior
 

@@ -21,7 +21,9 @@ from ._function_problem import (
     FunctionProblem as FunctionProblem,
 )
 from ._identifiability import (
+    Modes as Modes,
     data_against_prior as data_against_prior,
+    multistart as multistart,
     principal_axes as principal_axes,
 )
 from ._indifference_regions import (
@@ -45,10 +47,6 @@ from ._multiple_shooting import (
     EstimatedTrajectory as EstimatedTrajectory,
     ShootingEstimate as ShootingEstimate,
     multiple_shooting as multiple_shooting,
-)
-from ._multistart import (
-    Modes as Modes,
-    multistart as multistart,
 )
 from ._nuisance import (
     Nuisance as Nuisance,

@@ -7,7 +7,7 @@ from ._correlated_priors import (
 from ._derivatives import (
     Derived as Derived,
 )
-from ._drive import (
+from ._drive_and_start import (
     driven_by as driven_by,
     possible_drives as possible_drives,
 )

@@ -4,10 +4,6 @@ from ._discovery import (
     ranking as ranking,
     structures as structures,
 )
-from ._errors import (
-    by_run as by_run,
-    error as error,
-)
 from ._estimates import (
     history as history,
     indifference as indifference,
@@ -28,18 +24,18 @@ from ._predictions import (
     predictive as predictive,
     trajectory as trajectory,
 )
-from ._records import (
+from ._residuals import (
+    assessment as assessment,
+    residual as residual,
+    residual_breakdown as residual_breakdown,
+    residual_tests as residual_tests,
+)
+from ._runs import (
+    by_run as by_run,
+    error as error,
     fit as fit,
     period_search as period_search,
     records as records,
-)
-from ._residual_tests import (
-    assessment as assessment,
-    residual_tests as residual_tests,
-)
-from ._residuals import (
-    residual as residual,
-    residual_breakdown as residual_breakdown,
 )
 from ._style import (
     AFTER as AFTER,

@@ -1,10 +1,8 @@
-from ._bayesbag import (
-    BayesBag as BayesBag,
-    bayesbag as bayesbag,
-)
 from ._comparison import (
     DRAWS as DRAWS,
+    BayesBag as BayesBag,
     Uniformity as Uniformity,
+    bayesbag as bayesbag,
     compare as compare,
     comparison_text as comparison_text,
     prior_sensitivity as prior_sensitivity,
@@ -35,14 +33,12 @@ from ._laplace import (
 from ._log_density import (
     Density as Density,
     LogDensity as LogDensity,
+    PlainUnknowns as PlainUnknowns,
+    Unknowns as Unknowns,
 )
 from ._mixture import (
     Mixture as Mixture,
 )
 from ._sampler import (
     sample as sample,
-)
-from ._unknowns import (
-    PlainUnknowns as PlainUnknowns,
-    Unknowns as Unknowns,
 )

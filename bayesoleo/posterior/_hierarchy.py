@@ -53,8 +53,7 @@ from bayesoleo.error_models._registry import error_model
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.model._priors import Prior, Transform
-from bayesoleo.posterior._log_density import information_at, residuals_at
-from bayesoleo.posterior._unknowns import PlainUnknowns, Unknowns
+from bayesoleo.posterior._log_density import PlainUnknowns, Unknowns, information_at, residuals_at
 
 _HALF_NORMAL = 0.5 * float(np.log(2 / np.pi))
 _LOG_SQRT_2_PI = 0.5 * float(np.log(2 * np.pi))

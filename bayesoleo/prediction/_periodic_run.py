@@ -14,11 +14,17 @@ from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model._expressions import COSINE, SINE, TIME, WITHIN
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._anchors import PATH_PIECES, Anchor, solve_from_shot
 from bayesoleo.prediction._inputs import RowCache, input_rows
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._stability import unstable_of
-from bayesoleo.prediction._starts import KnownRows, Motion, guess_rows
+from bayesoleo.prediction._starts import (
+    PATH_PIECES,
+    Anchor,
+    KnownRows,
+    Motion,
+    guess_rows,
+    solve_from_shot,
+)
 from bayesoleo.prediction._sum_of_squares import FusedSquares, squared_distances
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import (

@@ -23,7 +23,6 @@ from bayesoleo.errors import InputError, choose
 from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._anchors import Anchor
 from bayesoleo.prediction._inputs import (
     RowCache,
     dynamics_of,
@@ -34,7 +33,7 @@ from bayesoleo.prediction._inputs import (
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._records import Harmonics, Record
 from bayesoleo.prediction._stability import unstable_of
-from bayesoleo.prediction._starts import Motion, guess_rows
+from bayesoleo.prediction._starts import Anchor, Motion, guess_rows
 from bayesoleo.solvers._adaptive_mesh import (
     AdaptiveSolution,
     AdaptiveStart,

@@ -13,11 +13,10 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._anchors import Anchor
 from bayesoleo.prediction._inputs import RowCache, highest_derivatives, input_rows, signal_of
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._records import Record
-from bayesoleo.prediction._starts import InitialState, Motion
+from bayesoleo.prediction._starts import Anchor, InitialState, Motion
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._library_integrator import halved, integrate, resolving
 from bayesoleo.solvers._mesh import Mesh, equidistant, tableau

@@ -23,7 +23,7 @@ from small_campaigns import (
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import close_loop
-from bayesoleo.discovery._scales import line_of, scales_of
+from bayesoleo.discovery._ranking import line_of, scales_of
 from bayesoleo.discovery._score_tests import score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.discovery._summary import summarise

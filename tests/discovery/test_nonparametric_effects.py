@@ -11,6 +11,7 @@ from scipy.interpolate import BSpline
 from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
 
 from bayesoleo import _schema as schema
+from bayesoleo._workflow.model_files import from_document, to_document
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._curves import shapes
 from bayesoleo.discovery._loop import close_loop
@@ -20,7 +21,6 @@ from bayesoleo.discovery._result_tree import loop_groups
 from bayesoleo.discovery._summary import summarise
 from bayesoleo.effects import find_effect
 from bayesoleo.effects._nonparametric import Axis, Spline, bspline_values
-from bayesoleo.model._documents import from_document, to_document
 from bayesoleo.model._expressions import symbol
 from bayesoleo.systems import equations_latex, system
 

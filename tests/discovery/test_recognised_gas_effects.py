@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import close_loop
-from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._score_tests import classes, score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import catalogue

@@ -8,7 +8,7 @@ from fitted_states import NUMERICS
 from test_recognised_gas_effects import Oleo, campaign
 
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._scales import scales_of
+from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._score_basis import sensitivities_of
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect

@@ -12,7 +12,7 @@ from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._round import _only_absorbs
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.model._kernels import kernels
 from bayesoleo.systems import system
 

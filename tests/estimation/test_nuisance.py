@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayesoleo._workflow.estimating import estimate as estimate_campaign
+from bayesoleo._workflow.model_files import from_document, to_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data import SimulatedRun, write_campaign
 from bayesoleo.discovery._fit import Numerics, fit_model
@@ -16,7 +17,6 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._nuisance import Nuisance, declared_nuisance, uncertain_conditions
 from bayesoleo.model import Model, Output, Parameter, driven_by
-from bayesoleo.model._documents import from_document, to_document
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics, Record
 from bayesoleo.systems import system

@@ -7,10 +7,9 @@ from hypothesis import HealthCheck, assume, given, settings, strategies as st
 
 from bayesoleo._compiled import cache_folder
 from bayesoleo.model import Condition, Model, Output, Parameter
-from bayesoleo.model._code_printing import statements
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._expressions import FUNCTIONS, symbol
-from bayesoleo.model._kernels import _counts, _results, kernels
+from bayesoleo.model._kernels import _counts, _results, kernels, statements
 from bayesoleo.systems import system
 from bayesoleo.systems._oleo import thermomechanical_oleo
 

@@ -9,7 +9,7 @@ from scipy import signal
 
 from bayesoleo.error_models import error_model
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._power import autocorrelation_time, effective_samples
+from bayesoleo.error_models._correlated import autocorrelation_time, effective_samples
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem
 from bayesoleo.model import Normal

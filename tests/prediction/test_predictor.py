@@ -8,7 +8,7 @@ from synthetic_runs import answered, oleo_runs, run, stroke
 
 from bayesoleo.errors import CampaignError, ModelError
 from bayesoleo.model import Condition, Model, Output, Parameter
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._predictor import Layout, Predictor
 from bayesoleo.solvers._orbit import Status

@@ -8,7 +8,7 @@ import pytest
 from synthetic_runs import answered, oleo_runs
 
 from bayesoleo.estimation._campaign_problem import CampaignProblem
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.posterior import LogDensity
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_runs import harmonics, run, stroke
 
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.model._kernels import kernels
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._predictor import Predictor

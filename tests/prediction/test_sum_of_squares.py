@@ -8,7 +8,7 @@ import pytest
 from synthetic_runs import answered, harmonics, oleo_runs, run, stroke
 
 from bayesoleo.model import Model, Output, Parameter
-from bayesoleo.model._drive import driven_by
+from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.solvers._orbit import Status, count
 from bayesoleo.systems._oleo import mechanical_oleo, thermomechanical_oleo

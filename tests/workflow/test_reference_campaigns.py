@@ -10,8 +10,7 @@ import pytest
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._workflow.closing import run_loop
 from bayesoleo._workflow.model_files import load_model
-from bayesoleo._workflow.output import ResultFolder, Stages
-from bayesoleo._workflow.result import write_result
+from bayesoleo._workflow.output import ResultFolder, Stages, write_result
 from bayesoleo._workflow.settings import Settings
 
 pytestmark = pytest.mark.reference

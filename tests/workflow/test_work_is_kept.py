@@ -19,7 +19,7 @@ from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._cli import app
 from bayesoleo._cli.shell import UNFINISHED
 from bayesoleo._storage.result_files import read_tree
-from bayesoleo._workflow import closing, output, result
+from bayesoleo._workflow import closing, output
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.discovery import _loop as search
 from bayesoleo.effects import find_effect
@@ -65,7 +65,7 @@ def without_draws(monkeypatch):
 
 def without_page(monkeypatch):
     """So do figures."""
-    monkeypatch.setattr(result, "write_report", lambda *_: [])
+    monkeypatch.setattr(output, "write_report", lambda *_: [])
 
 
 def read_back(folder: Path) -> tuple[dict, str]:
@@ -121,9 +121,9 @@ def test_a_search_that_breaks_off_at_once_keeps_the_estimate(campaign, tmp_path,
     ("stage", "module", "name"),
     [
         ("proposals", closing, "what_next"),
-        ("predictions", result, "loop_groups"),
-        ("report", result, "write_report"),
-        ("report", result, "summarise"),
+        ("predictions", output, "loop_groups"),
+        ("report", output, "write_report"),
+        ("report", output, "summarise"),
     ],
 )
 def test_a_late_stage_that_fails_leaves_the_others(
