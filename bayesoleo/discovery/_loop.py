@@ -28,6 +28,7 @@ from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import Progress, Round, examine
+from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state
 from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
@@ -310,8 +311,21 @@ def probabilities(
         numerics,
         prior=prior,
         known=known,
+        later=scored_later(progress.rounds),
         callback=callback,
     )
+
+
+def scored_later(rounds: Sequence[Round]) -> list[Score]:
+    """Scores of candidates that the first round did not have, as they were at first."""
+    first = {item.score.option.key for item in rounds[0].ranking}
+    found: dict[Added, Score] = {}
+    for entry in rounds[1:]:
+        for item in entry.ranking:
+            named = item.score.option.candidate.family != FAMILY
+            if named and item.score.option.key not in first:
+                found.setdefault(item.score.option.key, item.score)
+    return list(found.values())
 
 
 @dataclass(frozen=True)

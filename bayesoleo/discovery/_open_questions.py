@@ -21,7 +21,7 @@ from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._error_table import ErrorTable, error_table
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_error import predict_fitted
-from bayesoleo.discovery._loop import SURE, ClosedLoop
+from bayesoleo.discovery._loop import SURE, ClosedLoop, scored_later
 from bayesoleo.discovery._next_experiment import (
     PARAMETERS,
     STRUCTURES,
@@ -280,6 +280,7 @@ def _of_structures(
     try:
         first = loop.first
         scores = [item.score for item in loop.rounds[0].ranking]
+        scores += scored_later(loop.rounds)
         fits = structure_fits(first.base(), first.assembly, scores, chosen, plan.numerics)
         rivals, failed = [], []
         for effects, name, found in zip(chosen, names, fits, strict=True):

@@ -87,6 +87,9 @@ class Comparison:
     prior : StructurePrior
     curves : mapping of (curve, balance) to tuple of ndarray, shape (K, n)
         Changes of the outputs by unnamed functions, fine and coarse.
+    later : sequence of Score
+        Candidates that exist beside other effects only. They have no column about the declared
+        model, and are compared about models that have them.
     """
 
     data: SpectralData
@@ -96,6 +99,7 @@ class Comparison:
     scores: Sequence[Score]
     prior: StructurePrior
     curves: Mapping[tuple[str, str], tuple[Array, ...]] = field(default_factory=dict)
+    later: Sequence[Score] = ()
 
     @classmethod
     def of(
@@ -131,7 +135,8 @@ class Comparison:
     @property
     def families(self) -> dict[Added, str]:
         """Family of each candidate."""
-        return {s.option.key: s.option.candidate.family for s in self.scores}
+        every = (*self.scores, *self.later)
+        return {s.option.key: s.option.candidate.family for s in every}
 
     def unit(self, rows: Array) -> Array:
         """Factors ``(k,)`` that scale rows ``(k, n)`` to unit size in units of the noise."""

@@ -92,7 +92,7 @@ class Evidence:
         Where several anchors reach a structure, the one that has more of its effects counts, and
         of those the one with the larger evidence: it is better linearised.
         """
-        if not set(anchor.effects) <= set(self.columns.groups):
+        if not set(anchor.effects) <= set(self.comparison.families):
             return  # it has effects that were not scored, such as a curve
         # What cannot be computed about a poor estimate is no number; the rest counts.
         with np.errstate(all="ignore"):
@@ -219,6 +219,7 @@ def structure_posterior(
     *,
     prior: StructurePrior = DEFAULT_PRIOR,
     known: Sequence[tuple[Assembly, ModelFit]] = (),
+    later: Sequence[Score] = (),
     callback: ProgressCallback = lambda _: None,
 ) -> StructurePosterior:
     """Probabilities of what a model lacks.
@@ -237,14 +238,16 @@ def structure_posterior(
     prior : StructurePrior, optional
     known : sequence of (Assembly, ModelFit), optional
         Models with effects that were estimated already.
+    later : sequence of Score, optional
+        Of candidates that exist beside other effects only.
     callback : callable, optional
         Receives a message at each step.
     """
     assert base.data is not None
-    by_key = {score.option.key: score for score in scores}
-    evidence = Evidence(
-        Comparison.of(base, errors, scores, prior, curves_of(base, assembly, numerics.jobs))
-    )
+    by_key = {score.option.key: score for score in (*scores, *later)}
+    curves = curves_of(base, assembly, numerics.jobs)
+    comparison = Comparison.of(base, errors, scores, prior, curves)
+    evidence = Evidence(replace(comparison, later=later))
     evidence.add(EstimatedModel(base.fit, {}))
     for grown, fit in known:
         evidence.add(_anchor(grown, fit, by_key))
@@ -290,10 +293,13 @@ def _extended(
 ) -> Callable[[tuple[Added, ...]], EstimatedModel | None]:
     """Estimates a set of effects together; None where that failed."""
 
+    order = {key: place for place, key in enumerate(scores)}
+
     def estimated(effects: tuple[Added, ...]) -> EstimatedModel | None:
         grown, known = assembly.with_values(base.fit.shared), dict(base.fit.values)
         try:
-            for key in effects:
+            # What exists beside another effect only comes after it.
+            for key in sorted(effects, key=lambda one: order[one]):
                 score = scores[key]
                 step = score.option.assembly.steps[-1]
                 grown = grown.option(step.effect, step.target, step.scales).assembly

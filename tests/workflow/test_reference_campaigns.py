@@ -59,6 +59,9 @@ def test_a_polytropic_oleo_lacks_heat_exchange_and_solubility(data_set):
         if accepted is not None:
             found |= {accepted["effect"], *accepted["indistinguishable_from"]}
     assert {"heat_exchange", "gas_solubility"} <= found
+    # Solubility exists beside gas of its own temperature only; the declared model has no score.
+    likely = {one["effect"]: one["probability"] for one in summary["structures"]["effects"]}
+    assert min(likely["heat_exchange"], likely["gas_solubility"]) > 0.9
     assert max(on_hold_out(summary, "ratio_to_noise", 0).values()) > 3
     assert max(on_hold_out(summary, "ratio_to_noise").values()) <= 1.3
 
