@@ -10,7 +10,7 @@ from scipy import stats
 from structure_cases import CASES, behind_gap, closed, judged
 
 #: Campaigns over which intervals are judged.
-CAMPAIGNS = 12
+CAMPAIGNS = 6
 
 
 def test_a_slider_behind_a_gap_gives_way_where_the_gap_is_taken_up():
@@ -23,11 +23,10 @@ def test_a_slider_behind_a_gap_gives_way_where_the_gap_is_taken_up():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", CASES)
-def test_the_effect_is_named(name, seed):
+def test_the_effect_is_named(name):
     case = CASES[name]()
-    found = judged(case, closed(case, seed))
+    found = judged(case, closed(case, seed=0))
     assert found["named"], found["added"]
     # Intervals are judged over campaigns, below; one of them misses by three sd in 370.
     assert found["base_inside"] >= found["base"] - 3, found["outside"]

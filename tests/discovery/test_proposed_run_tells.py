@@ -68,6 +68,10 @@ CASES = {
 }  # fmt: skip
 
 
+#: Campaigns of each system.
+SEEDS = 6
+
+
 def of_truth(structures, truth):
     return sum(s.probability for s in structures.structures if {e for e, _ in s.effects} == {truth})
 
@@ -83,7 +87,8 @@ def entropy_of(structures):
 
 
 def outcome(name, seed, folder):
-    """Probabilities of the truth, bits said, and the fall of the entropy, for both runs."""
+    """Probabilities of the truth, bits said, and the fall of the entropy, for both runs; None where
+    the data decide already."""
     make, runs, model, truth, effects, limits = CASES[name]
     catalogue = tuple(map(find_effect, effects))
 
@@ -95,7 +100,10 @@ def outcome(name, seed, folder):
 
     records = make(folder / "before", runs, seed).records
     before = closed(records)
-    (question,) = questions_of(before, limits, NUMERICS)
+    questions = questions_of(before, limits, NUMERICS)
+    if not questions:
+        return None
+    (question,) = questions
     best, repeat = question.proposals.trials[0], question.proposals.best_repeat
     plan = (("next", best.frequency, best.amplitude, "fit"),)
     new = make(folder / "new", plan, 1000 + seed).records[0]
@@ -111,13 +119,15 @@ def outcome(name, seed, folder):
 
 @pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize(("name", "seeds"), [("springs", 10), ("friction", 10), ("oscillator", 10)])
-def test_the_proposed_run_raises_the_probability_of_the_truth(name, seeds, tmp_path):
-    rows = np.array([outcome(name, seed, tmp_path / str(seed)) for seed in range(seeds)])
+@pytest.mark.parametrize("name", CASES)
+def test_the_proposed_run_raises_the_probability_of_the_truth(name, tmp_path):
+    found = [outcome(name, seed, tmp_path / str(seed)) for seed in range(SEEDS)]
+    rows = np.array([row for row in found if row is not None])
+    assert len(rows) >= SEEDS - 2
     proposed, repeat = rows[:, 0], rows[:, 1]
     assert np.median(proposed[:, 0]) > np.median(repeat[:, 0])
     said, fell = proposed[:, 1].mean(), proposed[:, 2].mean()
-    # An entropy falls by anything between a rise and all of it in one campaign; the mean of ten
+    # An entropy falls by anything between a rise and all of it in one campaign; the mean of six
     # scatters by a tenth of a bit, and the truth is fixed here, where the said bits are a mean over
     # what may be true.
     assert abs(said - fell) < 0.2 + 0.5 * said
