@@ -46,7 +46,7 @@ plans = [
 noise = {"displacement": 5e-5, "force": 20.0, "pressure": 5e3}
 folder = Path(tempfile.mkdtemp()) / "shaker"
 campaign = bo.Campaign.simulate(folder, driven_by(oleo, "displacement"), plans, noise=noise)
-found = bo.Problem(campaign, model).fit().parameters
+found = bo.Problem(campaign, model, error_model="independent").fit().parameters
 amplitudes = found[found.index.str.startswith("friction_of_run")]
 pressure = [np.mean(run.samples["pressure"]) + 1e5 for run in campaign.reduced.records]
 

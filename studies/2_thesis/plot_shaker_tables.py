@@ -36,7 +36,7 @@ truth = driven_by(bo.system("f16n2d2"), "displacement")
 campaign = bo.Campaign.simulate(Path(tempfile.mkdtemp()) / "shaker", truth, plans, noise=noise)
 figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
 for name, look, colour in (("f16n1d1", "s", BEFORE), ("f16n2d1", "o", AFTER)):
-    fit = bo.Problem(campaign, name).fit()
+    fit = bo.Problem(campaign, name, error_model="independent").fit()
     print(fit)
     rms = np.sqrt((fit.residuals["force"] ** 2).mean("sample"))
     axes.semilogy(rms["run"], rms, look, color=colour, label=name)

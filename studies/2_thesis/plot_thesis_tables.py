@@ -33,7 +33,8 @@ for run in (run for run in SHAKER_RUNS if run.label in "dehikl"):
     row = dict(zip(("theta_4", "theta_6", "theta_16"), TABLE_6_5[run.label][:3], strict=True))
     plan = RunPlan(run.label, run.frequency, stroke, known, periods=2.1)
     campaign = bo.Campaign.simulate(folder / run.label, truth, [plan], row)
-    fit = bo.Problem(campaign, "f16n1d1_thesis", drive="model").fit()
+    problem = bo.Problem(campaign, "f16n1d1_thesis", drive="model", error_model="independent")
+    fit = problem.fit()
     refitted[run.label] = fit.parameters["estimate"]
     print(run.label, *(f"{name} {value:.4g}" for name, value in refitted[run.label].items()))
 
