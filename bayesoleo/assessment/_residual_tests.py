@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from bayesoleo._types import Array, Float
-from bayesoleo.data._fourier import lagged_products
+from bayesoleo.data._fourier import integrated_time, lagged_products
 from bayesoleo.errors import InputError
 
 #: Bins of a variable at most.
@@ -212,11 +212,7 @@ def autocorrelation_time(values: Array, power: int = 1) -> float:
     """
     if values.size < 20:
         return 1.0
-    rho = autocorrelation(values, values.size // 4)
-    total = 1.0 + 2.0 * np.cumsum(rho[1:])
-    window = np.arange(1, rho.size) >= 5.0 * np.maximum(total, 1.0)
-    end = int(np.argmax(window)) if window.any() else total.size - 1
-    return float(max(1.0 + 2.0 * np.sum(rho[1 : end + 2] ** power), 1.0))
+    return integrated_time(autocorrelation(values, values.size // 4), power)
 
 
 def normality(residual: Array) -> tuple[float, float, ResidualTest]:

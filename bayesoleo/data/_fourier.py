@@ -183,3 +183,23 @@ def lagged_products(rows: Array, length: int | None = None) -> Array:
     length = length or fft.next_fast_len(2 * rows.shape[1])
     power = np.mean(np.abs(fft.rfft(rows, length, axis=1)) ** 2, axis=0)
     return np.asarray(fft.irfft(power, length, axis=0)[: rows.shape[1]])
+
+
+def integrated_time(correlation: Array, power: int = 1) -> float:
+    """Integrated autocorrelation time in samples, at least one.
+
+    Parameters
+    ----------
+    correlation : ndarray, shape (lags + 1,)
+        Autocorrelation, one at lag zero.
+    power : {1, 2}, optional
+        To which it is raised in the sum: for the information on a mean, or on a variance.
+
+    References
+    ----------
+    Sokal (1997), *Functional Integration*, 131-192, eq. 3.11: a window of five times the sum.
+    """
+    total = 1.0 + 2.0 * np.cumsum(correlation[1:])
+    window = np.arange(1, correlation.size) >= 5.0 * np.maximum(total, 1.0)
+    end = int(np.argmax(window)) if window.any() else total.size - 1
+    return float(max(1.0 + 2.0 * np.sum(correlation[1 : end + 2] ** power), 1.0))

@@ -2,9 +2,9 @@
 
 A few numbers do not describe a new transient or how several inputs move together. A run that was
 measured does, and so does each run that changes it in one way or two: the amplitude of an input,
-the phase of one input against the others, the frequency, the duration of a transient, or how far
-from its rest it starts. No amplitude, frequency, duration or start leaves the range of those
-measured by more than the factor :data:`REACH`.
+the phase of one input against the others, the duration of a transient, or how far from its rest it
+starts. No amplitude, duration or start leaves the range of those measured by more than the factor
+:data:`REACH`.
 """
 
 from __future__ import annotations

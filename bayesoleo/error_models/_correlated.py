@@ -35,7 +35,6 @@ References
 Kelly, Becker, Sobolewska, Siemiginowska and Uttley (2014), "Flexible and scalable methods for
 quantifying stochastic variability", *Astrophysical Journal* 788, eqs. 9-16 (the filter). Rasmussen
 and Williams (2006), *Gaussian Processes for Machine Learning*, eq. B.26 (the process).
-Sokal (1997), *Functional Integration*, 131-192, eq. 3.11: autocorrelation time by a window.
 Kish (1965), *Survey Sampling*, section 5.4: the design effect of repetitions.
 Grünwald and van Ommen (2017), Bayesian Analysis 12, 1069-1103; Miller and Dunson (2019), JASA 114,
 1113-1125: posteriors by powers of the likelihood where models are wrong.
@@ -48,12 +47,12 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-from scipy import signal
 from scipy.special import ndtr, ndtri
 
 from bayesoleo import _schema as schema
 from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Integers
+from bayesoleo.data._fourier import integrated_time, lagged_products
 from bayesoleo.error_models._base import Frame, Quantity, RunSamples
 from bayesoleo.error_models._independent import ByOutput, IndependentErrors, log_likelihood_by_run
 from bayesoleo.errors import InputError
@@ -235,8 +234,6 @@ def covariance(time: Sequence[float] | Array, v: float, share: float, tau: float
     return cast(Array, v * ((1 - share) * np.eye(t.size) + share * kernel))
 
 
-#: Autocorrelation is summed over this many times its sum.
-WINDOW = 5.0
 #: Standard deviations by which the part that repeats must exceed chance.
 REPEATS = 3.0
 
@@ -324,16 +321,13 @@ def autocorrelation_time(rows: Sequence[Array]) -> float:
     overlap = np.zeros(longest + 1)
     for e in rows:
         lags = min(longest, e.size - 1)
-        own = signal.correlate(e, e, method="auto")[e.size - 1 :][: lags + 1]
+        own = lagged_products(e[None])[: lags + 1]
         products[: lags + 1] += own
         overlap[: lags + 1] += e.size - np.arange(lags + 1)
     if products[0] <= 0 or longest < 1:
         return 1.0
     rho = products / np.maximum(overlap, 1.0) / (products[0] / overlap[0])
-    total = 1.0 + 2.0 * np.cumsum(rho[1:])
-    inside = np.arange(1, rho.size) >= WINDOW * np.maximum(total, 1.0)
-    end = int(np.argmax(inside)) if inside.any() else total.size - 1
-    return float(max(total[end], 1.0))
+    return integrated_time(rho)
 
 
 def _repeating(residual: Array, when: RunSamples) -> tuple[Array | None, float]:

@@ -158,7 +158,8 @@ class Samples:
     runs : tuple of str
         Labels of the ``N`` runs.
     draws : ndarray, shape (chains, draws, d)
-        In natural units (``ln v`` for the variances).
+        In natural units (``ln v`` for the variances). Under errors that runs have in common, only
+        one draw of a few, closer together than a quarter of the autocorrelation time.
     log_density : ndarray, shape (chains, draws)
         Log posterior density over the coordinates without bounds, Jacobian included, not
         normalised.
