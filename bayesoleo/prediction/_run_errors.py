@@ -11,13 +11,13 @@ discretisation error is estimated once, at the point estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, ComplexArray, Integers
 from bayesoleo.prediction._band_limited import Smoothed
 from bayesoleo.prediction._inputs import (
     harmonics_of,
@@ -41,6 +41,8 @@ DRAWS = 16
 TOLERANCE = 1e-6
 #: Points of a run at which its equations are looked at: every run of every fit is.
 LOOKS = 16_384
+#: Orders in the finer of two tables of exponentials.
+TABLE = 32
 
 
 def input_columns(run: RunPredictor, p: Array) -> Array:
@@ -107,22 +109,32 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
     blocks = []
     for channel in channels:
         item = harmonics_of(record, channel).for_derivative(highest[channel])
-        turn = (
-            np.exp(2j * np.pi * np.outer(item.orders, phase % 1.0))
-            * np.sqrt(item.variances)[:, None]
-        )
-        block = np.zeros((len(rows), 2 * item.orders.size, phase.size))
-        for k, (name, derivative) in enumerate(rows):
-            if name == channel:
-                changed = (2j * np.pi * record.frequency * item.orders)[
-                    :, None
-                ] ** derivative * turn
-                block[k, : item.orders.size], block[k, item.orders.size :] = (
-                    changed.real,
-                    -changed.imag,
-                )
-        blocks.append(block[:, np.abs(block).max(axis=(0, 2)) > 0])
+        own = [(k, derivative) for k, (name, derivative) in enumerate(rows) if name == channel]
+        count = item.orders.size
+        block = np.zeros((len(rows), 2 * count, phase.size))
+        factors = zip(item.orders, np.sqrt(item.variances), _turns(item.orders, phase), strict=True)
+        for j, (order, sd, turn) in enumerate(factors):
+            for k, derivative in own:
+                changed = (2j * np.pi * record.frequency * order) ** derivative * sd * turn
+                block[k, j], block[k, count + j] = changed.real, -changed.imag
+        blocks.append(block[:, block.any(axis=(0, 2))])
     return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))
+
+
+def _turns(orders: Integers, phase: Array) -> Iterator[ComplexArray]:
+    """``exp(2 pi i k phase)`` for one order ``k`` after the other, each of shape (N,).
+
+    Products of two tables, since hundreds of orders at thousands of phases would take an
+    exponential each.
+    """
+    whole = phase % 1.0
+    fine = np.exp(2j * np.pi * np.outer(np.arange(TABLE), whole))
+    coarse: dict[int, ComplexArray] = {}
+    for order in orders:
+        high, low = divmod(int(order), TABLE)
+        if high not in coarse:
+            coarse = {high: np.exp(2j * np.pi * TABLE * high * whole)}  # orders ascend
+        yield coarse[high] * fine[low]
 
 
 @lru_cache(maxsize=64)
