@@ -77,7 +77,7 @@ figure = known.plot()
 # %%
 # The measured damper: one call estimates the model, tests the whole catalogue and adds effects.
 
-study = Study("mr_damper", data="measured/mr_damper", declaration=DECLARATION)
+study = Study("mr_damper", data="measured/mr_damper", slow=True, declaration=DECLARATION)
 problem = study.run(lambda: bo.Problem(study.campaign, model, seed=0, quick=True))
 found = study.run(lambda: problem.fit().explain())
 study.run(lambda: found.sample())
