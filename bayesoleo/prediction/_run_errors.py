@@ -43,6 +43,8 @@ TOLERANCE = 1e-6
 LOOKS = 16_384
 #: Orders in the finer of two tables of exponentials.
 TABLE = 32
+#: Coefficients of an input for which states are solved together.
+TOGETHER = 32
 
 
 def input_columns(run: RunPredictor, p: Array) -> Array:
@@ -61,42 +63,49 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
         Real and imaginary parts of all significant harmonics of all inputs, of a transient draws
         over the root of their number; SI; no columns where the run could not be solved.
     """
-    derived, boundary = run.kernels.derived, run.boundary
+    derived = run.kernels.derived
     ny, samples = run.measured.shape
     at_samples = _input_changes(run, run.record.position)
     lanes, one = np.zeros(1, dtype=np.int64), p[None]
-    z = np.empty((1, 0, samples))
-    moved = np.zeros((1, 0, at_samples.shape[1], samples))
+    z, x = np.empty((1, 0, samples)), np.empty((1, 0, 0))
     if derived.dofs:
         solution = run.solve(one)
         if solution.status[0] != Status.CONVERGED.value:
             return np.zeros((ny, 0, samples))
-        step = boundary.step(run.steps)
-        z = run.scheme.sample(solution.x[..., None], run.plan, step)[:, :, 0]
-        moved = run.scheme.sample(_states(run, one, solution.x), run.plan, step)
+        x = solution.x
+        z = run.scheme.sample(x[..., None], run.plan, run.boundary.step(run.steps))[:, :, 0]
     yz, yp = np.zeros((1, ny, z.shape[1], samples)), np.zeros((1, ny, len(derived.active), samples))
     yu = np.zeros((1, ny, len(derived.inputs), samples))
     with np.errstate(all="ignore"):
         run.kernels.output_jacobian(z, run.sample_inputs, one, lanes, yz, yp)
         run.kernels.output_inputs(z, run.sample_inputs, one, lanes, yu)
     columns = np.einsum("yuN,ukN->ykN", yu[0], at_samples)
-    columns += np.einsum("yzN,zkN->ykN", yz[0], moved[0])
+    for part, moved in _moved(run, one, x) if derived.dofs else ():
+        columns[:, part] += np.einsum("yzN,zkN->ykN", yz[0], moved)
     return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 
-def _states(run: RunPredictor, p: Array, x: Array) -> Array:
-    """Change of the solver's unknowns, shape (1, n, w, k)."""
+def _moved(run: RunPredictor, p: Array, x: Array) -> Iterator[tuple[slice, Array]]:
+    """Change of the dofs' rows at the samples, shape (nz, k, N), by some coefficients at a time.
+
+    The states of a few coefficients stay in the cache; those of hundreds take several times as long
+    each, and much memory.
+    """
     boundary, d = run.boundary, len(run.scheme.orders)
     points, nz = boundary.inputs.shape[1], run.scheme.state_size + d
     lanes = np.zeros(1, dtype=np.int64)
     z, g, gz = np.zeros((1, nz, points)), np.zeros((1, d, points)), np.zeros((1, d, nz, points))
     gu = np.zeros((1, d, boundary.inputs.shape[0], points))
-    run.scheme.rows(x, lanes, boundary.step(run.steps), z)
+    step, held = boundary.step(run.steps), not run.record.periodic
+    run.scheme.rows(x, lanes, step, z)
     run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
     run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
-    right = np.einsum("lduN,ukN->ldkN", gu, _input_changes(run, run.points))
-    step, held = boundary.step(run.steps), not run.record.periodic
-    return run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
+    changes = _input_changes(run, run.points)
+    for first in range(0, changes.shape[1], TOGETHER):
+        part = slice(first, first + TOGETHER)
+        right = np.einsum("lduN,ukN->ldkN", gu, changes[:, part])
+        states = run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
+        yield part, run.scheme.sample(states, run.plan, step)[0]
 
 
 def _input_changes(run: RunPredictor, phase: Array) -> Array:
