@@ -31,8 +31,15 @@ def found(fit: bo.Fit) -> bo.Explanation:
 
 
 @pytest.fixture(scope="module")
-def posterior(fit: bo.Fit) -> bo.Posterior:
-    return fit.sample(seed=3)
+def plain(campaign: bo.Campaign) -> bo.Fit:
+    """With independent errors: those of the catalogue, which would be chosen, draw slowly."""
+    settings = {"quick": True, "jobs": 1, "error_model": "independent"}
+    return bo.Problem(campaign, damper(cubic=False), **settings).fit()
+
+
+@pytest.fixture(scope="module")
+def posterior(plain: bo.Fit) -> bo.Posterior:
+    return plain.sample(seed=3)
 
 
 def test_the_root_has_few_names() -> None:
@@ -102,11 +109,11 @@ def test_each_question_is_one_line(fit: bo.Fit) -> None:
     assert {schema.PROFILE, schema.INDIFFERENCE, schema.SAMPLING_DISTRIBUTION} <= groups
 
 
-def test_posterior_is_read_by_arviz(fit: bo.Fit, posterior: bo.Posterior) -> None:
+def test_posterior_is_read_by_arviz(plain: bo.Fit, posterior: bo.Posterior) -> None:
     check_shown(posterior, "posterior of damper", "nested R-hat")
     check_shown(posterior.summary(), "effective size")
-    check_shown(posterior.compare(fit.indifference()), "sd / indifference")
-    assert fit.sample(seed=3) is posterior
+    check_shown(posterior.compare(plain.indifference()), "sd / indifference")
+    assert plain.sample(seed=3) is posterior
     table = arviz.summary(posterior.tree, var_names=["damping"])
     assert float(table["mean"].iloc[0]) == pytest.approx(
         float(posterior.summary()["mean"].sel(parameter="damping")), rel=0.01
