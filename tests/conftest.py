@@ -19,15 +19,26 @@ COMPILING = (
     "test_initial_value.py",
     "test_shooting_orbits.py",
 )
+#: Modules whose slow tests take a minute or more each, the longest first: one that is begun last
+#: would end alone.
+LONG = (
+    "test_reference_campaigns.py",
+    "test_proposed_run_tells.py",
+    "test_structure_probabilities.py",
+    "test_truth_benchmark.py",
+    "test_structure_cases.py",
+)
 #: Folders whose tests hardly need these; they are what the others run meanwhile.
 UNCOMPILED = ("data", "docs", "effects", "model", "plots", "posterior", "storage")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What compiles the most first, then what needs nothing compiled."""
+    """The longest slow tests first, then what compiles the most, then what compiles nothing."""
     root = Path(__file__).parent
 
     def turn(item: pytest.Item) -> int:
+        if item.path.name in LONG and item.get_closest_marker("slow"):
+            return LONG.index(item.path.name) - len(LONG)
         if item.path.name in COMPILING:
             return 0
         return 1 if item.path.relative_to(root).parts[0] in UNCOMPILED else 2
