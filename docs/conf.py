@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,6 +46,8 @@ sphinx_gallery_conf = {
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",  # model files are no pages
     "within_subsection_order": "FileNameSortKey",
+    # Pages of a section run beside each other, where the extra sphinx-gallery[parallel] is.
+    "parallel": (os.cpu_count() or 1) if find_spec("joblib") else False,
     "thumbnail_size": (640, 448),
     "image_scrapers": ("matplotlib", "gallery_figures.scrape"),
     "ignore_repr_types": r"matplotlib\.",
