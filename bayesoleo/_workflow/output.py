@@ -28,7 +28,6 @@ from bayesoleo._storage.resume import digest, keep_state, kept_state, package_di
 from bayesoleo._types import ProgressCallback
 from bayesoleo._workflow.model_files import to_document
 from bayesoleo._workflow.task import Task, silent
-from bayesoleo.data._data_warnings import data_warnings
 from bayesoleo.discovery._curves import CurveFacts
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._loop import ClosedLoop
@@ -355,10 +354,7 @@ def result_tree(
         PREDICTIONS_STAGE, lambda: CurveFacts.of(loop.final), lambda: CurveFacts()
     )
     summary = summarise(loop, samples, {**task.about(), "files": files}, facts)
-    summary["notes"] = [
-        *summary["notes"],
-        *data_warnings(task.reduced.records, task.campaign.units),
-    ]
+    summary["notes"] = [*summary["notes"], *task.data_warnings]
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     summary[schema.UNFINISHED] = list(stages.failed)
     summary["headline"] = headline(summary)

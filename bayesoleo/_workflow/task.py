@@ -10,6 +10,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -276,6 +277,11 @@ class Task:
         """As loaded."""
         return self.reduced.campaign
 
+    @cached_property
+    def data_warnings(self) -> list[str]:
+        """What deserves a look in the records; computed once, though each round's result has it."""
+        return data_warnings(self.reduced.records, self.campaign.units)
+
     def about(self) -> dict[str, Any]:
         """Top-level keys of the summary."""
         left_out = self.settings.left_out
@@ -484,8 +490,5 @@ def checked(task: Task) -> dict[str, Any]:
             for effect in settings.searched
         ),
         "start": as_plain(starts),
-        "data_warnings": [
-            *data_warnings(task.reduced.records, task.campaign.units),
-            *about_start(starts, driven),
-        ],
+        "data_warnings": [*task.data_warnings, *about_start(starts, driven)],
     }
