@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -215,15 +216,25 @@ def test_a_folder_that_fails_on_the_way_does_not_end_the_work(campaign, tmp_path
     assert json.loads(tree.attrs[schema.SUMMARY])["unfinished"] == []
 
 
-@pytest.mark.parametrize("changed", ["campaign", "model", "setting", "file"])
-def test_another_task_starts_anew_and_says_so(campaign, tmp_path, monkeypatch, changed):
-    without_draws(monkeypatch)
-    without_page(monkeypatch)
-    kept = tmp_path / "checkpoints" / "search.pickle"
-    with monkeypatch.context() as patched:
+@pytest.fixture(scope="module")
+def broken_off(campaign, tmp_path_factory) -> Path:
+    """Folder of a search that broke off in its second round."""
+    folder = tmp_path_factory.mktemp("broken")
+    with pytest.MonkeyPatch.context() as patched:
+        without_draws(patched)
+        without_page(patched)
         patched.setattr(search, "examine", failing_round(2))
         with pytest.raises(UnfinishedError):
-            workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+            workflow.close(campaign, damper(), SETTINGS, out=folder)
+    return folder
+
+
+@pytest.mark.parametrize("changed", ["campaign", "model", "setting", "file"])
+def test_another_task_starts_anew_and_says_so(campaign, broken_off, tmp_path, monkeypatch, changed):
+    without_draws(monkeypatch)
+    without_page(monkeypatch)
+    shutil.copytree(broken_off, tmp_path, dirs_exist_ok=True)
+    kept = tmp_path / "checkpoints" / "search.pickle"
     source, model, settings = campaign, damper(), SETTINGS
     if changed == "campaign":
         source = tmp_path / "other"
