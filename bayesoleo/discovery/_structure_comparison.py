@@ -196,6 +196,8 @@ def _directions(rows: Array, variance: Array) -> Array:
 Key = tuple[frozenset[Added], bool]
 #: Log evidence of structures.
 Evidences = dict[Key, float]
+#: Log evidence of effects that act beside a law that resembles one more, by both.
+Similar = dict[tuple[frozenset[Added], Added], float]
 
 
 @dataclass(frozen=True)
@@ -208,13 +210,13 @@ class Reached:
         Log evidence.
     curves : mapping of (curve, balance) to float
         Log evidence of unnamed functions beside the anchor's effects.
-    similar : mapping of (effect, target) to float
-        Log evidence of a law outside the catalogue that resembles an effect, and of nothing else.
+    similar : mapping of (effects, effect) to float
+        Log evidence of some effects and a law outside the catalogue that resembles one more.
     """
 
     structures: Evidences
     curves: dict[Added, float]
-    similar: dict[Added, float]
+    similar: Similar
 
 
 @dataclass(frozen=True)
@@ -296,14 +298,11 @@ def evidences_about(
     found: Evidences = {}
     for outside, value in zip((False, True), at.remainders.split(totals), strict=True):
         found[own, outside] = mean_of(value)
-    similar: dict[Added, float] = {}
-    if len(own) == 1:
-        (only,) = own
-        similar[only] = mean_of(at.remainders.similar(totals, fewer(at.sizes)))
+    similar = _like_own(at, tuple(anchor.effects), totals)
     for some in _chunks(at.groups):
         more, alike = _one_more(at, some)
         found |= {(own | {key}, outside): value for (key, outside), value in more.items()}
-        similar |= {} if own else alike
+        similar |= {(own, key): value for key, value in alike.items()}
     if chosen is None:
         found |= _pairs(at, best_alone(found, IN_PAIRS))
     every = {key: _curve(at, groups) for key, groups in at.curves.items()}
@@ -314,6 +313,20 @@ def evidences_about(
         total = logsumexp(list(curves.values())) - np.log(len(columns.curves))
         found[own, True] = float(np.logaddexp(found[own, True], total) - _LOG_2)
     return Reached(found, curves, similar)
+
+
+def _like_own(at: _At, effects: Sequence[Added], totals: Array) -> Similar:
+    """Log evidence of an anchor with a law that resembles one of its effects instead of the effect,
+    from that of all remainders and sizes of its own effects (parts, grid)."""
+    few, every = fewer(at.sizes), frozenset(effects)
+    found: Similar = {}
+    for place, key in enumerate(effects):
+        logs = totals
+        if len(effects) == 2:  # the grid has each size of the one with each of the other
+            pairs = totals.reshape(len(totals), few.size, few.size)
+            logs = np.moveaxis(pairs, 1 + place, 2)
+        found[every - {key}, key] = mean_of(at.remainders.similar(logs, few))
+    return found
 
 
 def _curve(at: _At, groups: Sequence[Group]) -> float:

@@ -47,12 +47,18 @@ from bayesoleo.solvers._orbit import Status
 
 #: Structures are estimated this many at a time, so often, where their probability may be more than
 #: this part of the most probable one's.
-AT_A_TIME, TIMES, WORTH = 4, 5, 0.01
+AT_A_TIME, TIMES, WORTH = 4, 6, 0.01
+#: Part of what an effect explains alone, from which it is estimated beside others.
+LESS = 0.3
+#: Parts of sets of effects are estimated where the whole is this probable, compared with the most
+#: probable structure.
+LIKELY = 0.1
 DEFAULT_PRIOR = StructurePrior()
 #: Effects and unnamed functions that are considered beside the effects of an anchor.
 BESIDE, BEST_CURVES = 40, 3
-#: Part of the log evidence for an effect that its score may miss, and what of it does not matter.
-UNSURE, NEGLIGIBLE = 0.03, 0.1
+#: Part of the log evidence for an effect that its score may miss, the same of one whose shapes are
+#: scanned, and what of it does not matter.
+UNSURE, UNSURE_SHAPE, NEGLIGIBLE = 0.01, 0.2, 0.1
 #: Pieces of the splines: a curve is either fine or coarse.
 FINE, COARSE = 16, 4
 #: Part of the largest velocity within which a change of direction takes place.
@@ -80,11 +86,17 @@ class Evidence:
     _curves: list[Added] | None = None
     _beyond: Evidences = field(default_factory=dict)
     _chosen: list[Added] | None = None
-    _similar: dict[Added, float] = field(default_factory=dict)
+    _similar: dict[frozenset[Added], dict[Added, float]] = field(default_factory=dict)
     _anchors: dict[Key, EstimatedModel] = field(default_factory=dict)
+    _resemblance: dict[Added, float] = field(init=False)
+    _shaped: set[Added] = field(init=False)
 
     def __post_init__(self) -> None:
         self.columns = self.comparison.columns()
+        prior = self.comparison.prior
+        self._resemblance = prior.resemblance(self.comparison.families)
+        options = [s.option for s in (*self.comparison.scores, *self.comparison.later)]
+        self._shaped = {option.key for option in options if option.candidate.shapes}
 
     def add(self, anchor: EstimatedModel) -> None:
         """Compare structures about one more estimated model; the declared one comes first.
@@ -108,8 +120,11 @@ class Evidence:
             self._chosen = best_alone(result, BESIDE)
             self._curves = sorted(curves, key=lambda key: -curves[key])[:BEST_CURVES]
         here = len(anchor.effects)
-        finite = {key: value for key, value in reached.similar.items() if np.isfinite(value)}
-        self._similar |= finite
+        for (effects, alike), value in reached.similar.items():
+            like = self._similar.setdefault(effects, {})
+            # About an estimate of the effect itself it is better linearised.
+            if np.isfinite(value) and (alike in own or alike not in like):
+                like[alike] = value
         for key, value in result.items():
             there = self._depth.get(key, -1)
             if here > there or (here == there and value > self.found[key]):
@@ -123,11 +138,11 @@ class Evidence:
         Half of the laws outside the catalogue resemble one of its effects.
         """
         effects, outside = key
-        if effects or not outside or not self._similar:
+        weights = self._resemblance if outside else {}
+        like = self._similar.get(effects, {})
+        alike = [np.log(weights[k]) + value for k, value in like.items() if weights.get(k, 0.0) > 0]
+        if not alike:
             return self.found[key]
-        weights = self.comparison.prior.resemblance(self.comparison.families)
-        likely = {k: value for k, value in self._similar.items() if weights.get(k, 0.0) > 0}
-        alike = [np.log(weights[k]) + value for k, value in likely.items()] or [-np.inf]
         return float(np.logaddexp(self.found[key], logsumexp(alike)) - np.log(2.0))
 
     def posterior(self) -> StructurePosterior:
@@ -164,6 +179,11 @@ class Evidence:
         """Whether a structure's effects were estimated together."""
         return self._depth.get(key, -1) == len(key[0])
 
+    def nearest(self, effects: tuple[Added, ...]) -> EstimatedModel:
+        """The best estimate of the largest part of some effects, from which all are estimated."""
+        there = [k for k in self._anchors if self.estimated(k) and not k[1] and k[0] < {*effects}]
+        return self._anchors[max(there, key=lambda key: (len(key[0]), self.found[key]))]
+
     def without_outside(self) -> list[tuple[Added, ...]]:
         """The best sets of effects that explain the data alone, of each number one, where something
         outside seems more probable.
@@ -184,6 +204,30 @@ class Evidence:
         found = [effects for (_, outside), (_, effects) in best.items() if not outside]
         return [e for e in found if e and not self.estimated((frozenset(e), False))]
 
+    def parts(self, least: float) -> list[tuple[Added, ...]]:
+        """What is left of the most probable sets of effects without one of them, best first.
+
+        About these every set follows that has another effect in the place of the one left out.
+        Otherwise two effects that were found together would have no rivals but those that are
+        among the best alone.
+
+        Parameters
+        ----------
+        least : float
+            Logarithm of the smallest ratio to the most probable structure.
+        """
+        prior, weights = self.comparison.prior, self.comparison.weights
+        height: dict[frozenset[Added], float] = {}
+        for key in self.found:
+            value = self.evidence_of(key)
+            value += prior.log_probability(tuple(key[0]), key[1], weights)
+            height[key[0]] = max(value, height.get(key[0], -np.inf))
+        best = max(height.values(), default=-np.inf)
+        likely = [effects for effects, value in height.items() if value > best + least]
+        ordered = sorted(likely, key=lambda one: -height[one])
+        found = dict.fromkeys(effects - {key} for effects in ordered for key in sorted(effects))
+        return [tuple(sorted(e)) for e in found if e and not self.estimated((e, False))]
+
     def doubtful(self, least: float) -> list[tuple[Added, ...]]:
         """Sets of effects that may be probable but are known by scores only, best first.
 
@@ -199,7 +243,8 @@ class Evidence:
         height: dict[tuple[Added, ...], float] = {}
         best = -np.inf
         for key, value in self.found.items():
-            effects, missed = tuple(sorted(key[0])), UNSURE * self._beyond[key]
+            effects = tuple(sorted(key[0]))
+            missed = (UNSURE_SHAPE if key[0] & self._shaped else UNSURE) * self._beyond[key]
             value = value + prior.log_probability(effects, key[1], weights)
             best = max(best, value)
             if not self.estimated(key) and missed > NEGLIGIBLE:
@@ -256,12 +301,15 @@ def structure_posterior(
     for _ in range(TIMES):
         doubtful = [e for e in evidence.doubtful(float(np.log(WORTH))) if e and e not in tried]
         chosen = [e for e in evidence.without_outside() if e not in tried]
-        chosen += [e for e in doubtful if e not in chosen][: AT_A_TIME - len(chosen)]
+        for others in (evidence.parts(float(np.log(LIKELY))), doubtful):
+            new = [e for e in others if e not in tried and e not in chosen]
+            chosen += new[: max(AT_A_TIME - len(chosen), 0)]
         if not chosen:
             break
         callback(f"estimate {len(chosen)} structures")
         tried |= set(chosen)
-        for found in thread_map(extended, chosen, numerics.jobs):
+        starts = [(effects, evidence.nearest(effects)) for effects in chosen]
+        for found in thread_map(lambda one: extended(*one), starts, numerics.jobs):
             if found is not None:
                 evidence.add(found)
     return evidence.posterior()
@@ -279,23 +327,28 @@ def _anchor(assembly: Assembly, fit: ModelFit, scores: Mapping[Added, Score]) ->
     return EstimatedModel(fit, effects, shapes)
 
 
-def _parameters(grown: Assembly, score: Score, base: Base) -> dict[str, Parameter]:
-    """New parameters of an effect, its shapes with the prior by which they are compared."""
+def _parameters(grown: Assembly, score: Score, part: float, base: Base) -> dict[str, Parameter]:
+    """New parameters of an effect, which start at a part of what it explains alone, its shapes with
+    the prior by which they are compared."""
     found = new_parameters(grown, score, base.policy)
+    found = {name: replace(one, value=part * one.value) for name, one in found.items()}
     for name, values in score.option.candidate.shapes.items():
         centre, spread = scan_prior(values)
-        found[name] = replace(found[name], prior=LogNormal(float(np.exp(centre)), spread))
+        found[name] = replace(
+            found[name], value=score.shapes[name], prior=LogNormal(float(np.exp(centre)), spread)
+        )
     return found
 
 
 def _extended(
     base: Base, assembly: Assembly, scores: Mapping[Added, Score], numerics: Numerics
-) -> Callable[[tuple[Added, ...]], EstimatedModel | None]:
-    """Estimates a set of effects together; None where that failed."""
+) -> Callable[[tuple[Added, ...], EstimatedModel], EstimatedModel | None]:
+    """Estimates a set of effects together from the estimate of some of them; None where that
+    failed."""
 
     order = {key: place for place, key in enumerate(scores)}
 
-    def estimated(effects: tuple[Added, ...]) -> EstimatedModel | None:
+    def estimated(effects: tuple[Added, ...], near: EstimatedModel) -> EstimatedModel | None:
         grown, known = assembly.with_values(base.fit.shared), dict(base.fit.values)
         try:
             # What exists beside another effect only comes after it.
@@ -303,10 +356,16 @@ def _extended(
                 score = scores[key]
                 step = score.option.assembly.steps[-1]
                 grown = grown.option(step.effect, step.target, step.scales).assembly
-                grown = grown.with_parameters(_parameters(grown, score, base))
-                known |= dict(zip(score.names, map(float, score.expected), strict=True))
+                # Beside others an effect has less to explain than alone.
+                part = LESS if near.effects else 1.0
+                grown = grown.with_parameters(_parameters(grown, score, part, base))
+                known |= dict(zip(score.names, map(float, part * score.expected), strict=True))
+            present = grown.model().parameters
+            shared = near.fit.shared
+            grown = grown.with_values({name: shared[name] for name in shared if name in present})
         except ModelError:
             return None
+        known |= near.fit.values
         fit = quick_fit(base, grown.model(), known, numerics)
         # A fit that stopped early is linearised where it is, which does nearly as well.
         solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
@@ -324,9 +383,10 @@ def structure_fits(
 ) -> list[EstimatedModel | None]:
     """Estimates of some structures; None where one failed. No effects are the base itself."""
     extended = _extended(base, assembly, {s.option.key: s for s in scores}, numerics)
+    declared = EstimatedModel(base.fit, {})
 
     def fitted(effects: tuple[Added, ...]) -> EstimatedModel | None:
-        return extended(effects) if effects else EstimatedModel(base.fit, {})
+        return extended(effects, declared) if effects else declared
 
     return thread_map(fitted, list(structures), numerics.jobs)
 

@@ -1,8 +1,8 @@
 """Structures: which effects act, alone or together, and whether there is something outside the
 catalogue; their prior and their posterior probabilities.
 
-The prior is stated: one half that nothing is missing, two fifths for effects of the catalogue, one
-tenth for something outside of it. The share of the catalogue is divided equally among families,
+The prior is stated: two fifths that nothing is missing, two fifths for effects of the catalogue,
+one fifth for something outside of it: no catalogue has every law. The share of the catalogue is divided equally among families,
 then among the effects of a family, so that near copies do not weigh more.
 """
 
@@ -37,9 +37,9 @@ class StructurePrior:
         whatever is missing and name no cause.
     """
 
-    nothing: float = 0.5
+    nothing: float = 0.4
     catalogue: float = 0.4
-    outside: float = 0.1
+    outside: float = 0.2
     numbers: tuple[float, ...] = (0.75, 0.2, 0.04, 0.01)
     families: Mapping[str, float] = field(default_factory=dict)
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -129,11 +129,16 @@ class Signal:
 
     def at(self, time: Array, derivative: int = 0) -> Array:
         """Value or time derivative, shape of ``time``."""
-        omega = 2 * np.pi * self.frequencies
-        turn = np.multiply.outer(np.asarray(time, dtype=float), omega) + self.phases
+        omega, amplitudes = self._omega, self.amplitudes
+        turn = np.asarray(time, dtype=float)[..., None] * omega + self.phases
+        if derivative == 0:  # an integrator asks for nothing else
+            return np.asarray(np.sin(turn) @ amplitudes + self.mean)
         turn = turn + derivative * np.pi / 2
-        values: Array = np.sin(turn) @ (self.amplitudes * omega**derivative)
-        return values + (self.mean if derivative == 0 else 0.0)
+        return np.asarray(np.sin(turn) @ (amplitudes * omega**derivative))
+
+    @cached_property
+    def _omega(self) -> Array:
+        return 2 * np.pi * self.frequencies
 
     def times(self, factor: float) -> Signal:
         """The same with smaller or larger swings about its mean."""
@@ -181,7 +186,7 @@ class Oscillator(System):
     def rates(self, s: Array, signal: Signal, t: Array, resist: Array) -> Array:
         p = self.truth
         pull = p["damping"] * s[1] + p["stiffness"] * s[0] + p.get("cubic", 0.0) * s[0] ** 3
-        return np.stack([s[1], (signal.at(t) - pull - resist) / p["mass"]])
+        return np.array([s[1], (signal.at(t) - pull - resist) / p["mass"]])
 
     def outputs(self, s: Array, signal: Signal, t: Array, resist: Array) -> dict[str, Array]:
         return {"displacement": s[0]}
@@ -201,7 +206,7 @@ class TwoMasses(System):
         ground = p["damping"] * s[1] + p["stiffness"] * s[0]
         between = p["coupling_damping"] * (s[1] - s[3]) + p["coupling"] * (s[0] - s[2])
         first = (signal.at(t) - ground - between - resist) / p["mass"]
-        return np.stack([s[1], first, s[3], between / p["second_mass"]])
+        return np.array([s[1], first, s[3], between / p["second_mass"]])
 
     def outputs(self, s: Array, signal: Signal, t: Array, resist: Array) -> dict[str, Array]:
         return {"first": s[0], "second": s[2]}
@@ -648,7 +653,7 @@ def _simulated(
     """Channels by run, without noise; driven less where the motion does not repeat."""
     for _ in range(6):
         try:
-            plain = {run.label: _channels(system, run, NOTHING) for run in runs}
+            plain = {run.label: _plain(system, run) for run in runs}
             sizes = _sizes(plain, runs)
             if effect is None:
                 return runs, sizes, {label: found.channels for label, found in plain.items()}
@@ -670,6 +675,24 @@ def _sizes(plain: Mapping[str, _Motion], runs: Sequence[_Run]) -> Sizes:
     position, velocity = float(np.std(found.position)), float(np.std(found.velocity))
     mean = float(np.mean(found.position))
     return Sizes(position, velocity, float(np.std(force)), mean, run.base)
+
+
+#: Motions without an extra effect that were made last.
+_LAST: dict[tuple[object, ...], _Motion] = {}
+
+
+def _plain(system: System, run: _Run) -> _Motion:
+    """A run without an extra effect, which a campaign with effects of several sizes asks for
+    again."""
+    signal = run.signal
+    arrays = (signal.frequencies, signal.amplitudes, signal.phases, run.time)
+    truth = tuple(sorted(system.truth.items()))
+    key = (type(system), truth, run.frequency, signal.mean, *(a.tobytes() for a in arrays))
+    if key not in _LAST:
+        while len(_LAST) > 8:
+            del _LAST[next(iter(_LAST))]
+        _LAST[key] = _channels(system, run, NOTHING)
+    return _LAST[key]
 
 
 def _channels(system: System, run: _Run, extra: Extra) -> _Motion:

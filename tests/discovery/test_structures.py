@@ -77,7 +77,7 @@ def test_what_is_missing_is_probable(rubbing):
 
 def test_nothing_is_probable_where_nothing_is_missing(plain):
     found = compared(plain)
-    # The prior of nothing is a half: data that show nothing raise it.
+    # The prior of nothing is two fifths: data that show nothing raise it.
     assert found.nothing > 0.6
     assert max(found.effects.values()) < 0.2
 
@@ -85,6 +85,70 @@ def test_nothing_is_probable_where_nothing_is_missing(plain):
 def test_without_the_true_effect_something_outside_is_probable(rubbing):
     found = compared(rubbing, ("quadratic_stiffness", "sensor_gain"))
     assert found.outside > 0.9
+
+
+def with_two_effects(x, v, t):
+    return with_soft_friction(x, v, t) + 2e4 * x**2
+
+
+PAIR = (FRICTION, ("quadratic_stiffness", "force"))
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory) -> State:
+    return fitted(damper_campaign(tmp_path_factory.mktemp("two"), with_two_effects), damper())
+
+
+def evidence_with(state: State, names=FEW) -> tuple[Evidence, list[EstimatedModel]]:
+    """Evidence about the declared model, and estimates of the pair's parts and of the pair, from
+    one of them and from the declared model."""
+    base = state.base()
+    scores, _ = score_candidates(base, state.assembly, [find_effect(n) for n in names], 1)
+    errors = {(entry.run, entry.output): entry for entry in state.fit_errors.entries}
+    evidence = Evidence(Comparison.of(base, errors, scores, StructurePrior()))
+    declared = EstimatedModel(base.fit, {})
+    evidence.add(declared)
+    by_key = {score.option.key: score for score in scores}
+    estimate = _extended(base, state.assembly, by_key, NUMERICS)
+    single = [estimate((key,), declared) for key in PAIR]
+    return evidence, [*single, estimate(PAIR, single[0]), estimate(PAIR, declared)]
+
+
+def test_two_effects_are_found_where_none_was_tried_as_a_pair(two, monkeypatch):
+    """Each is compared beside the other, for what is left of a probable set is estimated too."""
+    monkeypatch.setattr("bayesoleo.discovery._structure_comparison.IN_PAIRS", 1)
+    found = compared(two)
+    assert set(found.structures[0].effects) == set(PAIR)
+    assert found.structures[0].estimated
+    assert all(found.effects[key] > 0.9 for key in PAIR)
+
+
+def test_an_estimate_does_not_depend_on_where_it_starts(two):
+    """The mode is one: from the estimate of a part, or from the declared model."""
+    evidence, (one, _, both, other) = evidence_with(two)
+    evidence.add(one)
+    assert evidence.nearest(PAIR) is one
+    for name, value in both.fit.values.items():
+        # Estimates for comparison end where steps are small parts of a standard deviation.
+        sd = float(
+            np.sqrt(both.fit.point.covariance.diagonal()[both.fit.problem.names.index(name)])
+        )
+        assert other.fit.values[name] == pytest.approx(value, abs=0.2 * sd)
+    assert both.fit.values["quadratic_stiffness"] == pytest.approx(2e4, rel=0.05)
+
+
+def test_a_law_like_an_effect_has_one_evidence_about_both_estimates(two):
+    """About an estimate without the effect, by its column, and about one with it."""
+    evidence, (one, other, both, _) = evidence_with(two)
+    evidence.add(one)
+    key, part = PAIR[1], frozenset({PAIR[0]})
+    about_part = evidence._similar[part][key]
+    evidence.add(other)
+    evidence.add(both)
+    # Sizes are on a coarser grid where the effect is estimated: half a unit of log evidence.
+    assert evidence._similar[part][key] == pytest.approx(about_part, abs=0.7)
+    like, alone = evidence.evidence_of((part, True)), evidence.found[part, True]
+    assert like > alone  # what differs a little from the effect beside friction is likelier
 
 
 def test_odds_of_two_structures_follow_their_prior(plain):
@@ -109,7 +173,9 @@ def test_evidence_about_an_estimate_is_that_of_importance_sampling(tmp_path):
     evidence = Evidence(Comparison.of(base, errors, scores, StructurePrior()))
     evidence.add(EstimatedModel(base.fit, {}))
     (score,) = scores
-    anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)((FRICTION,))
+    anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)(
+        (FRICTION,), EstimatedModel(base.fit, {})
+    )
     evidence.add(anchor)
     found = evidence.found[frozenset({FRICTION}), False]
     assert found == pytest.approx(_sampled(evidence.comparison, anchor), abs=0.3)
