@@ -2,8 +2,9 @@
 catalogue; their prior and their posterior probabilities.
 
 The prior is stated: two fifths that nothing is missing, two fifths for effects of the catalogue,
-one fifth for something outside of it: no catalogue has every law. The share of the catalogue is divided equally among families,
-then among the effects of a family, so that near copies do not weigh more.
+one fifth for something outside of it: no catalogue has every law. The share of the catalogue is
+divided equally among families, then among the effects of a family, so that near copies do not
+weigh more.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 structures are right.
 
 Run with ``python tests/benchmarks/structures.py --json`` for one flat object, or without ``--json``
-for a table; the keys are explained in the files that measure them, :mod:`structures_coverage`.
-Those of probabilities come from the stored table of ``studies/structure_probabilities.py``, with
-its command, seed and version. ``--count`` is the number of campaigns of each question, ``--only``
-names keys.
+for a table; the keys are explained in the files that measure them, :mod:`structures_coverage`,
+:mod:`structures_nuisance` and :mod:`structures_round`. Those of probabilities come from the stored
+table of ``studies/structure_probabilities.py``, with its command, seed and version. ``--count`` is
+the number of campaigns of each question, ``--only`` names keys.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import structures_coverage as coverage
+import structures_nuisance as nuisance
+import structures_round
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import structure_figures
@@ -96,6 +98,10 @@ MEASURED: dict[tuple[str, ...], Callable[[int], Mapping[str, float | str]]] = {
         for key in ("coverage_inside", "coverage_outside", "width_inside")
     ): lambda count: coverage.side_by_side(count, SEED),
     ("density_ratio",): density_ratio,
+    ("round_ratio",): structures_round.round_ratio,
+    ("nuisance_named", "nuisance_significant"): lambda count: nuisance.figures(
+        min(count / (3 * nuisance.EACH), 1.0), lambda text: print(text, file=sys.stderr)
+    ),
     PROBABILITIES: probabilities,
 }
 
