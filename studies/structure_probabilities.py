@@ -48,6 +48,9 @@ BEYOND = 3.0
 PLAN = Plan(fitted=2, held_out=0, periods=5, per_period=64.3)
 #: Probabilities below this are not kept.
 KEPT = 0.01
+#: Log evidence of structures that are more probable goes to the rows, so that another prior can be
+#: tried without running them again; the stored table is without.
+SMALL = 1e-6
 SEED = 2718
 
 
@@ -166,6 +169,11 @@ def run(number: int) -> dict[str, Any]:
             [[f"{e} @ {t}" for e, t in s.effects], s.outside, s.probability]
             for s in found.structures[:5]
         ],
+        "evidence": [
+            [s.effects, s.outside, round(s.log_evidence, 2)]
+            for s in found.structures
+            if s.probability > SMALL
+        ],
         "ratio": state.worst_ratio,
         "made_seconds": begin - start,
         "score_seconds": middle - begin,
@@ -183,6 +191,7 @@ def store(rows: Sequence[Mapping[str, Any]], campaigns: int) -> None:
         "campaigns": len(kept),
         "failed": len(rows) - len(kept),
     }
+    kept = [{key: value for key, value in row.items() if key != "evidence"} for row in kept]
     lines = ",\n".join(json.dumps(_brief(row)) for row in kept)
     text = json.dumps(head)[:-1] + f', "rows": [\n{lines}\n]}}\n'
     TABLE.write_text(text, encoding="utf-8")

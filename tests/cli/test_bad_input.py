@@ -242,7 +242,7 @@ def test_usage_errors_exit_with_two(run, arguments):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("nothing=x", "no number (got 'nothing=x'); write nothing=0.4,"),
+        ("nothing=x", "no number (got 'nothing=x'); write nothing=0.45,"),
         ("noth=0.5", "no part of this prior (got 'noth=0.5'); use nothing, catalogue, outside"),
         ("nothing=0.9,outside=0.2", "leaves no probability for the other parts"),
         ("outside=0", "structure-prior.outside: must be a finite number above zero (got 0.0)"),
@@ -257,7 +257,9 @@ def test_a_prior_of_structures_that_cannot_be(refused, campaign, model, given, m
 
 def test_parts_of_the_prior_that_are_left_out_share_the_rest():
     prior = settings(structure_prior="nothing=0.8").structure_prior
-    assert (prior.nothing, prior.catalogue, prior.outside) == pytest.approx((0.8, 0.4 / 3, 0.2 / 3))
+    assert (prior.nothing, prior.catalogue, prior.outside) == pytest.approx(
+        (0.8, 0.2 * 8 / 11, 0.2 * 3 / 11)
+    )
     assert settings(structure_prior=None).structure_prior == StructurePrior()
 
 

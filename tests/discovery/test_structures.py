@@ -77,7 +77,7 @@ def test_what_is_missing_is_probable(rubbing):
 
 def test_nothing_is_probable_where_nothing_is_missing(plain):
     found = compared(plain)
-    # The prior of nothing is two fifths: data that show nothing raise it.
+    # The prior of nothing is 0.45: data that show nothing raise it.
     assert found.nothing > 0.6
     assert max(found.effects.values()) < 0.2
 
