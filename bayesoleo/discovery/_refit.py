@@ -348,7 +348,13 @@ def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> di
     return changed
 
 
-def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Numerics) -> ModelFit:
+def quick_fit(
+    base: Base,
+    model: Model,
+    known: Mapping[str, float],
+    numerics: Numerics,
+    method: str = "mbe",
+) -> ModelFit:
     """Estimate a model to compare it with the present one, on the same runs and mesh.
 
     Parameters
@@ -360,6 +366,8 @@ def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Nu
     known : mapping of str to float
         Starts of by-run unknowns, as far as known.
     numerics : Numerics
+    method : str
+        Estimator that leads to the mode; BE goes there at once, from a start nearby.
     """
     # NumPy's kernels need no compiler, and a comparison needs no higher accuracy than the data.
     quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
@@ -372,6 +380,7 @@ def quick_fit(base: Base, model: Model, known: Mapping[str, float], numerics: Nu
         max_iterations=15,
         share=base.fit.predictor,
         check_mesh=False,
+        method=method,
     )
 
 

@@ -366,7 +366,7 @@ def _extended(
         except ModelError:
             return None
         known |= near.fit.values
-        fit = quick_fit(base, grown.model(), known, numerics)
+        fit = quick_fit(base, grown.model(), known, numerics, "be")
         # A fit that stopped early is linearised where it is, which does nearly as well.
         solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
         return _anchor(grown, fit, scores) if solved else None
