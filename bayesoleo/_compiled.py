@@ -12,28 +12,134 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib.util
+import marshal
 import os
+import pickle
 import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
 from math import prod
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numba
 import numpy as np
 import platformdirs
 from llvmlite import ir
 from numba import types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
 from bayesoleo._types import Array, Integers
 
+
+def sealed(content: bytes) -> bytes:
+    """Content of a file with its checksum before it; see :func:`unsealed`."""
+    return hashlib.sha256(content).digest() + content
+
+
+def unsealed(path: str | os.PathLike[str]) -> bytes | None:
+    """Content of a file that was written by :func:`sealed`; None if it is not whole, or not there.
+
+    Code and pickles are read from the cache: a byte that is wrong there crashes or gives wrong
+    numbers.
+    """
+    try:
+        whole = Path(path).read_bytes()
+    except OSError:
+        return None
+    content = whole[_DIGEST:]
+    return content if sealed(content) == whole else None
+
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+#: Their annotations lack too much for them to be called in checked code.
+_CacheFile: Any = IndexDataCacheFile
+_FunctionCache: Any = FunctionCache
+
+
+class _CheckedFile(_CacheFile):  # type: ignore[misc]
+    """Files in which Numba keeps what it compiled of a function; those that are not whole are not
+    there."""
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
+        # Another name than that of files without checksums, which others may read.
+        super().__init__(cache_path, f"{filename_base}.sha256", source_stamp)
+
+    def _load_index(self) -> dict[Any, str]:
+        content = unsealed(self._index_path)
+        if content is None:
+            return {}
+        version, stamp, overloads = pickle.loads(content)
+        current = (version, stamp) == (self._version, self._source_stamp)
+        return cast(dict[Any, str], overloads) if current else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        content = self._dump((self._version, self._source_stamp, overloads))
+        write_durably(Path(self._index_path), sealed(content))
+
+    def _load_data(self, name: str) -> Any:
+        content = unsealed(self._data_path(name))
+        if content is None:
+            raise FileNotFoundError(name)  # it is compiled again
+        return pickle.loads(content)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        write_durably(Path(self._data_path(name)), sealed(self._dump(data)))
+
+
+class _CheckedCache(_FunctionCache):  # type: ignore[misc]
+    """Numba's cache of a function, in files with checksums."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _CheckedFile(
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=self._impl.locator.get_source_stamp(),
+        )
+
+    def _save_overload(self, signature: Any, data: Any) -> None:
+        with suppress(OSError):  # a full disk must not stop a computation; only the cache is lost
+            super()._save_overload(signature, data)
+
+
+def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
+    """Decorator that compiles a function without the interpreter lock, and keeps the code on disk.
+
+    Parameters
+    ----------
+    **options
+        As ``numba.njit`` takes them.
+    """
+
+    def decorate(function: F) -> F:
+        made: Any = numba.njit(nogil=True, **options)(function)
+        if hasattr(made, "enable_caching"):  # it is plain Python where NUMBA_DISABLE_JIT is set
+            made._cache = _CheckedCache(function)
+        return cast(F, made)
+
+    return decorate
+
+
+def cached_callback(signature: Any, function: Callable[..., Any], **options: Any) -> Any:
+    """A function compiled at once for its address, as ``numba.cfunc`` does; kept on disk."""
+    made: Any = CFunc(function, normalize_signature(signature), locals={}, options=options)
+    made._cache = _CheckedCache(function)
+    made.compile()
+    return made
+
+
 #: Compiles a function for other compiled code and for Python, without the interpreter lock.
-jit = numba.njit(nogil=True, cache=True, error_model="numpy")
+jit = cached(error_model="numpy")
 
 #: Points in a block, and the distance between rows.
 BLOCK = 64
@@ -64,7 +170,7 @@ class BlockKernel:
     def pointer(self) -> Any:
         """The compiled function, to be passed to compiled code."""
         with COMPILING:
-            return numba.cfunc(SIGNATURE, cache=True, error_model="numpy")(self.function)
+            return cached_callback(SIGNATURE, self.function, error_model="numpy")
 
     @property
     def address(self) -> int:
@@ -276,16 +382,43 @@ def load(source: str) -> ModuleType:
 
 
 def _import(name: str, source: str) -> ModuleType:
-    path = cache_folder() / f"{name}.py"
-    if not path.is_file():
-        _write_atomically(path, source)
+    path = _source_file(name, source)
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # Numba finds a cached function's globals by its module's name
-    spec.loader.exec_module(module)
+    exec(_code(path, source), module.__dict__)
     return module
+
+
+def _source_file(name: str, source: str) -> Path:
+    """A file that holds the source; one that is empty, cut or changed is written anew."""
+    path = cache_folder() / f"{name}.py"
+    content = source.encode()
+    try:
+        if not path.is_file() or path.read_bytes() != content:
+            write_durably(path, content)
+    except OSError:  # a full disk
+        path = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-")) / path.name
+        path.write_bytes(content)
+    return path
+
+
+def _code(path: Path, source: str) -> Any:
+    """The byte code of a source, from a file beside it where that is whole.
+
+    Python's own cache of it has no checksum.
+    """
+    kept = path.with_name(f"{path.stem}.{sys.implementation.cache_tag}.code")
+    content = unsealed(kept)
+    if content is not None and content.startswith(importlib.util.MAGIC_NUMBER):
+        code = marshal.loads(content[len(importlib.util.MAGIC_NUMBER) :])
+        if code.co_filename == str(path):  # the folder may have been moved
+            return code
+    code = compile(source, str(path), "exec")
+    with suppress(OSError):  # as above
+        write_durably(kept, sealed(importlib.util.MAGIC_NUMBER + marshal.dumps(code)))
+    return code
 
 
 def cache_folder() -> Path:
@@ -300,9 +433,16 @@ def cache_folder() -> Path:
     return folder
 
 
-def _write_atomically(path: Path, text: str) -> None:
-    """Two processes may generate the same kernel at once; neither may read half a file."""
+def write_durably(path: Path, content: bytes) -> None:
+    """Write a file of the cache as a whole: two processes may make the same at once."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    with os.fdopen(handle, "w", encoding="utf-8") as stream:
-        stream.write(text)
-    os.replace(temporary, path)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise

@@ -120,6 +120,13 @@ def choose(wrong: object, allowed: Iterable[object], most: int = 1) -> str:
     return f"did you mean {' or '.join(close)}?" + (f" {listed}" if len(names) <= FEW else "")
 
 
+def memory_text(error: MemoryError) -> str:
+    """What is told where memory runs out, in one line."""
+    asked = " ".join(str(error).split())
+    text = "not enough memory" + (f": {asked[0].lower()}{asked[1:]}" if asked else "")
+    return f"{text}; close other programs, or use fewer --jobs, runs or draws"
+
+
 def check_number(
     value: object, key: str, *, hint: str, kind: type[InputError] = InputError
 ) -> None:

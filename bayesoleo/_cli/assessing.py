@@ -115,7 +115,12 @@ def _draw(data: xr.Dataset, drawn: list[Series], figure: Path) -> None:
         outputs = [str(output) for output in data[schema.OUTPUT].values]
         figures = {output: plots.assessment(data, output) for output in outputs}
     for output, made in figures.items():
-        made.savefig(figure.with_stem(f"{figure.stem}-{output}"))
+        shell.write_figure(made, _file_of(figure, str(output)))
+
+
+def _file_of(figure: Path, output: str) -> Path:
+    """The file of an output's figure; a name of a file cannot hold a slash."""
+    return figure.with_stem(f"{figure.stem}-{schema.variable_name(output)}")
 
 
 @options.of_settings("seed", "jobs")
@@ -179,8 +184,7 @@ def predict(
         shell.say(found)
     if figure is not None:
         for output in found.data[schema.OUTPUT].values:
-            path = figure.with_stem(f"{figure.stem}-{output}")
-            found.plot(output=str(output)).savefig(path)
+            shell.write_figure(found.plot(output=str(output)), _file_of(figure, str(output)))
 
 
 @options.of_settings("seed", "jobs", "scheduler", *options.SOLVED)

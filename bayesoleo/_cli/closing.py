@@ -96,7 +96,7 @@ def propose(
     if figure is not None:
         if schema.PROPOSAL not in tree.children:
             raise InputError("there is no run to draw", key="--figure", value=figure)
-        plots.proposal(tree).savefig(figure, dpi=150)
+        shell.write_figure(plots.proposal(tree), figure, dpi=150)
     if as_json:
         shell.print_json({"proposals": entries})
     else:
@@ -200,10 +200,11 @@ def demo(
 
 def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
     """Put a newly simulated campaign in the place of an older one of its kind, as a whole."""
-    from bayesoleo._storage.files import replacing
+    from bayesoleo._storage.files import only_writer, replacing, sweep
 
     target = out / "campaign"
-    with replacing(target) as draft:
+    with only_writer(out), replacing(target) as draft:
+        sweep(out, [target.name])
         make(draft, seed)
         if target.exists() and not _is_demo(target, shell.campaign_name(draft)):
             hint = "choose another folder with --out"

@@ -18,6 +18,7 @@ from bayesoleo._workflow.settings import Settings
 from bayesoleo.errors import InputError
 
 if TYPE_CHECKING:
+    import xarray as xr
     from rich.console import Console
 
     from bayesoleo.data._reduction import ReducedCampaign
@@ -197,7 +198,6 @@ def report(
       bayesoleo report bayesoleo-shaker/results.nc
       bayesoleo report results.nc --out for-colleagues.html
     """
-    from bayesoleo._report.page import write_report
     from bayesoleo._storage.result_files import read_tree
 
     page = results.parent / PAGE if out is None else out.expanduser()
@@ -207,9 +207,23 @@ def report(
     if page.is_dir():
         raise InputError("is a folder", file=page, hint="give another file or folder with --out")
     shell.check_writable(page.parent)
-    page.parent.mkdir(parents=True, exist_ok=True)
-    write_report(tree, page)
+    _write_page(tree, page, page.parent.resolve() == results.parent.resolve())
     shell.say(f"report    {page}")
+
+
+def _write_page(tree: xr.DataTree, page: Path, beside: bool) -> None:
+    """Write the page; beside its result it is one of the files whose checksums are noted."""
+    from bayesoleo._report.page import write_report
+    from bayesoleo._storage.files import only_writer, read_sums, settle, sweep, together
+
+    with only_writer(page.parent):
+        settle(page.parent)
+        sweep(page.parent, [page.name])
+        if beside and page.name == PAGE and read_sums(page.parent):
+            with together(page.parent, [PAGE], keep=True) as draft:
+                write_report(tree, draft / PAGE)
+        else:
+            write_report(tree, page)
 
 
 @options.of_settings("seed", "jobs", *options.SOLVED)

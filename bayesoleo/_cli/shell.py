@@ -5,7 +5,9 @@ Labels of users are printed as they are, not as markup.
 
 from __future__ import annotations
 
+import errno
 import inspect
+import io
 import math
 import os
 import re
@@ -14,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
@@ -23,7 +25,10 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from bayesoleo import _schema as schema
-from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError
+from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError, memory_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], words: int = 1) -> Table:
@@ -175,6 +180,26 @@ class Commands(TyperGroup):
                 raise
             complain(f"error: {error}")
             raise typer.Exit(UNUSABLE) from None
+        except (MemoryError, OSError) as error:
+            text = machine_text(error)
+            if not text or os.environ.get(DEBUG, "0") not in ("", "0"):
+                raise
+            complain(f"error: {text}")
+            raise typer.Exit(UNUSABLE) from None
+
+
+#: What a disk refuses, whatever the program does.
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ENAMETOOLONG)
+
+
+def machine_text(error: MemoryError | OSError) -> str:
+    """What is told where memory or a disk has come to its limit; empty for other errors."""
+    if isinstance(error, MemoryError):
+        return memory_text(error)
+    if error.errno not in _DISK:
+        return ""
+    where = f"file {error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror}; give another folder, or make room on this disk"
 
 
 def add(app: typer.Typer, panel: str, *commands: Callable[..., None]) -> None:
@@ -375,9 +400,33 @@ def _check_own(folder: Path, campaign: Path) -> None:
 
 def check_writable(folder: Path) -> Path:
     """See :func:`bayesoleo._storage.files.check_writable`."""
-    from bayesoleo._storage.files import check_writable
+    from bayesoleo._storage.files import check_free, check_writable
 
-    return check_writable(folder)
+    place = check_writable(folder)
+    check_free(place)
+    return place
+
+
+def write_figure(figure: Figure, path: Path, **options: Any) -> None:
+    """Write a figure in the format that the name ends in, as a whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    path : Path
+    **options
+        As ``figure.savefig`` takes them.
+    """
+    from bayesoleo._storage.files import write_bytes_atomic
+
+    drawn = io.BytesIO()
+    try:
+        figure.savefig(drawn, format=path.suffix[1:].lower() or "png", **options)
+    except ValueError as error:  # it lists the formats that there are
+        raise InputError(
+            "is no format of a figure", file=path, hint="give a name that ends in .png or .pdf"
+        ) from error
+    write_bytes_atomic(path, drawn.getvalue())
 
 
 def write_groups(groups: Mapping[str, Any], path: Path, seed: int | None, **about: str) -> None:
@@ -394,11 +443,14 @@ def write_groups(groups: Mapping[str, Any], path: Path, seed: int | None, **abou
     """
     import xarray as xr
 
+    from bayesoleo._storage.files import only_writer, sweep
     from bayesoleo._storage.result_files import provenance, write_tree
 
     tree = xr.DataTree.from_dict(dict(groups))
     tree.attrs.update(provenance(seed, **about))
-    write_tree(tree, path)
+    with only_writer(path.parent):
+        sweep(path.parent, [path.name])
+        write_tree(tree, path)
 
 
 def print_json(value: Any) -> None:

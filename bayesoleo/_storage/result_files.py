@@ -7,9 +7,12 @@ format could not be written as the other otherwise.
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import os
 import platform
+import re
 import warnings
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -20,7 +23,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._storage.files import replacing
+from bayesoleo._storage.files import current, replacing, sha256, write_bytes_atomic
 from bayesoleo.errors import MissingExtraError, ResultsError, import_extra
 
 PACKAGES = (
@@ -101,15 +104,17 @@ def write_tree(tree: xr.DataTree, path: str | os.PathLike[str]) -> None:
         The place cannot be written to; an older result there is untouched.
     MissingExtraError
         The path ends in ``.zarr`` and Zarr is not installed.
+    MemoryError
+        A copy of the result does not fit into memory.
     """
     if _is_zarr(path):
         import_extra("zarr", "zarr")
     storable = _storable(tree)
-    with replacing(path) as draft:
-        if _is_zarr(path):
+    if _is_zarr(path):
+        with replacing(path) as draft:
             _write_zarr(storable, draft)
-        else:
-            storable.to_netcdf(draft, engine="h5netcdf", encoding=_compression(storable))
+    else:
+        write_bytes_atomic(path, netcdf_bytes(storable))
 
 
 def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
@@ -127,31 +132,31 @@ def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
     Raises
     ------
     ResultsError
-        The file is missing, empty, cut short, of another kind or from a later version.
+        The file is missing, empty, cut short, changed, of another kind or from a later version.
     MissingExtraError
         The path ends in ``.zarr`` and Zarr is not installed.
     """
     path = Path(path)
+    path = current(path)
     _check_exists(path)
     try:
         tree = _read_zarr(path) if _is_zarr(path) else _read_netcdf(path)
-    except MissingExtraError:
+    except (MissingExtraError, ResultsError, MemoryError):
         raise
     # A damaged file shows itself as almost anything, depending on where it is damaged.
     except Exception as error:
-        raise ResultsError(
-            "cannot be read; it is damaged, cut short or not a netCDF or Zarr result",
-            file=path,
-            hint="run the command that wrote it once more, or give the results.nc of another run",
-        ) from error
+        problem = "cannot be read; it is damaged, cut short or not a netCDF or Zarr result"
+        raise _damaged(path, problem) from error
     _check_format(tree, path)
+    tree.attrs.pop(_ZARR_SUM, None)
     return tree.map_over_datasets(_clean)
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
     """What a netCDF result says of itself, without its arrays; nothing if it cannot be read."""
     try:
-        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as root:
+        _check_sum(current(Path(path)))
+        with xr.open_dataset(current(Path(path)), engine="h5netcdf", decode_times=False) as root:
             return dict(root.attrs)
     except Exception:  # as above: damage has many faces
         return {}
@@ -207,20 +212,175 @@ def _compression(tree: xr.DataTree) -> dict[str, dict[str, dict[str, Any]]]:
     return encoding
 
 
+class _Image(io.RawIOBase):
+    """A file in memory to which writing never fails before it is closed.
+
+    The HDF5 library crashes the process where closing a file fails: a full disk, or memory that
+    runs out, must not reach it.
+
+    Parameters
+    ----------
+    size : int
+        Bytes to begin with.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._content, self._end, self._at = np.zeros(size, np.uint8), 0, 0
+        self.failed: MemoryError | None = None
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._end}[whence]
+        self._at = start + offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        found = self._content[self._at : min(self._at + len(view), self._end)]
+        view[: found.size] = found.data
+        self._at += found.size
+        return int(found.size)
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        end = self._at + len(view)
+        if end > self._content.size:
+            self._grow(end)
+        if self.failed is None:
+            self._content[self._at : end] = view
+        self._at, self._end = end, max(self._end, end)
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._at if size is None else size
+        if size > self._content.size:
+            self._grow(size)
+        self._end = size
+        return size
+
+    def _grow(self, size: int) -> None:
+        try:
+            larger = np.zeros(size + size // 4, np.uint8)
+        except MemoryError as error:
+            self.failed = self.failed or error
+        else:
+            larger[: self._content.size] = self._content
+            self._content = larger
+
+    def content(self) -> memoryview:
+        """All that was written."""
+        if self.failed is not None:
+            raise self.failed
+        return self._content[: self._end].data
+
+
+#: Bytes that must be free besides the arrays while a file is made.
+_SPARE = 32 * 2**20
+_SUM_LINE = b"\nbayesoleo sha256 %s\n"
+_SUM_LENGTH = len(_SUM_LINE % bytes(64))
+
+
+def netcdf_bytes(tree: xr.DataTree) -> bytes:
+    """A tree as a netCDF file, with the checksum of its content in the last line.
+
+    Readers of netCDF and HDF5 pass over what follows the content.
+
+    Raises
+    ------
+    MemoryError
+        If there is no room for it.
+    """
+    sizes = [item.nbytes for node in tree.subtree for item in node.variables.values()]
+    # Asked for before the library is: see _Image.
+    np.zeros(2 * max(sizes, default=0) + _SPARE, np.uint8)
+    image = _Image(sum(sizes) + _SPARE // 8)
+    tree.to_netcdf(image, engine="h5netcdf", encoding=_compression(tree))
+    content = image.content()
+    digest = hashlib.sha256(content).hexdigest().encode()
+    return b"".join((content, _SUM_LINE % digest))
+
+
+def _check_sum(path: Path) -> None:
+    """Raise where a netCDF file has a checksum that is another than that of its content.
+
+    One of another program has none.
+    """
+    with path.open("rb") as stream:
+        left = path.stat().st_size - _SUM_LENGTH
+        if left <= 0:
+            return
+        stream.seek(left)
+        line = stream.read()
+        if not re.fullmatch(re.escape(_SUM_LINE % b"X").replace(b"X", b"[0-9a-f]{64}"), line):
+            return
+        stream.seek(0)
+        digest = hashlib.sha256()
+        while left > 0:
+            block = stream.read(min(left, 2**20))
+            digest.update(block)
+            left -= len(block)
+    if digest.hexdigest().encode() not in line:
+        raise _damaged(path, "was changed since it was written, or is damaged")
+
+
+_ROOT, _ZARR_SUM = "zarr.json", "bayesoleo_sha256"
+
+
+def _zarr_sum(path: Path, attributes: dict[str, Any]) -> str:
+    """Digest of the files of a Zarr result; that of the root's attributes without their digest."""
+    total = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
+    for file in sorted(item for item in path.rglob("*") if item.is_file()):
+        if file != path / _ROOT:
+            total.update(file.relative_to(path).as_posix().encode())
+            total.update(sha256(file).encode())
+    return total.hexdigest()
+
+
+def _check_zarr_sum(path: Path) -> None:
+    """As :func:`_check_sum`."""
+    attributes = json.loads((path / _ROOT).read_text(encoding="utf-8")).get("attributes", {})
+    noted = attributes.pop(_ZARR_SUM, None)
+    if noted is not None and noted != _zarr_sum(path, attributes):
+        raise _damaged(path, "was changed since it was written, or is damaged")
+
+
+def _damaged(path: Path, problem: str) -> ResultsError:
+    hint = "run the command that wrote it once more, or give the results.nc of another run"
+    return ResultsError(problem, file=path, hint=hint)
+
+
 def _write_zarr(tree: xr.DataTree, path: Path) -> None:
     with warnings.catch_warnings():
         # Zarr 3 has not settled how fixed-width text is written; what we write, we read (tested).
         warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
         tree.to_zarr(path, mode="w", consolidated=False)
+    root = json.loads((path / _ROOT).read_text(encoding="utf-8"))
+    attributes = root.setdefault("attributes", {})
+    attributes[_ZARR_SUM] = _zarr_sum(path, attributes)
+    (path / _ROOT).write_text(json.dumps(root, indent=2), encoding="utf-8")
 
 
 def _read_netcdf(path: Path) -> xr.DataTree:
+    _check_sum(path)
     with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
         return tree.load()
 
 
 def _read_zarr(path: Path) -> xr.DataTree:
     import_extra("zarr", "zarr")
+    if (path / _ROOT).is_file():
+        _check_zarr_sum(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*does not have a Zarr V3 specification.*")
         options: dict[str, Any] = {"engine": "zarr", "decode_times": False, "consolidated": False}

@@ -35,6 +35,7 @@ from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
+from bayesoleo.errors import ResultsError
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._log_density import LogDensity
@@ -59,9 +60,10 @@ def trace(
     output = ResultFolder.checked(out)
     task = prepare(campaign, model, settings, progress=progress)
     _check_aim(task)
-    stages = Stages(callback)
-    loop, questions = search(task, 0, stages, output)
-    return written(task, loop, None, output, stages, questions)
+    with output.alone():
+        stages = Stages(callback)
+        loop, questions = search(task, 0, stages, output)
+        return written(task, loop, None, output, stages, questions)
 
 
 def close(
@@ -177,6 +179,8 @@ def written(
     """The result, written; if nothing failed on the way to it."""
     try:
         tree = write_result(task, loop, drawn, output, stages, questions)
+    except ResultsError:  # nothing more can be written than was
+        raise
     except Exception as error:
         stages.fail(REPORT_STAGE, reason_of(error), error)
         found = report_what_is_there(output, stages)

@@ -83,12 +83,13 @@ def estimate(
     """
     output, stages = ResultFolder.checked(out), Stages(callback)
     task = prepare(campaign, model, settings)
-    fit, more = estimated(task, stages)
-    tree = finish(task, {schema.POINT: point_group(fit), **more}, fit)
-    mark_unfinished(tree, stages.failed)
-    output.write(tree)
-    stages.finish(tree, output.folder)
-    output.finish()
+    with output.alone():
+        fit, more = estimated(task, stages)
+        tree = finish(task, {schema.POINT: point_group(fit), **more}, fit)
+        mark_unfinished(tree, stages.failed)
+        output.write(tree)
+        stages.finish(tree, output.folder)
+        output.finish()
     return tree
 
 

@@ -1,8 +1,8 @@
 """Output folder, the stages of a long calculation, and the tree and files that come of it.
 
-A folder is checked before anything is computed and written as soon as something is known. A stage
-that fails takes nothing with it that was known before. One tree holds everything that was found and
-where it comes from.
+A folder is checked before anything is computed and written as soon as something is known; the
+files of a result appear in it together. A stage that fails takes nothing with it that was known
+before. One tree holds everything that was found and where it comes from.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ from bayesoleo import _schema as schema
 from bayesoleo._report.page import write_report
 from bayesoleo._report.sentences import headline
 from bayesoleo._report.terminal import write_plain_report
-from bayesoleo._storage.files import check_writable, only_writer, write_text_atomic
+from bayesoleo._storage.files import (
+    SUMS,
+    check_free,
+    check_writable,
+    only_writer,
+    settle,
+    sweep,
+    together,
+    write_text_atomic,
+)
 from bayesoleo._storage.result_files import provenance, read_attributes, read_tree, write_tree
 from bayesoleo._storage.resume import digest, keep_state, kept_state, package_digest
 from bayesoleo._types import ProgressCallback
@@ -40,7 +49,7 @@ from bayesoleo.discovery._result_tree import (
 )
 from bayesoleo.discovery._round import Progress
 from bayesoleo.discovery._summary import summarise
-from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError
+from bayesoleo.errors import BayesoleoError, InputError, UnfinishedError, memory_text
 from bayesoleo.posterior._comparison import compare
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._log_density import LogDensity
@@ -48,6 +57,8 @@ from bayesoleo.systems._systems import equations, equations_latex
 
 RESULTS, REPORT, SUMMARY = "results.nc", "report.html", "summary.json"
 FILES = (RESULTS, REPORT, SUMMARY)
+#: Files and folders of which a process that was killed may have left a draft.
+SWEPT = (*FILES, "each.nc", "replications.nc", "campaign")
 CHECKPOINTS, SEARCH, OLDER = "checkpoints", "search.pickle", "older"
 #: By this file a folder of an older result is known as one that was made here, and may go.
 PUT_ASIDE = ".put-aside"
@@ -73,11 +84,13 @@ class ResultFolder:
         Raises
         ------
         InputError
-            If it is no path, or files cannot be written there without writing over others.
+            If it is no path, another process is writing there, or files cannot be written without
+            writing over others.
         """
         if out is None:
             return cls(None)
         folder = check_writable(out, FILES, (CHECKPOINTS, OLDER))
+        check_free(folder)
         aside = folder / OLDER
         if not (aside / PUT_ASIDE).is_file() and any((aside / name).exists() for name in FILES):
             raise InputError(
@@ -94,41 +107,44 @@ class ResultFolder:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep other processes from writing here.
+        """Keep other processes from writing here; what one that was killed left is put in order.
 
         Raises
         ------
         ResultsError
             If one does already.
         """
-        with only_writer(self.checkpoints):
+        with only_writer(self.folder):
+            if self.folder is not None:
+                settle(self.folder)
+                sweep(self.folder, SWEPT)
+                sweep(self.folder / CHECKPOINTS, (SEARCH,))
             yield
 
     # -- results ------------------------------------------------------------------------
 
     def write(self, tree: xr.DataTree, summary: dict[str, Any] | None = None) -> None:
         """Write a result; an older one that was finished is put aside until this one is."""
-        if self.folder is None:
-            return
-        if not self._begun:
-            self._put_aside()
-        self._begun = True
-        write_tree(tree, self.folder / RESULTS)
-        if summary is not None:
-            write_text_atomic(self.folder / SUMMARY, schema.summary_json(summary))
+        if self.folder is not None:
+            with self.draft() as draft:
+                write_files(tree, summary, draft)
 
-    def _put_aside(self) -> None:
-        """Move an older, finished result to a folder of its own."""
+    @contextmanager
+    def draft(self) -> Iterator[Path]:
+        """A folder to write files to, which replace those that are there on leaving.
+
+        An older result that was finished is put aside.
+        """
         assert self.folder is not None
-        if not is_finished(self.folder / RESULTS):
-            return
-        aside = self.folder / OLDER
-        _drop(aside)
-        aside.mkdir(parents=True, exist_ok=True)
-        (aside / PUT_ASIDE).touch()
-        for name in FILES:
-            if (self.folder / name).exists():
-                os.replace(self.folder / name, aside / name)
+        aside = None
+        if not self._begun and is_finished(self.folder / RESULTS):
+            aside = OLDER
+            _drop(self.folder / OLDER)
+            (self.folder / OLDER).mkdir(parents=True, exist_ok=True)
+            (self.folder / OLDER / PUT_ASIDE).touch()
+        with together(self.folder, FILES, aside=aside) as draft:
+            yield draft
+        self._begun = True
 
     def finish(self) -> None:
         """Drop the older result, and what the search would go on from: the new one is complete."""
@@ -158,11 +174,18 @@ class ResultFolder:
         return found
 
 
+def write_files(tree: xr.DataTree, summary: dict[str, Any] | None, folder: Path) -> None:
+    """Write a tree and its summary, if it has one."""
+    write_tree(tree, folder / RESULTS)
+    if summary is not None:
+        write_text_atomic(folder / SUMMARY, schema.summary_json(summary))
+
+
 def _drop(aside: Path) -> None:
     """Remove a result that was put aside; whatever else is in its folder stays."""
     if not (aside / PUT_ASIDE).is_file():
         return
-    for name in (*FILES, PUT_ASIDE):
+    for name in (*FILES, SUMS, PUT_ASIDE):
         (aside / name).unlink(missing_ok=True)
     with suppress(OSError):  # a user's own files are in it
         aside.rmdir()
@@ -245,6 +268,8 @@ def reason_of(error: Exception) -> str:
     """An exception in a line: what it says, and where it came from if it was not foreseen."""
     if isinstance(error, InputError):
         return str(error)
+    if isinstance(error, MemoryError):
+        return memory_text(error)
     text = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     own = [
         (Path(frame.filename), frame.lineno)
@@ -287,18 +312,20 @@ def write_result(
     if output.folder is None:
         return tree
     stages.callback("write results and report")
-    output.write(tree, summary)
-    page, failed = output.folder / REPORT, len(stages.failed)
-    for figure in stages.attempt(
-        REPORT_STAGE,
-        lambda: write_report(tree, page),
-        lambda: write_plain_report({**summary, schema.UNFINISHED: stages.failed}, page),
-    ):
-        stages.fail(REPORT_STAGE, figure)
-    if len(stages.failed) > failed:
-        summary[schema.UNFINISHED] = list(stages.failed)
-        _mark(tree, summary)
-        output.write(tree, summary)
+    with output.draft() as draft:
+        failed = len(stages.failed)
+        for figure in stages.attempt(
+            REPORT_STAGE,
+            lambda: write_report(tree, draft / REPORT),
+            lambda: write_plain_report(
+                {**summary, schema.UNFINISHED: stages.failed}, draft / REPORT
+            ),
+        ):
+            stages.fail(REPORT_STAGE, figure)
+        if len(stages.failed) > failed:
+            summary[schema.UNFINISHED] = list(stages.failed)
+            _mark(tree, summary)
+        write_files(tree, summary, draft)
     return tree
 
 
@@ -319,8 +346,9 @@ def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | 
     summary[schema.UNFINISHED] = [*stages.failed, *before]
     summary["headline"] = headline(summary)
     _mark(tree, summary)
-    output.write(tree, summary)
-    write_plain_report(summary, output.folder / REPORT)
+    with output.draft() as draft:
+        write_files(tree, summary, draft)
+        write_plain_report(summary, draft / REPORT)
     return tree
 
 

@@ -27,10 +27,10 @@ from dataclasses import dataclass
 from math import perm
 from typing import cast
 
-import numba
 import numpy as np
 from scipy import fft
 
+from bayesoleo._compiled import cached
 from bayesoleo._types import Array
 from bayesoleo.solvers._elimination import eliminate
 
@@ -49,7 +49,7 @@ def process_noise() -> Array:
     return np.array([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1.0]])
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def _advance(x: Array, p: Array, roughness: float, noise: Array, ahead: Array) -> None:
     """One step of the state ``x (3,)`` and its covariance ``p (3, 3)``, in place."""
     x[0] += x[1] + 0.5 * x[2]
@@ -72,7 +72,7 @@ def _advance(x: Array, p: Array, roughness: float, noise: Array, ahead: Array) -
             p[i, j] = value + roughness * noise[i, j]
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def _update(x: Array, p: Array, innovation: float, gain: Array) -> float:
     """Take in one sample with unit noise; returns the innovation's variance."""
     variance = p[0, 0] + 1.0
@@ -87,7 +87,7 @@ def _update(x: Array, p: Array, innovation: float, gain: Array) -> float:
     return float(variance)
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def _filter(
     values: Array, roughness: float, noise: Array, kept: Array, covariances: Array, store: bool
 ) -> tuple[float, float]:
@@ -129,7 +129,7 @@ def smooth(values: Array, roughness: float) -> Array:
     return kept
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def _backward(kept: Array, covariances: Array, roughness: float, noise: Array) -> None:
     ahead, x = np.zeros((3, 3)), np.zeros(3)
     for n in range(kept.shape[0] - 2, -1, -1):
@@ -145,7 +145,7 @@ def _backward(kept: Array, covariances: Array, roughness: float, noise: Array) -
                 kept[n, i] += weights[j, i] * change[j]
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def walk(steps: Array) -> Array:
     """States of the process from its increments ``(N, 3)``, from zero."""
     states = np.zeros_like(steps)

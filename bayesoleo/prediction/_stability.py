@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 
+from bayesoleo._compiled import cached
 from bayesoleo._types import Array, Complex, ComplexArray, Flags, Int, Integers
 from bayesoleo.solvers._orbit import floquet_multipliers
 
@@ -58,7 +58,7 @@ JUMPED = (
 )
 
 
-@numba.njit(nogil=True, cache=True)
+@cached()
 def jumps(
     x0: Array, x_p: Array, swing: Array, nodes: Integers, change: Array, x: Array, found: Flags
 ) -> None:

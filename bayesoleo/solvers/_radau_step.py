@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from bayesoleo._compiled import BLOCK, call_kernel, pointer
+from bayesoleo._compiled import BLOCK, cached, call_kernel, pointer
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._mesh import tableau
@@ -35,8 +34,7 @@ ROUND_OFF = 1e-10
 
 def inner[F: Callable[..., Any]](function: F) -> F:
     """Compile a function that only compiled code calls."""
-    options = {"nogil": True, "cache": True, "error_model": "numpy", **_NO_WRAPPERS}
-    return cast(F, numba.njit(**options)(function))
+    return cached(error_model="numpy", **_NO_WRAPPERS)(function)
 
 
 @inner

@@ -16,11 +16,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numba import types
 
-from bayesoleo._compiled import BLOCK, COMPILING, load
+from bayesoleo._compiled import BLOCK, COMPILING, cached_callback, load
 from bayesoleo.solvers import _unrolled_collocation as collocation_code
 from bayesoleo.solvers._mesh import Tableau
 from bayesoleo.solvers._unrolled_collocation import (
@@ -238,8 +237,8 @@ def _compile(parts: Sequence[str]) -> dict[str, int]:
     module = load(source)
     addresses = {}
     for name, signature in SIGNATURES.items():
-        compiler = numba.cfunc(signature, cache=True, error_model="numpy", fastmath={"contract"})
-        function: Any = compiler(getattr(module, name))
+        options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+        function = cached_callback(signature, getattr(module, name), **options)
         _ALIVE.append(function)
         addresses[name] = int(function.address)
     return addresses
