@@ -284,10 +284,12 @@ def simulate(
       bayesoleo simulate bayesoleo-shaker/results.nc --like shaker --out predicted --draws 20
     """
     from bayesoleo import _workflow as workflow
+    from bayesoleo._storage.files import only_writer
     from bayesoleo._storage.result_files import read_tree
     from bayesoleo._workflow.model_files import load_model
+    from bayesoleo.data._campaign_folders import is_vacant
 
-    if out.is_dir() and any(out.iterdir()):
+    if out.is_dir() and not is_vacant(out):
         raise InputError("folder is not empty", file=out, hint="choose another with --out")
     shell.check_writable(out)
     amounts = pairs(noise or [], "--noise")
@@ -306,9 +308,10 @@ def simulate(
     changed = pairs(values or [], "--set") or None
     made_from = read_tree(source) if from_result else load_model(source)
     more = {"noise": amounts} if amounts else {}
-    folder = workflow.simulate(
-        made_from, like, chosen, out=out, values=changed, draws=draws, **more
-    )
+    with only_writer(out):
+        folder = workflow.simulate(
+            made_from, like, chosen, out=out, values=changed, draws=draws, **more
+        )
     shell.say(f"campaign  {folder}")
 
 

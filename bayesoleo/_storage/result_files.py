@@ -23,8 +23,15 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._storage.files import current, replacing, sha256, write_bytes_atomic
-from bayesoleo.errors import MissingExtraError, ResultsError, import_extra
+from bayesoleo._storage.files import (
+    changed_files,
+    current,
+    read_sums,
+    replacing,
+    sha256,
+    write_bytes_atomic,
+)
+from bayesoleo.errors import DataWarning, MissingExtraError, ResultsError, import_extra
 
 PACKAGES = (
     "bayesoleo",
@@ -136,8 +143,8 @@ def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
     MissingExtraError
         The path ends in ``.zarr`` and Zarr is not installed.
     """
-    path = Path(path)
-    path = current(path)
+    place = Path(path)
+    path = current(place)
     _check_exists(path)
     try:
         tree = _read_zarr(path) if _is_zarr(path) else _read_netcdf(path)
@@ -149,6 +156,7 @@ def read_tree(path: str | os.PathLike[str]) -> xr.DataTree:
         raise _damaged(path, problem) from error
     _check_format(tree, path)
     tree.attrs.pop(_ZARR_SUM, None)
+    _check_beside(place)
     return tree.map_over_datasets(_clean)
 
 
@@ -332,6 +340,15 @@ def _check_sum(path: Path) -> None:
             left -= len(block)
     if digest.hexdigest().encode() not in line:
         raise _damaged(path, "was changed since it was written, or is damaged")
+
+
+def _check_beside(path: Path) -> None:
+    """Warn of files that were written with a result and are no longer what they were."""
+    if path.name not in read_sums(path.parent):
+        return
+    for name in changed_files(path.parent):
+        text = f"file {path.parent / name}: was changed since it was written with {path.name}"
+        warnings.warn(text, DataWarning, stacklevel=3)
 
 
 _ROOT, _ZARR_SUM = "zarr.json", "bayesoleo_sha256"

@@ -11,7 +11,9 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -257,20 +259,52 @@ def write_campaign(
         If the folder holds files, or something cannot be written so that it reads back.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not overwrite:
+    if not is_vacant(folder) and not overwrite:
         raise CampaignError(
             "folder is not empty", file=folder, hint="choose another, or pass overwrite=True"
         )
     _check_columns(channels)
     files = _file_names([run.label for run in runs])
-    folder.mkdir(parents=True, exist_ok=True)
-    for run, file in zip(runs, files, strict=True):
-        _write_samples(folder / file, run, channels)
     text = _head(name, description, controlled, channels)
     text += "".join(_run_table(run, file) for run, file in zip(runs, files, strict=True))
-    # Last, so that a campaign.toml never stands for runs that are not written yet.
-    (folder / FILE).write_text(text, encoding="utf-8", newline="\n")
+    with _moved_into(folder) as draft:
+        for run, file in zip(runs, files, strict=True):
+            _write_samples(draft / file, run, channels)
+        (draft / FILE).write_text(text, encoding="utf-8", newline="\n")
     return folder
+
+
+#: Folder of files that are being written; and the file by which a process keeps others out.
+_DRAFT, _NOT_COUNTED = ".campaign-draft", (".campaign-draft", ".lock")
+
+
+def is_vacant(folder: Path) -> bool:
+    """Whether a new campaign can be written to a folder without touching other files."""
+    if not folder.exists():
+        return True
+    return folder.is_dir() and all(item.name in _NOT_COUNTED for item in folder.iterdir())
+
+
+@contextmanager
+def _moved_into(folder: Path) -> Iterator[Path]:
+    """Give a folder to write files to, which are moved on leaving: a full disk leaves no half."""
+    draft, made = folder / _DRAFT, not folder.exists()
+    try:
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+        yield draft
+        # Last, so that a campaign.toml never stands for runs that are not there yet.
+        for file in sorted(draft.iterdir(), key=lambda path: path.name == FILE):
+            os.replace(file, folder / file.name)
+        draft.rmdir()
+    except OSError as error:
+        hint = "choose a folder that you may write to and that has space left"
+        problem = f"cannot be written: {error.strerror or error}"
+        raise CampaignError(problem, file=folder, hint=hint) from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+        if made and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def _check_columns(channels: Mapping[str, tuple[str, str]]) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -9,6 +12,7 @@ from small_rig import CAMPAIGN, MODEL, rows, write_rows
 
 from bayesoleo import _schema as schema
 from bayesoleo._cli.options import settings
+from bayesoleo._storage.files import only_writer
 from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo._workflow import Settings
 from bayesoleo.discovery import StructurePrior
@@ -167,6 +171,45 @@ def test_damaged_results(refused, tmp_path, made_up, campaign):
     assert f"file {path}: cannot be read; it is damaged" in refused("report", path)
     out = tmp_path / "simulated"
     assert "is damaged" in refused("simulate", path, "--like", campaign, "--out", out)
+
+
+def test_a_changed_byte_of_a_result_is_found(refused, tmp_path, made_up):
+    path = tmp_path / "results.nc"
+    write_tree(made_up.two_run_tree(), path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    for command in ("report", "assess"):
+        assert f"file {path}: was changed since it was written" in refused(command, path)
+
+
+@pytest.mark.parametrize("command", ["estimate", "sample", "trace", "close", "simulate"])
+def test_a_folder_to_which_another_process_writes_is_refused(
+    refused, campaign, model, tmp_path, command
+):
+    with only_writer(tmp_path / "out"):
+        what = [model, "--like", campaign] if command == "simulate" else [campaign, "-m", model]
+        line = refused(command, *what, "--out", tmp_path / "out")
+    assert (
+        f"file {tmp_path / 'out'}: another process is writing here (process {os.getpid()}" in line
+    )
+
+
+LIMITS = {
+    "memory": (MemoryError("Unable to allocate 9 GiB"), "not enough memory: unable to allocate 9"),
+    "disk": (OSError(errno.ENOSPC, "No space left on device", "a"), "file a: No space left on"),
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_machine_at_its_limit_is_told_in_one_line(refused, campaign, model, monkeypatch, name):
+    error, message = LIMITS[name]
+
+    def at_the_limit(*_, **__):
+        raise error
+
+    monkeypatch.setattr("bayesoleo._workflow.estimating.fit_model", at_the_limit)
+    assert message in refused("estimate", campaign, "--model", model)
 
 
 BAD_SIMULATIONS = {

@@ -1,11 +1,15 @@
 """Generated kernels compute what SymPy does, in both back ends, on both sides of every kink."""
 
+import hashlib
+import shutil
+import sys
+
 import numpy as np
 import pytest
 import sympy as sp
 from hypothesis import HealthCheck, assume, given, settings, strategies as st
 
-from bayesoleo._compiled import cache_folder
+from bayesoleo._compiled import BlockKernel, cache_folder, load, unsealed
 from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._expressions import FUNCTIONS, symbol
@@ -267,3 +271,62 @@ def test_a_conjugate_of_what_is_real_is_itself():
     scope = {"np": np, "p0": 1.5, "z0": np.array([1.0, 2.0])}
     exec("\n".join(lines), scope)
     np.testing.assert_allclose(eval(result, scope), [1.0, 2.0**1.5], rtol=1e-15)
+
+
+SMALL = "def add(z, u, p, out, count):\n    for i in range(count):\n        out[i] = z[i] + p[0]\n"
+
+
+def evaluate(source):
+    """A kernel of generated source, as a new process would load it."""
+    sys.modules.pop("bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24], None)
+    out = np.zeros((1, 1, 3))
+    kernel = BlockKernel(load(source).add, 1)
+    kernel(np.array([[[1.0, 2.0, 3.0]]]), np.zeros((0, 3)), np.array([[0.5]]), np.array([0]), out)
+    return out.ravel().tolist()
+
+
+def cut(content):
+    return content[: len(content) // 2]
+
+
+def flipped(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize("damage", [lambda _: b"", cut, flipped], ids=["empty", "cut", "flipped"])
+def test_a_damaged_file_of_the_cache_is_made_anew(tmp_path, monkeypatch, damage):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    assert evaluate(SMALL) == [1.5, 2.5, 3.5]
+    whole = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    kinds = {"".join(path.suffixes[-1:]) for path in whole}
+    assert kinds == {".py", ".code", ".nbi", ".nbc"}, "all of these are damaged below"
+    for path, content in whole.items():
+        path.write_bytes(damage(content))
+    assert evaluate(SMALL) == [1.5, 2.5, 3.5]
+    for path in whole:
+        assert path.suffix == ".py" or unsealed(path) is not None
+    (source,) = tmp_path.rglob("*.py")
+    assert source.read_text() == SMALL
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_full_disk_costs_only_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("bayesoleo._compiled.os.fsync", full)
+    assert evaluate(SMALL.replace("p[0]", "2.0*p[0]")) == [2.0, 3.0, 4.0]
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_cache_that_was_moved_is_used_where_it_is(tmp_path, monkeypatch):
+    source = SMALL.replace("p[0]", "3.0*p[0]")
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "a"))
+    assert evaluate(source) == [2.5, 3.5, 4.5]
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    shutil.rmtree(tmp_path / "a")
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "b"))
+    assert evaluate(source) == [2.5, 3.5, 4.5]
