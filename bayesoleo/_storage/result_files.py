@@ -347,8 +347,10 @@ def _check_beside(path: Path) -> None:
     if path.name not in read_sums(path.parent):
         return
     for name in changed_files(path.parent):
-        text = f"file {path.parent / name}: was changed since it was written with {path.name}"
-        warnings.warn(text, DataWarning, stacklevel=3)
+        text = f"was changed since it was written with {path.name}"
+        if name == path.name:
+            text = "was written again; the report and the summary beside it are of another result"
+        warnings.warn(f"file {path.parent / name}: {text}", DataWarning, stacklevel=3)
 
 
 _ROOT, _ZARR_SUM = "zarr.json", "bayesoleo_sha256"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from bayesoleo._compiled import cache_folder
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="forks, and sends SIGKILL"),
@@ -32,7 +33,8 @@ def faults() -> Iterator[ModuleType]:
 @pytest.fixture
 def bench(faults, tmp_path, monkeypatch):
     """A campaign, and the kernels that other tests have compiled."""
-    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "cache"))
+    # Set by the bench itself; this has it put back afterwards.
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(cache_folder().parent))
     return faults.Bench(tmp_path, few=True)
 
 
@@ -63,6 +65,8 @@ NAMES = ("label up, simulated", "label newline, estimated", "100 000 columns", "
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_hostile_input(bench, monkeypatch, name):
-    monkeypatch.setattr(sys.modules["faults"], "INPUTS", {name: sys.modules["hostile"].INPUTS[name]})
+    monkeypatch.setattr(
+        sys.modules["faults"], "INPUTS", {name: sys.modules["hostile"].INPUTS[name]}
+    )
     bench.inputs()
     check(bench.count, 0, 1)

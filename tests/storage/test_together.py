@@ -25,7 +25,7 @@ from bayesoleo._storage.files import (
 )
 from bayesoleo._storage.result_files import provenance, read_attributes, read_tree, write_tree
 from bayesoleo._workflow.output import FILES, OLDER, PUT_ASIDE, REPORT, RESULTS, ResultFolder
-from bayesoleo.errors import ResultsError
+from bayesoleo.errors import DataWarning, ResultsError
 
 posix = pytest.mark.skipif(os.name != "posix", reason="forks")
 #: What changes a disk; each of them may be the last thing that a process does.
@@ -126,6 +126,22 @@ def test_a_page_that_is_written_again_keeps_the_other_files(tmp_path):
     assert changed_files(tmp_path) == []
     (tmp_path / REPORT).write_text("edited")
     assert changed_files(tmp_path) == [REPORT]
+
+
+def test_files_that_were_changed_beside_a_result_are_warned_of(tmp_path):
+    output = ResultFolder.checked(tmp_path)
+    with output.draft() as draft:
+        write_tree(small_tree(), draft / RESULTS)
+        (draft / REPORT).write_text("as written")
+    read_tree(tmp_path / RESULTS)
+    (tmp_path / REPORT).write_text("edited")
+    with pytest.warns(DataWarning, match=rf"{REPORT}: was changed since it was written with"):
+        read_tree(tmp_path / RESULTS)
+    (tmp_path / REPORT).unlink()
+    read_tree(tmp_path / RESULTS)
+    write_tree(small_tree(2.0), tmp_path / RESULTS)
+    with pytest.warns(DataWarning, match="the summary beside it are of another result"):
+        read_tree(tmp_path / RESULTS)
 
 
 def test_checksums_are_those_that_sha256sum_reads(tmp_path):
