@@ -183,7 +183,10 @@ def _fetch(name: str, known: RegisteredSet, wanted: Sequence[str]) -> Path:
 
 TIME_COLUMN = "time_s"
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_PLAIN_FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+#: Names of files on every system: no others, not too long, and none that Windows keeps for devices.
+_PLAIN_FILE = re.compile(
+    r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{,99}", re.IGNORECASE | re.ASCII
+)
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,11 @@ def sniff_delimiter(lines: list[str]) -> str:
 def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == WHITESPACE:
         return [cell.strip('"') for cell in line.split()]
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [""])]
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter), [""])
+    except csv.Error:  # a cell of more than 128 kB: a long line without this delimiter
+        cells = line.split(delimiter)
+    return [cell.strip() for cell in cells]
 
 
 def _width(lines: list[str], delimiter: str) -> int:

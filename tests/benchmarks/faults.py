@@ -464,7 +464,7 @@ class Bench:
             around = sorted(self.root.iterdir())
             done = command(arguments, folder)
             kept = sorted(self.root.iterdir()) == around
-            self.count.fault(name, done, kept and right(folder))
+            self.count.fault(name, done, done.status == 0 and kept and right(folder))
             shutil.rmtree(folder)
 
 
@@ -490,12 +490,18 @@ SLOW, OFTEN, SELDOM = ("trace", "sample", "close"), 8, 4
 
 
 def measure(
-    few: bool = False, only: str = "", report: Callable[[str], None] = lambda _: None
+    few: bool = False,
+    only: str = "",
+    share: float = 1.0,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Count:
-    """Try all faults, a sample of them, or those whose name begins with one of some words."""
+    """Try all faults, a sample of them, or those whose name begins with one of some words.
+
+    ``share`` is that of the moments at which a command is killed, and of the bits.
+    """
     with tempfile.TemporaryDirectory(prefix="faults-") as root:
         bench = Bench(Path(root), few)
-        for name, step in steps(bench):
+        for name, step in steps(bench, share):
             if name.startswith(tuple(only.split(","))):
                 seen = len(bench.count.remarks)
                 report(name)
@@ -505,16 +511,16 @@ def measure(
     return bench.count
 
 
-def steps(bench: Bench) -> Iterator[tuple[str, Callable[[], None]]]:
+def steps(bench: Bench, share: float) -> Iterator[tuple[str, Callable[[], None]]]:
     """What is tried, one after the other."""
     for verb in ("reduce", "simulate") if bench.few else VERBS:
-        most = 2 if bench.few else SELDOM if verb in SLOW else OFTEN
+        most = 2 if bench.few else max(1, round(share * (SELDOM if verb in SLOW else OFTEN)))
         yield f"kill {verb}", partial(bench.kills, verb, most)
         yield f"fill the disk of {verb}", partial(bench.full_disk, verb, most)
     yield "hostile input", bench.inputs
     if not bench.few:
         yield "a small disk", bench.real_disk
-        yield "flipped bits", partial(bench.flips, 51)
+        yield "flipped bits", partial(bench.flips, max(3, round(share * 51)))
         yield "clocks", bench.clocks
         yield "locales", bench.locales
         for spare in (1, 30, 100):
@@ -526,10 +532,11 @@ def cli() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--few", action="store_true", help="a sample of the faults")
     parser.add_argument("--only", default="", help="steps, by their first words: kill,clocks")
+    parser.add_argument("--share", type=float, default=1.0, help="of moments and bits tried")
     wanted = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*multi-threaded.*")  # the child starts no thread
     told = partial(print, file=sys.stderr, flush=True)
-    count = measure(wanted.few, wanted.only, told)
+    count = measure(wanted.few, wanted.only, wanted.share, told)
     figures = {key: int(value) for key, value in vars(count).items() if key != "remarks"}
     if wanted.json:
         print(json.dumps(figures))

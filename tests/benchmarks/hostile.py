@@ -46,7 +46,7 @@ def labelled(label: str, command: list[str]) -> Spoil:
     """A run of that name."""
 
     def spoil(folder: Path) -> tuple[list[str], Right]:
-        written = json.dumps(label, ensure_ascii=True).replace("\\\\ud800", "\\ud800")
+        written = json.dumps(label, ensure_ascii=False).replace("\\\\ud800", "\\ud800")
         change(folder, 'label = "slow"', f"label = {written}")
         return command, near_truth if command is ESTIMATE else lambda made: inside(made / "out")
 

@@ -36,6 +36,8 @@ BAD_FILES = {
     "gap": (np.delete(rows(1.0), 30, axis=0), "run slow, column time_s: gap of 2 samples at 0.29"),
     "time back": (bad_rows(0, 30, 0.1), "run slow, column time_s: time does not increase"),
     "constant": (bad_rows(1, slice(None), 3.0), "run slow, column f_N: channel is constant (got 3"),
+    "huge": (rows(1.0) * [1, 1e160, 1], "column f_N: size of the samples is out of range (got"),
+    "tiny": (rows(1.0) * [1, 1e-160, 1], "column f_N: swing of the samples is out of range (got"),
     "short": (rows(1.0)[:150], "run slow, key frequency: fewer than two periods"),
 }
 

@@ -41,6 +41,15 @@ def check(columns):
         np.testing.assert_allclose(columns[name], expected, rtol=1e-8)
 
 
+def test_a_line_may_be_longer_than_a_cell(tmp_path):
+    """Python's csv takes a line without its delimiter for one cell, of 128 kB at most."""
+    count = 30_000
+    head = ",".join(["t", "a", "b", *(f"c{k}" for k in range(count))])
+    lines = [",".join([f"{cell:.9g}" for cell in row] + ["0"] * count) for row in VALUES]
+    (tmp_path / "run.csv").write_text("\n".join([head, *lines]) + "\n")
+    check(read_columns(tmp_path / "run.csv"))
+
+
 def test_binary_formats(tmp_path):
     columns = dict(zip(("t", "a", "b"), VALUES.T, strict=True))
     scipy.io.savemat(tmp_path / "run.mat", columns | {"note": "hand made", "rate": 2.0})

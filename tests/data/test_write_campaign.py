@@ -64,6 +64,25 @@ def test_transient_and_controlled(tmp_path):
     assert (tmp_path / "drop.csv").is_file()
 
 
+@pytest.mark.parametrize("label", ["r" * 300, "CON", "com1", "../a", "a\nb", ".", "測定", ""])
+def test_a_label_that_is_no_name_of_a_file_on_every_system_is_numbered(tmp_path, label):
+    runs = [simulated(label, np.random.default_rng(1))]
+    write_campaign(tmp_path / "new", name="one", channels=CHANNELS, runs=runs)
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"campaign.toml", "run-001.csv"}
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+def test_a_full_disk_leaves_no_half_of_a_campaign(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    runs = [simulated("a", np.random.default_rng(1))]
+    with pytest.raises(CampaignError, match="new: cannot be written: No space left on device"):
+        write_campaign(tmp_path / "new", name="one", channels=CHANNELS, runs=runs)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_files_are_not_overwritten(tmp_path):
     runs = [simulated("a", np.random.default_rng(1))]
     write_campaign(tmp_path, name="one", channels=CHANNELS, runs=runs)
