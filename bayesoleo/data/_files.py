@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from itertools import islice
 from pathlib import Path
@@ -182,7 +183,7 @@ def _header_names(
             value=header[:60],
             hint="set delimiter and header_delimiter of this run",
         )
-    repeated = sorted({name for name in names if names.count(name) > 1 and name})
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1 and name)
     if repeated:
         raise CampaignError("two columns have this name", file=path.name, column=repeated[0])
     return names
