@@ -364,7 +364,7 @@ class Bench:
                     right = content(folder / "out") == self.undisturbed(verb)[0]
                     self.count.fault(f"{verb} on a disk of {size} kB", done, right)
             finally:
-                subprocess.run(["umount", str(folder / "out")], check=False)
+                subprocess.run(["umount", "-l", str(folder / "out")], check=False)
 
     def memory(self, verb: str, spare: int) -> None:
         """Leave a command so many megabytes more than it has at its start."""

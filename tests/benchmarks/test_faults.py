@@ -47,9 +47,9 @@ def check(count, kills: int, faults: int) -> None:
 
 
 def test_a_command_that_is_killed_or_has_no_room(bench):
-    bench.kills("reduce", 3)
-    bench.full_disk("reduce", 3)
-    check(bench.count, 3, 3)
+    bench.kills("reduce", 2)
+    bench.full_disk("reduce", 2)
+    check(bench.count, 2, 2)
 
 
 @pytest.mark.slow
