@@ -24,6 +24,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._storage.files import (
+    SUMS,
     changed_files,
     current,
     read_sums,
@@ -347,10 +348,10 @@ def _check_beside(path: Path) -> None:
     if path.name not in read_sums(path.parent):
         return
     for name in changed_files(path.parent):
-        text = f"was changed since it was written with {path.name}"
+        text = f"file {path.parent / name}: is not as {SUMS} has it; one of them was changed"
         if name == path.name:
-            text = "was written again; the report and the summary beside it are of another result"
-        warnings.warn(f"file {path.parent / name}: {text}", DataWarning, stacklevel=3)
+            text += f", or {name} is of another result than the files beside it"
+        warnings.warn(text, DataWarning, stacklevel=3)
 
 
 _ROOT, _ZARR_SUM = "zarr.json", "bayesoleo_sha256"

@@ -135,12 +135,12 @@ def test_files_that_were_changed_beside_a_result_are_warned_of(tmp_path):
         (draft / REPORT).write_text("as written")
     read_tree(tmp_path / RESULTS)
     (tmp_path / REPORT).write_text("edited")
-    with pytest.warns(DataWarning, match=rf"{REPORT}: was changed since it was written with"):
+    with pytest.warns(DataWarning, match=rf"{REPORT}: is not as {SUMS} has it"):
         read_tree(tmp_path / RESULTS)
     (tmp_path / REPORT).unlink()
     read_tree(tmp_path / RESULTS)
     write_tree(small_tree(2.0), tmp_path / RESULTS)
-    with pytest.warns(DataWarning, match="the summary beside it are of another result"):
+    with pytest.warns(DataWarning, match="of another result than the files beside it"):
         read_tree(tmp_path / RESULTS)
 
 
