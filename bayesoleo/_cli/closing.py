@@ -104,7 +104,7 @@ def propose(
 
 
 def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -> None:
-    from bayesoleo._report.sentences import proposal_lines, proposal_table
+    from bayesoleo._report.structures import proposal_lines, proposal_table
 
     console = shell.console()
     if not entries:

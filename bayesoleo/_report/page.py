@@ -16,7 +16,8 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections, sentences, structures, tables
 from bayesoleo._report.sections import encode_formula
-from bayesoleo._report.sentences import begin, proposal_lines, proposal_table, role_shown
+from bayesoleo._report.sentences import begin, role_shown
+from bayesoleo._report.structures import proposal_lines, proposal_table
 from bayesoleo._report.tables import (
     FLOOR,
     error_scale,

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 
 from bayesoleo import _schema as schema, plots
-from bayesoleo._report.sentences import proposal_table
+from bayesoleo._report.structures import proposal_table
 from bayesoleo._report.tables import FLOOR, words
 from bayesoleo.assessment._residual_breakdown import residual_breakdown
 from bayesoleo.effects._catalogue import called, listed

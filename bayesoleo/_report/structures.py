@@ -1,16 +1,15 @@
-"""Sentences and the table of the probabilities of structures; empty where a result has none."""
+"""What might be missing: probabilities of structures, and the runs that would tell rivals apart.
+
+Sentences and tables are empty where a result has none.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-import xarray as xr
-
 from bayesoleo import _schema as schema
-from bayesoleo._display import columns
-from bayesoleo._report.tables import Table
+from bayesoleo._report.tables import Table, format_short
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.plots._discovery import SHOWN, format_probability, name
@@ -76,10 +75,10 @@ def next_best(summary: Mapping[str, Any]) -> str:
 
 
 def _listed(names: Sequence[str], summary: Mapping[str, Any]) -> str:
-    return listed([_called(one, summary) for one in names])
+    return listed([title_of(one, summary) for one in names])
 
 
-def _called(one: str, summary: Mapping[str, Any]) -> str:
+def title_of(one: str, summary: Mapping[str, Any]) -> str:
     """An effect by its title; the words for nothing and for what is outside stay."""
     return one if one in (NOTHING, OUTSIDE) else called(one, summary.get("titles", {}))
 
@@ -89,7 +88,7 @@ def structure_words(one: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     every = of_effects(summary)
     effects = sorted(one["effects"], key=lambda member: -every.get(member, 0.0))
     names = [*effects, *([OUTSIDE] if one["outside"] else [])] or [NOTHING]
-    return listed([_called(member, summary) for member in names])
+    return listed([title_of(member, summary) for member in names])
 
 
 def disagreement(summary: Mapping[str, Any]) -> str:
@@ -132,7 +131,7 @@ def classes(summary: Mapping[str, Any]) -> Iterator[str]:
         shown = [member for member in one["effects"] if single.get(member, 0.0) >= SHOWN]
         if len(shown) < 2:
             continue
-        names = listed([_called(member, summary) for member in shown], " or ")
+        names = listed([title_of(member, summary) for member in shown], " or ")
         rest = len(one["effects"]) - len(shown)
         family = f" or another effect of the family {one['family']}" if one["family"] else ""
         more = f"{family}" if rest and family else " or a similar effect" if rest else ""
@@ -151,7 +150,7 @@ def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
     best = next(iter(found["effects"]), None)
     if best is not None and best["probability"] >= LIKELY:
         p = spoken(best["probability"])
-        return f"{lead}, probably {_called(name(best), summary)} ({p})"
+        return f"{lead}, probably {title_of(name(best), summary)} ({p})"
     if found["nothing"] >= LIKELY:
         p = spoken(found["nothing"])
         return f"An error is left that is not noise, yet that nothing is missing has {p}"
@@ -176,7 +175,7 @@ def lines(summary: Mapping[str, Any], most: int = 4) -> list[str]:
     every += [(NOTHING, found["nothing"]), (OUTSIDE, found["outside"])]
     shown = [(one, p) for one, p in every if p >= SHOWN]
     shown = sorted(shown, key=lambda item: -item[1])
-    texts = [f"{_called(one, summary)} {format_probability(p)}" for one, p in shown]
+    texts = [f"{title_of(one, summary)} {format_probability(p)}" for one, p in shown]
     return [f"Probabilities: {'; '.join(texts)}.", *classes(summary)]
 
 
@@ -246,48 +245,197 @@ def section(summary: Mapping[str, Any]) -> list[str]:
     return [text for text in texts if text]
 
 
-def structures_data(summary: Mapping[str, Any]) -> xr.Dataset:
-    """Probabilities of effects and of the leading structures as labelled arrays.
+#: Pairs of rivals that have a column of their own.
+MOST_PAIRS = 3
+
+
+def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> list[str]:
+    """What one entry of the summary's ``proposals`` says, sentence by sentence.
 
     Parameters
     ----------
-    summary : mapping
-        As in ``summary.json``, with ``structures``.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``probability(effect)`` with its effects named ``effect @ target``;
-        ``structure_probability``, ``has_outside`` and ``estimated`` ``(structure)``; ``member``
-        ``(structure, effect)``; ``nothing``, ``outside`` and ``only_outside``.
+    entry : mapping
+        As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
     """
-    found, single = summary["structures"], of_effects(summary)
-    shown = found["list"]
-    member = [[one in entry["effects"] for one in single] for entry in shown]
-    flat = {key: [entry[key] for entry in shown] for key in ("outside", "estimated", "probability")}
-    return xr.Dataset(
-        {
-            "probability": (schema.EFFECT, list(single.values())),
-            "member": (("structure", schema.EFFECT), np.reshape(member, (len(shown), len(single)))),
-            "structure_probability": ("structure", flat["probability"]),
-            "has_outside": ("structure", flat["outside"]),
-            "estimated": ("structure", flat["estimated"]),
-            **{key: found[key] for key in ("nothing", "outside", "only_outside")},
-        },
-        coords={
-            schema.EFFECT: list(single),
-            "structure": [structure_words(entry, summary) for entry in shown],
-        },
-    )
+    entry = _with_titles(entry, titles or {})
+    lines = [_question(entry)]
+    if entry["runs"]:
+        lines += _answer(entry)
+    elif entry["note"]:
+        lines.append(f"No run can be proposed: {entry['note']}.")
+    else:
+        left_out = ", ".join(entry["left_out"])
+        lines.append(f"No run within the limits of the rig can be foreseen ({left_out or 'none'}).")
+    if entry["runs"] and entry["note"]:
+        lines.append(f"Left out: {entry['note']}.")
+    return lines
 
 
-def structures_text(summary: Mapping[str, Any]) -> str:
-    """The table of a session: single probabilities first, then structures, then classes."""
-    found = summary["structures"]
-    every = [*of_effects(summary).items(), (NOTHING, found["nothing"]), (OUTSIDE, found["outside"])]
-    every = sorted(every, key=lambda item: -item[1])
-    rows = [[_called(one, summary), format_probability(p)] for one, p in every if p >= SHOWN]
-    shown = table(summary)
-    texts = [columns(["acts", "probability"], rows)]
-    texts += [] if shown is None else [columns(shown.head, shown.rows)]
-    return "\n\n".join([*texts, *classes(summary)])
+def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:
+    """The entry with rivals as they are called."""
+
+    def words(names: Sequence[str]) -> list[str]:
+        return [" with ".join(called(e, titles) for e in one.split(" + ")) for one in names]
+
+    def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        return {**found, "pairs": [{**p, "rivals": words(p["rivals"])} for p in found["pairs"]]}
+
+    return {
+        **entry,
+        "rivals": words(entry["rivals"]),
+        "runs": [run(one) for one in entry["runs"]],
+        "repeat": run(entry["repeat"]),
+        "inseparable": [words(pair) for pair in entry["inseparable"]],
+    }
+
+
+def proposal_table(
+    entry: Mapping[str, Any], titles: Mapping[str, str] | None = None
+) -> Table | None:
+    """The runs that would tell most, the best first, and the best one of those made.
+
+    None where there is nothing to choose.
+
+    Parameters
+    ----------
+    entry : mapping
+        As in ``summary.json``.
+    titles : mapping of str to str, optional
+        Titles of effects by id, besides those of the catalogue.
+    """
+    if not entry["runs"] or _all_alike(entry):
+        return None
+    entry = _with_titles(entry, titles or {})
+    head = ["run", *_place_head(entry), "information [bit]", *_told_head(entry)]
+    shown = [(f"{number}", run) for number, run in enumerate(entry["runs"], start=1)]
+    if entry["repeat"]:
+        shown.append((f"{entry['repeat']['run']} once more", entry["repeat"]))
+    rows = [
+        [label, *_place(entry, run), f"{run['information']:.2f}", *_told(entry, run)]
+        for label, run in shown
+    ]
+    return Table(head, rows, 1, frozenset({0}))
+
+
+def _varies(entry: Mapping[str, Any]) -> bool:
+    """Whether proposed runs vary measured ones."""
+    return bool(entry["runs"][0].get("change"))
+
+
+def _place_head(entry: Mapping[str, Any]) -> list[str]:
+    """Heads of the columns that say which run it is."""
+    if _varies(entry):
+        return ["as run", "changed"]
+    unit = _scale(entry).unit
+    unit = f" [{unit}]" if unit else ""
+    return ["frequency [Hz]", f"mean{unit}", f"amplitude{unit}"]
+
+
+def _place(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    if _varies(entry):
+        return [run["like"], run["change"] or "nothing"]
+    factor = _scale(entry).factor
+    place = [factor * run[key] for key in ("mean", "amplitude")]
+    return [format_short(value) for value in (run["frequency"], *place)]
+
+
+def _told_head(entry: Mapping[str, Any]) -> list[str]:
+    """Heads of the columns that say how far a run separates rivals, or which parameters it makes
+    more precise."""
+    pairs = entry["runs"][0]["pairs"]
+    if not pairs:
+        return [f"sd of {name} [%]" for name in _most_improved(entry)]
+    by_pair = len(pairs) <= MOST_PAIRS
+    named = [f"{' / '.join(pair['rivals'])} [σ]" for pair in pairs]
+    return named if by_pair else ["least separated pair [σ]"]
+
+
+def _told(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    if not run["pairs"]:
+        return [f"{100 * run['sd_ratio'][name]:.0f}" for name in _most_improved(entry)]
+    by_pair = len(run["pairs"]) <= MOST_PAIRS
+    values = [pair["sigma"] for pair in run["pairs"]] if by_pair else [run["sigma"]]
+    return [format_sigma(value) for value in values]
+
+
+def _most_improved(entry: Mapping[str, Any]) -> list[str]:
+    """Parameters whose standard deviations the best run reduces most."""
+    ratio = entry["runs"][0].get("sd_ratio", {})
+    return sorted(ratio, key=lambda name: float(ratio[name]))[:MOST_PAIRS]
+
+
+def format_sigma(value: float) -> str:
+    """Standard deviations, to a tenth while that matters."""
+    return f"{value:.1f}" if value < 99.95 else f"{value:.0f}"
+
+
+def run_text(run: Mapping[str, Any], scale: Scale) -> str:
+    """A run in words: ``at 2.00 Hz, mean 120 mm, amplitude 30.0 mm``."""
+    if run.get("change"):
+        return f"like {run['like']} with {run['change']}"
+    mean, amplitude = (format_short(scale.factor * run[key]) for key in ("mean", "amplitude"))
+    unit = f" {scale.unit}" if scale.unit else ""
+    place = f"mean {mean}{unit}, amplitude {amplitude}{unit}"
+    return f"at {format_short(run['frequency'])} Hz, {place}"
+
+
+def _scale(entry: Mapping[str, Any]) -> Scale:
+    sizes = [max(abs(run["mean"] or 0.0), run["amplitude"] or 0.0) for run in entry["runs"]]
+    return engineering(entry["unit"], max(sizes, default=0.0))
+
+
+def _question(entry: Mapping[str, Any]) -> str:
+    names = listed(entry["rivals"])
+    if entry["question"] == "parameters":
+        what = entry.get("parameter") or "the parameters"
+        return f"To know {what} more precisely:"
+    if entry["question"] == "structures":
+        pairs = zip(entry["rivals"], entry.get("probabilities") or [], strict=False)
+        known = [f"{name} ({chance:.2f})" for name, chance in pairs]
+        return f"What is missing, by probability: {listed(known or entry['rivals'])}."
+    if entry["question"] == "indistinguishable":
+        first, *others = entry["rivals"]
+        return f"These data cannot tell {first}, which was added, from {listed(others)}."
+    if entry["question"] == "open":
+        return f"Each of {names} might be what is missing."
+    return f"To be told apart: {names}."
+
+
+def _answer(entry: Mapping[str, Any]) -> list[str]:
+    best, repeat, apart = entry["runs"][0], entry["repeat"], entry["inseparable"]
+    if _all_alike(entry):
+        return [
+            "No run within the limits of the rig would separate them by one standard deviation:"
+            " they are one law in other words, or differ beyond these limits or in other channels."
+        ]
+    gain = "is expected to tell"
+    text = f"A run {run_text(best, _scale(entry))} {gain} {best['information']:.2f} bits"
+    if best["pairs"]:
+        text += f" of the {entry['entropy']:.2f} that are open"
+    else:
+        name = _most_improved(entry)[0]
+        text += f" and to leave {100 * best['sd_ratio'][name]:.0f} % of the standard deviation"
+        text += f" of {name}"
+    if repeat and repeat["information"] > best["information"]:
+        text = f"{repeat['run']}, made once more, {gain} {repeat['information']:.2f} bits, more"
+        text += f" than any new run: one {run_text(best, _scale(entry))} {gain}"
+        text += f" {best['information']:.2f}"
+    elif repeat:
+        text += f"; no present run, made once more, more than {repeat['information']:.2f}"
+    lines = [f"{text}."]
+    for pair in apart:
+        lines.append(
+            f"No run within the limits of the rig separates {listed(pair, ' from ')} by one"
+            " standard deviation."
+        )
+    return lines
+
+
+def _all_alike(entry: Mapping[str, Any]) -> bool:
+    """Whether no pair is separated by any run, so that there is nothing to choose."""
+    pairs = len(entry["runs"][0]["pairs"])
+    return pairs > 0 and len(entry["inseparable"]) == pairs

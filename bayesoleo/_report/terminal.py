@@ -13,7 +13,7 @@ from rich.text import Text
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import sentences, structures, tables
-from bayesoleo._report.sentences import proposal_lines
+from bayesoleo._report.structures import proposal_lines
 from bayesoleo._storage.files import write_text_atomic
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.plots._discovery import chosen, format_p, name

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import inspect
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from html import escape
@@ -23,11 +23,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
-from bayesoleo._display import LabelledResult
+from bayesoleo._display import LabelledResult, columns
+from bayesoleo._report import structures
 from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError, choose
 from bayesoleo.plots import _reading as reading, _style as style
+from bayesoleo.plots._discovery import SHOWN, format_probability
 from bayesoleo.plots._style import engineering
 
 _MEASURED, _PREDICTED = "_measured", "_predicted"
@@ -378,3 +380,56 @@ def number(value: float, sd: float) -> str:
         return f"{value:.4g}"
     digits = int(np.floor(np.log10(abs(value))) - np.floor(np.log10(sd))) + 2
     return f"{value:.{min(max(digits, 2), 12)}g}"
+
+
+def structures_data(summary: Mapping[str, Any]) -> xr.Dataset:
+    """Probabilities of effects and of the leading structures as labelled arrays.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``, with ``structures``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``probability(effect)`` with its effects named ``effect @ target``;
+        ``structure_probability``, ``has_outside`` and ``estimated`` ``(structure)``; ``member``
+        ``(structure, effect)``; ``nothing``, ``outside`` and ``only_outside``.
+    """
+    found, single = summary["structures"], structures.of_effects(summary)
+    shown = found["list"]
+    member = [[one in entry["effects"] for one in single] for entry in shown]
+    flat = {key: [entry[key] for entry in shown] for key in ("outside", "estimated", "probability")}
+    return xr.Dataset(
+        {
+            "probability": (schema.EFFECT, list(single.values())),
+            "member": (("structure", schema.EFFECT), np.reshape(member, (len(shown), len(single)))),
+            "structure_probability": ("structure", flat["probability"]),
+            "has_outside": ("structure", flat["outside"]),
+            "estimated": ("structure", flat["estimated"]),
+            **{key: found[key] for key in ("nothing", "outside", "only_outside")},
+        },
+        coords={
+            schema.EFFECT: list(single),
+            "structure": [structures.structure_words(entry, summary) for entry in shown],
+        },
+    )
+
+
+def structures_text(summary: Mapping[str, Any]) -> str:
+    """The table of a session: single probabilities first, then structures, then classes."""
+    found = summary["structures"]
+    every = [
+        *structures.of_effects(summary).items(),
+        (structures.NOTHING, found["nothing"]),
+        (structures.OUTSIDE, found["outside"]),
+    ]
+    every = sorted(every, key=lambda item: -item[1])
+    rows = [
+        [structures.title_of(one, summary), format_probability(p)] for one, p in every if p >= SHOWN
+    ]
+    shown = structures.table(summary)
+    texts = [columns(["acts", "probability"], rows)]
+    texts += [] if shown is None else [columns(shown.head, shown.rows)]
+    return "\n\n".join([*texts, *structures.classes(summary)])

@@ -21,7 +21,6 @@ from bayesoleo import _schema as schema, plots
 from bayesoleo._display import LabelledResult, columns
 from bayesoleo._report.page import write_report
 from bayesoleo._report.sentences import certainty
-from bayesoleo._report.structures import structures_data, structures_text
 from bayesoleo._report.terminal import print_summary
 from bayesoleo._session import display
 from bayesoleo._session.campaign import (
@@ -504,7 +503,7 @@ class Explanation(Stored):
                 hint="the search was stopped early, scored no candidate, or is of an older version:"
                 " explain() once more",
             )  # fmt: skip
-        shown = LabelledResult(structures_data(summary), structures_text(summary))
+        shown = LabelledResult(display.structures_data(summary), display.structures_text(summary))
         return replace(result(shown, "structures"), source=self.tree)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bayesoleo._report.sentences import proposal_lines, proposal_table
+from bayesoleo._report.structures import proposal_lines, proposal_table
 
 
 def trial(sigmas, amplitude=0.05, run=None, information=0.9):

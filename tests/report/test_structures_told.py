@@ -13,8 +13,8 @@ from bayesoleo import _schema as schema
 from bayesoleo._report import structures
 from bayesoleo._report.page import render_report
 from bayesoleo._report.sentences import badge, headline
-from bayesoleo._report.structures import structures_data, structures_text
 from bayesoleo._report.terminal import print_summary
+from bayesoleo._session.display import structures_data, structures_text
 
 COULOMB, STRIBECK = "coulomb_friction @ stroke", "stribeck_friction @ stroke"
 NOTHING, OUTSIDE = (), None
