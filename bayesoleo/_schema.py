@@ -42,6 +42,8 @@ SENSITIVITY: Final = "sensitivity"
 ASSESSMENT: Final = "assessment"
 LOG_PRIOR: Final = "log_prior"
 ERROR_MODEL: Final = "error_model"
+ERROR_MODEL_REASON: Final = "error_model_reason"
+"""Attribute of the posterior: why its error model was chosen; absent where the user chose it."""
 COMPARISON: Final = "comparison"
 PROPOSAL: Final = "proposal"
 

@@ -16,14 +16,15 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections, sentences, structures, tables
 from bayesoleo._report.sections import encode_formula
-from bayesoleo._report.sentences import begin, role_shown
+from bayesoleo._report.sentences import begin, in_run, role_shown
 from bayesoleo._report.structures import proposal_lines, proposal_table
 from bayesoleo._report.tables import (
-    FLOOR,
     error_scale,
+    format_ratio,
     format_short,
     parameters,
     ratio,
+    ratios,
     too_large,
     words,
 )
@@ -33,7 +34,8 @@ from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.plots import _reading as reading
-from bayesoleo.plots._discovery import chosen, format_p, name
+from bayesoleo.plots._discovery import chosen, format_p, format_share, name
+from bayesoleo.plots._residuals import has_excess
 
 #: A harmonic or a coordinate is named if it holds this part of the excess.
 WORTH_NAMING = 0.2
@@ -78,15 +80,15 @@ def case(
 def _wrong(summary: Mapping[str, Any]) -> str:
     errors = _errors(summary["rounds"][0])
     if not errors:
-        return "No run repeats, so that there is no noise to hold the error against."
+        return "The noise of no run is known, so that no error can be compared with it."
     worst, output, run = max((ratio(error) or 0.0, output, run) for error, output, run in errors)
     above = len({run for error, _, run in errors if too_large(error)})
-    times = f"{format_short(worst)} times {words(summary)}"
-    what = f"the largest is the error of {output} in run {run}, {times}"
+    times = f"{format_ratio(worst)} times {words(summary)}"
+    what = f"the largest is the error of {output} in {in_run(run)}, {times}"
     if not above:
-        return f"No: no error repeats beyond what chance allows; {what}."
+        return f"No: no error is larger than chance allows; {what}."
     of = f"{above} of {len({run for *_, run in errors})} runs"
-    return f"In {of} an error repeats that is larger than chance allows; {what}."
+    return f"In {of} an error is larger than chance allows; {what}."
 
 
 def _errors(entry: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], str, str]]:
@@ -108,14 +110,14 @@ def _where(tree: xr.DataTree) -> str:
     for output in data[schema.OUTPUT].values:
         one = data.sel({schema.OUTPUT: output}).isel(stage=0)
         # An excess that noise alone may feign has no place.
-        if not float(one["excess"]) > FLOOR**2 - 1:
+        if not has_excess(float(one["excess"])):
             continue
         orders = _named(one["power"].values, [*map(str, range(ORDERS)), f"{ORDERS} and above"])
         places = [str(place) for place in one["coordinate"].values]
         words = [_CONSTANTS.get(place, f"one function of {place}") for place in places]
         shares = _named(one["share"].values, words)[:2]
-        text = f"Of what repeats of {output} beyond its noise, "
-        text += ", ".join(f"{share} stands at harmonic {word}" for word, share in orders)
+        text = f"Of the excess of {output}, "
+        text += ", ".join(f"{share} is at harmonic {word}" for word, share in orders)
         text += ("; " if orders else "") + ", ".join(f"{word} explains {s}" for word, s in shares)
         texts.append(f"{text}." if orders or shares else "")
     return " ".join(filter(None, texts))
@@ -231,10 +233,11 @@ def _large(summary: Mapping[str, Any]) -> str:
         if row[0].split("[")[0] in new:
             cells = dict(zip(table.head, row, strict=True))
             interval = cells["95 % interval"]
+            what = _parameter_words(row[0], summary)
             if summary["parameters"][row[0]].get("shared_with"):
-                texts.append(f"{row[0]} {interval}")
+                texts.append(f"{what} {interval}")
                 continue
-            text = f"{row[0]} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
+            text = f"{what} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
             known = any(character.isdigit() for character in interval)
             texts.append(f"{text} (95 %: {interval})" if known else text)
     most = 6
@@ -242,6 +245,17 @@ def _large(summary: Mapping[str, Any]) -> str:
     drawn = any(one.get("family") == FAMILY for one in added)
     curve = "The curve and its band are drawn below, in the round that added it." if drawn else ""
     return " ".join(filter(None, [f"{', '.join(texts[:most])}{rest}." if texts else "", curve]))
+
+
+def _parameter_words(label: str, summary: Mapping[str, Any]) -> str:
+    """A parameter of an added effect by the effect's title: ``breakaway friction, decay``."""
+    known = sentences.titles(summary)
+    for effect in sorted(summary["effects"], key=len, reverse=True):
+        if label.startswith(effect):
+            rest = label.removeprefix(effect).replace("_", " ").strip()
+            comma = "" if not rest or rest.startswith("[") else ","
+            return " ".join(filter(None, [f"{called(effect, known)}{comma}", rest]))
+    return label
 
 
 def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
@@ -257,8 +271,8 @@ def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
             format_short(scale.factor * e[key]) for e in (first, last) if e[key] is not None
         )
         text = f"{output} {before} → {after} {scale.unit}".rstrip()
-        ratios = " → ".join(format_short(ratio(e)) for e in (first, last))
-        texts.append(f"{text} ({ratios} times {words(summary)})" if ratio(last) else text)
+        times = f"{ratios(first, last, two=True)} times {words(summary)}"
+        texts.append(f"{text} ({times})" if ratio(last) else text)
     said = summary.get("hold_out", "")
     return f"On the {role} runs: {', '.join(texts)}{f' ({said})' if said else ''}."
 
@@ -268,12 +282,12 @@ def _left(summary: Mapping[str, Any]) -> str:
     errors, text = _errors(last), ""
     if errors:
         worst, output, run = max((ratio(e) or 0.0, output, run) for e, output, run in errors)
-        text = f"At most {format_short(worst)} times {words(summary)}, of {output} in run {run}"
+        text = f"At most {format_ratio(worst)} times {words(summary)}, of {output} in {in_run(run)}"
     if last["candidates"]:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         lead = "; the" if text else "The"
-        share = f"{100 * best['gain']:.0f} %"
         which = called(name(best), sentences.titles(summary))
+        share = format_share(best["gain"])
         text += f"{lead} best remaining candidate, {which}, would explain {share} of it"
     return f"{text}." if text else ""
 
@@ -344,6 +358,7 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
     """What the template fills in."""
     summary = _summary(tree)
     units = tables.output_units(tree, summary)
+    averaged = reading.averaged_word(tree)
     figures = _figures(tree, drawing)
     rounds = list(_rounds(tree, summary, drawing))
     proposals = list(_proposals(tree, summary, drawing))
@@ -361,9 +376,10 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "extended": sentences.added(summary),
         "unfinished": [*sentences.unfinished(summary), *drawing.failed],
         "role": sentences.role_shown(summary),
-        "tiles": sentences.tiles(summary, units),
-        "error_by_role": tables.error_by_role(summary, units),
-        "error_by_run": tables.error_by_run(summary, units),
+        "tiles": sentences.tiles(summary, units, averaged),
+        "averaged": averaged,
+        "error_by_role": tables.error_by_role(summary, units, averaged),
+        "error_by_run": tables.error_by_run(summary, units, averaged),
         "case": case(summary, units, tree),
         "remainder": sentences.remainder(summary),
         "proposals": proposals,
@@ -378,6 +394,11 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "equations": str(tree.attrs.get(schema.EQUATIONS, "")).strip(),
         "provenance": tables.provenance(tree),
         "figures": figures,
+        "lead": figures["structures"] or figures["error"],
+        "runs": sentences.runs_used(summary),
+        "errors_word": sentences.error_model(_posterior_attributes(tree), summary),
+        "viewer": sections.viewer(tree),
+        "periodic": [run.periodic for run in reading.runs(tree)],
         "residual_title": sections.residual_title(tree),
         "number": itertools.count(1),
     }
@@ -390,6 +411,10 @@ def _summary(tree: xr.DataTree) -> dict[str, Any]:
         raise ResultsError("the result holds no summary to report", key=schema.SUMMARY, hint=hint)
     schema.validate_summary(summary)
     return summary
+
+
+def _posterior_attributes(tree: xr.DataTree) -> dict[Any, Any]:
+    return tree[schema.POSTERIOR].attrs if schema.POSTERIOR in tree.children else {}
 
 
 def _rounds(

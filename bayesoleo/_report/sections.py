@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 import matplotlib
+import numpy as np
 import xarray as xr
 from matplotlib import mathtext
 from matplotlib.figure import Figure
@@ -24,12 +25,14 @@ from matplotlib.font_manager import FontProperties
 
 from bayesoleo import _schema as schema, plots
 from bayesoleo._report.structures import proposal_table
-from bayesoleo._report.tables import FLOOR, words
+from bayesoleo._report.tables import words
+from bayesoleo._types import Array
 from bayesoleo.assessment._residual_breakdown import residual_breakdown
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.errors import InputError
-from bayesoleo.plots import _reading as reading
-from bayesoleo.plots._residuals import Against
+from bayesoleo.plots import _reading as reading, _style as style
+from bayesoleo.plots._residuals import Against, averaged_residual, has_excess
+from bayesoleo.plots._style import Scale, engineering
 
 LARGEST_SVG = 300_000
 """Bytes above which a figure is stored as pixels instead; a page stays below some megabytes."""
@@ -155,10 +158,17 @@ LOOPS: tuple[Against, ...] = ("velocity", "stroke")
 def data_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The records."""
     caption = (
-        "The records as measured, averaged over the periods of each run. All runs of a channel "
-        "share its scale."
+        f"The records as measured{averaged_over(tree)}. All runs of a channel share its scale."
     )
     return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
+
+
+def averaged_over(tree: xr.DataTree, lead: str = ", averaged over the periods of each run") -> str:
+    """That runs are averaged over their periods, where they have periods."""
+    periodic = [run.periodic for run in reading.runs(tree)]
+    if not any(periodic):
+        return ""
+    return lead if all(periodic) else f"{lead} that has periods"
 
 
 def fit_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
@@ -177,7 +187,7 @@ def breakdown_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
         excess = residual_breakdown(tree)["excess"].values
     except (InputError, KeyError):
         return []
-    if not (excess > FLOOR**2 - 1).any():
+    if not any(map(has_excess, excess)):
         return []
     caption = (
         "How the repeating error divides over harmonics and coordinates, all runs together. Each "
@@ -199,8 +209,16 @@ def residual_title(tree: xr.DataTree) -> str:
     """Title of the section: what the residuals are shown against."""
     if schema.RESIDUAL not in tree.children:
         return "Residual"
-    *most, last = ["phase", *(against for against in LOOPS if against in tree[schema.RESIDUAL])]
+    *most, last = [
+        _place(tree),
+        *(against for against in LOOPS if against in tree[schema.RESIDUAL]),
+    ]
     return f"Residual against {', '.join(most)} and {last}" if most else f"Residual against {last}"
+
+
+def _place(tree: xr.DataTree) -> str:
+    """What runs are drawn over."""
+    return "phase" if any(run.periodic for run in reading.runs(tree)) else "time"
 
 
 def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
@@ -211,7 +229,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
     for output in reading.outputs(tree):
         yield (
             partial(plots.residual, tree, output),
-            f"Residual of {output} against phase, averaged over the periods of each run.",
+            f"Residual of {output} against {_place(tree)}{averaged_over(tree)}.",
         )
         for against in LOOPS:
             if against in tree[schema.RESIDUAL]:
@@ -283,10 +301,8 @@ def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Ca
 
 def error_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
     """The error of each run."""
-    of = words(reading.summary(tree)).replace("its noise", "the noise of its average")
-    caption = (
-        f"Repeating error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
-    )
+    of, what = words(reading.summary(tree)), reading.averaged_word(tree).capitalize()
+    caption = f"{what} error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
     return _drawn([(lambda: plots.error(tree), caption)])
 
 
@@ -316,7 +332,7 @@ def predictive_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     for output in reading.outputs(tree):
         if schema.average_sd(output) in tree[schema.PERIOD_PREDICTIVE]:
             caption = (
-                f"Measured {output}, averaged over the periods of each run, about the prediction. "
+                f"Measured {output}{averaged_over(tree)}, about the prediction. "
                 "Dark: what the parameters leave open; light: where 95 % of such averages would "
                 "lie if the run were repeated, with errors as the error model has them."
             )
@@ -331,6 +347,120 @@ def trace_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
         return []
     caption = "Some walkers of each ensemble, one colour an ensemble: colours must not keep apart."
     return _drawn([(lambda: plots.trace(tree), caption)])
+
+
+#: Numbers of one curve of the viewer at least and at most, and of all curves together.
+FEWEST_POINTS, MOST_POINTS, ALL_POINTS = 240, 1200, 100_000
+
+
+def viewer(tree: xr.DataTree) -> dict[str, Any] | None:
+    """What the page's script draws: measurement, prediction and residual of one run at a time.
+
+    Parameters
+    ----------
+    tree : DataTree
+
+    Returns
+    -------
+    dict or None
+        Numbers in the units of the axes, for JSON; None without a prediction.
+    """
+    runs, names = reading.runs(tree), reading.outputs(tree)
+    if not runs or not names or schema.RESIDUAL not in tree.children:
+        return None
+    stages = [s for s in _STAGES if f"{names[0]}_{s}" in tree[schema.PREDICTION].to_dataset()]
+    share = ALL_POINTS // (2 * len(runs) * len(names) * (1 + len(stages)))
+    points = min(max(share, FEWEST_POINTS), MOST_POINTS)
+    shown = []
+    for name in names:
+        measured = reading.variable(tree, schema.RECORDS, name)
+        left = reading.variable(tree, schema.RESIDUAL, schema.before(name))
+        unit = reading.unit(measured)
+        scales = [engineering(unit, style.magnitude(part.values)) for part in (measured, left)]
+        shown.append(
+            {
+                "name": name,
+                "unit": scales[0].unit,
+                "labels": [scales[0].label(name), scales[1].label("residual")],
+                "runs": [_one_run(tree, name, run, scales, stages, points) for run in runs],
+            }
+        )
+    two = len(stages) > 1
+    words = {"measured": "measured", "before": "before" if two else "model", "after": "after"}
+    about = [{"label": r.label, "role": r.role, "remark": r.remark} for r in runs]
+    return {"runs": about, "outputs": shown, "words": words, "stages": stages}
+
+
+_STAGES = ("before", "after")
+
+
+def _one_run(
+    tree: xr.DataTree,
+    name: str,
+    run: reading.RunView,
+    scales: list[Scale],
+    stages: list[str],
+    points: int,
+) -> dict[str, Any]:
+    """Curves of one output in one run: signals, and below them residuals in their own unit."""
+    measured = reading.variable(tree, schema.RECORDS, name).values[run.index]
+    predicted, left = (tree[group].to_dataset() for group in (schema.PREDICTION, schema.RESIDUAL))
+    curves = {"measured": measured}
+    curves |= {s: predicted[f"{name}_{s}"].values[run.index] for s in stages}
+    errors = {s: left[f"{name}_{s}"].values[run.index] for s in stages}
+    position = reading.abscissa(tree, run)
+    if run.periodic and reading.is_resolved(position, measured):
+        folded = {key: reading.fold(position, y, points) for key, y in curves.items()}
+        means = {s: averaged_residual(tree, f"{name}_{s}", run) for s in stages}
+        x, below = folded["measured"][0], means[stages[0]][0]
+        label, ends = "phase in cycles", [0.0, 1.0]
+        curves = {key: y for key, (_, y) in folded.items()}
+        errors = {s: y for s, (_, y) in means.items()}
+        band = (
+            float(left[schema.noise(name)].values[run.index])
+            if schema.noise(name) in left
+            else np.nan
+        )
+    else:
+        time = reading.variable(tree, schema.RECORDS, schema.TIME).values[run.index]
+        chosen = _telling([measured, *errors.values()], np.isfinite(time), points, run.periodic)
+        curves = {key: y[chosen] for key, y in curves.items()}
+        errors = {s: y[chosen] for s, y in errors.items()}
+        x = below = time[chosen]
+        label, band, ends = "time in s", np.nan, [float(x[0]), float(x[-1])]
+    return {
+        "x": _numbers(x), "x_label": label, "ends": ends,
+        **{key: _numbers(scales[0].factor * y) for key, y in curves.items()},
+        "residual": {
+            "x": _numbers(below), "band": _number(scales[1].factor * band),
+            **{s: _numbers(scales[1].factor * y) for s, y in errors.items()},
+        },
+    }  # fmt: skip
+
+
+def _telling(curves: list[Array], known: Array, points: int, periodic: bool) -> Array:
+    """Indices of samples to draw: extremes of stretches of a transient, else a stretch."""
+    every = np.flatnonzero(known)
+    if every.size <= points:
+        return every
+    if periodic:
+        middle = every.size // 2
+        return every[middle - points // 2 : middle + points // 2]
+    chosen: set[int] = set()
+    for part in np.array_split(every, points // (2 * len(curves))):
+        for curve in curves:
+            values = np.where(np.isfinite(curve[part]), curve[part], 0.0)
+            chosen |= {int(part[values.argmin()]), int(part[values.argmax()])}
+    return np.array(sorted(chosen))
+
+
+def _numbers(values: Array) -> list[float | None]:
+    return [_number(value) for value in np.asarray(values, dtype=float)]
+
+
+def _number(value: float) -> float | None:
+    """Five digits: more than a screen can show."""
+    return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
 def _drawn(entries: list[tuple[Draw, str]]) -> list[CaptionedFigure]:

@@ -11,15 +11,24 @@ from bayesoleo import _schema as schema
 from bayesoleo._report import structures
 from bayesoleo._report.tables import (
     error_scale,
+    format_ratio,
     format_short,
     ratio,
+    ratios,
     too_large,
     too_small,
     words,
 )
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.effects._catalogue import PROPER, called, listed, titles_for, with_titles
-from bayesoleo.plots._discovery import chosen, format_p, format_probability, name
+from bayesoleo.effects._catalogue import (
+    PROPER,
+    called,
+    catalogue_titles,
+    listed,
+    titles_for,
+    with_titles,
+)
+from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
 from bayesoleo.plots._style import Scale
 
 
@@ -168,7 +177,7 @@ def _size_left(summary: Mapping[str, Any]) -> str:
         for output, errors in outputs.items()
     }
     single = {
-        f"{output} in run {run}": errors
+        f"{output} in {in_run(run)}": errors
         for output, runs in summary["rounds"][-1]["error"].items()
         for run, errors in runs.items()
     }
@@ -177,7 +186,7 @@ def _size_left(summary: Mapping[str, Any]) -> str:
             (one for one in pooled if too_small(pooled[one])),
             key=lambda one: ratio(pooled[one]) or 0.0,
         )
-        times = f"{format_short(ratio(pooled[where]))} times {words(summary)}"
+        times = f"{format_ratio(ratio(pooled[where]))} times {words(summary)}"
         return f"the error of {where} is {times}, less than chance allows: its noise is overstated"
     large = [{w: e for w, e in found.items() if too_large(e)} for found in (pooled, single)]
     unknown = [where for where, errors in single.items() if ratio(errors) is None]
@@ -187,7 +196,7 @@ def _size_left(summary: Mapping[str, Any]) -> str:
     for found in (*large, known):
         where = max(found, key=lambda one: ratio(found[one]) or 0.0, default="")
         if where:
-            times = f"{format_short(ratio(found[where]))} times {words(summary)}"
+            times = f"{format_ratio(ratio(found[where]))} times {words(summary)}"
             return f"the error of {where} is {times}"
     return "an error is left"
 
@@ -202,7 +211,7 @@ def only_too_small(summary: Mapping[str, Any]) -> bool:
 def unfinished(summary: Mapping[str, Any]) -> list[str]:
     """Which stages did not finish, and why."""
     return [
-        f"Unfinished stage: {item['stage']}. {begin(item['reason'])}"
+        f"Unfinished stage: {item['stage']}. {begin(item['reason']).rstrip('.')}."
         for item in summary.get(schema.UNFINISHED, [])
     ]
 
@@ -232,7 +241,9 @@ def _unexplained(summary: Mapping[str, Any]) -> str:
     return f"; {nearest} would explain {share} of the excess, and was not tried"
 
 
-def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str, str]]:
+def tiles(
+    summary: Mapping[str, Any], units: Mapping[str, str], averaged: str = "repeating"
+) -> list[dict[str, str]]:
     """For each output the numbers that matter: the error on the runs not used, before and after."""
     role = role_shown(summary)
     two = len(summary["rounds"]) > 1
@@ -241,7 +252,6 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
         first = summary["error_before"].get(role, {}).get(output, last)
         key = "rms" if last["repeating"] is None else "repeating"
         scale = error_scale(units.get(output, ""), (first, last))
-        ratios = [format_short(ratio(e)) for e in (first, last)]
         known = ratio(last) is not None
         shown.append(
             {
@@ -249,14 +259,56 @@ def tiles(summary: Mapping[str, Any], units: Mapping[str, str]) -> list[dict[str
                 "before": _number(first[key], scale) if two else "",
                 "after": _number(last[key], scale),
                 "unit": scale.unit,
-                "what": "repeating error" if key == "repeating" else "rms error",
-                "ratio": f"{' → '.join(ratios) if two else ratios[1]} × {words(summary)}"
-                if known
-                else "",
+                "what": f"{averaged} error" if key == "repeating" else "rms error",
+                "ratio": f"{ratios(first, last, two)} × {words(summary)}" if known else "",
                 "change": _change(first[key], last[key]) if two else "",
             }
         )
     return shown
+
+
+#: Labels of runs that are named in a sentence; of more the number is enough.
+MOST_LABELS = 6
+
+
+def runs_used(summary: Mapping[str, Any]) -> str:
+    """On which runs the model was fitted, and on which it was tried."""
+    roles = {
+        run: str(error["role"])
+        for runs in summary["rounds"][0]["error"].values()
+        for run, error in runs.items()
+    }
+    fitted, held = (
+        [run for run, own in roles.items() if own == role] for role in (schema.FIT, schema.HOLD_OUT)
+    )
+    text = f"Fitted on {_runs(fitted)}" if fitted else "Fitted on no run"
+    if held:
+        return (
+            f"{text}; tested on {_runs(held)} that {'was' if len(held) == 1 else 'were'} not used."
+        )
+    return f"{text}; no run was held out to test it."
+
+
+def _runs(labels: list[str]) -> str:
+    number = f"{len(labels)} run{'s' if len(labels) > 1 else ''}"
+    return f"{number} ({', '.join(labels)})" if len(labels) <= MOST_LABELS else number
+
+
+def error_model(attributes: Mapping[Any, Any], summary: Mapping[str, Any]) -> str:
+    """Which error model the intervals assume, and why; empty where nothing was sampled.
+
+    Parameters
+    ----------
+    attributes : mapping
+        Of the group of the posterior.
+    summary : mapping
+        As in ``summary.json``; its titles are used.
+    """
+    why = str(attributes.get(schema.ERROR_MODEL_REASON, ""))
+    if why:
+        return f"{begin(with_titles(why, catalogue_titles() | titles(summary)))}."
+    word = str(attributes.get("error_model", ""))
+    return f"{begin(word)} errors, as the settings ask." if word else ""
 
 
 def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:
@@ -306,13 +358,18 @@ def remainder(summary: Mapping[str, Any]) -> list[str]:
     if last["candidates"]:
         best = max(last["candidates"], key=lambda candidate: candidate["gain"])
         p = format_p(best["p_value"])
-        share = f"{100 * best['gain']:.1f} %".replace("-", "−")
         which = called(name(best), titles(summary))
+        share = format_share(best["gain"])
         text = f"The best remaining candidate, {which}, would explain {share} of the excess"
         lines.append(f"{text} ({p})." if p else f"{text}.")
     if last["reason"]:
         lines.append(f"The search ended: {_small(reason(last, titles(summary)))}")
     return [line for line in lines if line]
+
+
+def in_run(label: str) -> str:
+    """A run in a sentence: ``run 3``, and not ``run run 3``."""
+    return label if label.lower().startswith("run") else f"run {label}"
 
 
 def begin(text: str) -> str:
@@ -327,15 +384,15 @@ def _small(sentence: str) -> str:
 
 def _above_floor(output: str, runs: Mapping[str, Any], than: str) -> str:
     """In how many runs the error of an output is larger than chance allows, and the worst."""
-    ratios = {run: ratio(e) or 0.0 for run, e in runs.items() if ratio(e) is not None}
-    if not ratios:
-        return f"No run has a noise floor for {output}: only the rms of the residual is known."
-    worst = max(ratios, key=lambda run: ratios[run])
-    above = sum(too_large(runs[run]) for run in ratios)
-    lead = "No run" if above == 0 else f"{above} of {len(ratios)} runs"
+    known = {run: ratio(e) or 0.0 for run, e in runs.items() if ratio(e) is not None}
+    if not known:
+        return f"The noise of {output} is not known in any run: only the rms of the residual is."
+    worst = max(known, key=lambda run: known[run])
+    above = sum(too_large(runs[run]) for run in known)
+    lead = "No run" if above == 0 else f"{above} of {len(known)} runs"
     verb = "has" if above <= 1 else "have"
-    largest = f"the largest is {format_short(ratios[worst])} times {than}, in {worst}"
-    return f"{lead} {verb} a repeating {output} error beyond what chance allows; {largest}."
+    largest = f"the largest is {format_ratio(known[worst])} times {than}, in {worst}"
+    return f"{lead} {verb} an error of {output} beyond what chance allows; {largest}."
 
 
 def _number(value: float | None, scale: Scale) -> str:

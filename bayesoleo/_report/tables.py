@@ -17,7 +17,7 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo.effects._catalogue import called, listed, titles_for, with_titles
 from bayesoleo.plots import _reading as reading
-from bayesoleo.plots._discovery import chosen, format_p, title
+from bayesoleo.plots._discovery import chosen, format_p, format_share, title
 from bayesoleo.plots._style import Scale, engineering, format_number, format_value
 from bayesoleo.solvers._orbit import counted
 
@@ -49,7 +49,7 @@ def words(summary: Mapping[str, Any]) -> str:
     entries = [e for tables in (errors, summary["error_after"].values())
                for table in tables for e in table.values()]  # fmt: skip
     known = any(schema.RATIO_TO_EXPECTED in entry for entry in entries)
-    return "what is expected" if known else "its noise"
+    return "what is expected" if known else "its standard error"
 
 
 KNOWN_CONSTANTS = (
@@ -76,7 +76,7 @@ BY_PARAMETER = {
 LEADING_CANDIDATES = 10
 LEADING_PARAMETERS = 20
 #: Part of a frequency below which no digits are shown, however well it is known.
-FINEST = 1e-5
+FINEST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,26 @@ def format_short(value: float | None) -> str:
     return f"{value:#.3g}".rstrip(".")
 
 
-def error_by_role(summary: Mapping[str, Any], units: Mapping[str, str]) -> Table:
-    """Error before and after, pooled over the hold-out and over the fitted runs."""
+def format_ratio(value: float | None) -> str:
+    """A ratio of errors: two decimals, of large ones three digits."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{value:.2f}" if value < 9.995 else format_short(value)
+
+
+def ratios(before: Mapping[str, Any], after: Mapping[str, Any], two: bool) -> str:
+    """Ratio before and after: ``1.81 → 1.00``; one number where nothing was added."""
+    texts = [format_ratio(ratio(errors)) for errors in (before, after)]
+    return " → ".join(texts) if two else texts[1]
+
+
+def error_by_role(
+    summary: Mapping[str, Any], units: Mapping[str, str], averaged: str = "repeating"
+) -> Table:
+    """Error before and after, pooled over the hold-out and over the fitted runs.
+
+    ``averaged`` is what the error of an average is called.
+    """
     before, after = summary["error_before"], summary["error_after"]
     two = len(summary["rounds"]) > 1
     known = _expected_known(after)
@@ -146,15 +164,17 @@ def error_by_role(summary: Mapping[str, Any], units: Mapping[str, str]) -> Table
             pairs = [arrow(first[k], last[k], scale.factor, two) for k in ("rms", "repeating")]
             floors = [noise_of(last), *([last.get("expected")] if known else [])]
             shown = [format_short(None if v is None else scale.factor * v) for v in floors]
-            ratios = arrow(ratio(first), ratio(last), two=two)
-            rows.append([role, output, *pairs, *shown, scale.unit, ratios])
-    head = ["runs", "output", "rms", "repeating", "noise", *_expected_head(known), "unit"]
-    head.append(_ratio_head(known))
+            times = ratios(first, last, two)
+            rows.append([role, output, *pairs, *shown, scale.unit, times])
+    head = ["runs", "output", "rms", averaged, "standard error", *_expected_head(known), "unit"]
+    head.append(f"{averaged} / {_ratio_head(known)}")
     return Table(head, rows, 2, frozenset(i for i, row in enumerate(rows) if row[0] != schema.FIT))
 
 
-def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Table]:
-    """Error before and after of every run, a table for each output."""
+def error_by_run(
+    summary: Mapping[str, Any], units: Mapping[str, str], averaged: str = "repeating"
+) -> dict[str, Table]:
+    """Error before and after of every run, a table for each output; see :func:`error_by_role`."""
     rounds = summary["rounds"]
     two = len(rounds) > 1
     known = _expected_known(summary["error_after"])
@@ -167,9 +187,11 @@ def error_by_run(summary: Mapping[str, Any], units: Mapping[str, str]) -> dict[s
         for run in sorted(first, key=lambda label: first[label]["role"] == schema.HOLD_OUT):
             a, b = first[run], last.get(run, first[run])
             pairs = [arrow(a.get(k), b.get(k), scale.factor, two) for k in keys]
-            rows.append([run, a["role"], *pairs, arrow(ratio(a), ratio(b), two=two)])
+            rows.append([run, a["role"], *pairs, ratios(a, b, two)])
         unit = f" [{scale.unit}]" if scale.unit else ""
-        head = ["run", "role", *(f"{key}{unit}" for key in keys), _ratio_head(known)]
+        shown = ["rms", averaged, "standard error", *_expected_head(known)]
+        head = ["run", "role", *(f"{text}{unit}" for text in shown)]
+        head.append(f"{averaged} / {_ratio_head(known)}")
         marked = frozenset(i for i, row in enumerate(rows) if row[1] == schema.HOLD_OUT)
         tables[output] = Table(head, rows, 2, marked)
     return tables
@@ -185,7 +207,8 @@ def _expected_head(known: bool) -> list[str]:
 
 
 def _ratio_head(known: bool) -> str:
-    return "repeating / expected" if known else "repeating / noise"
+    """What the averaged error is divided by."""
+    return "expected" if known else "standard error"
 
 
 def candidates(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> Table:
@@ -205,7 +228,7 @@ def candidates(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None
             title(candidate),
             candidate["effect"],
             candidate["family"],
-            f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
+            format_share(candidate["gain"]),
             format_p(candidate["p_value"]).removeprefix("p ").removeprefix("= "),
             expected_text(candidate["expected"], candidate.get("expected_units")),
             listed([called(other, titles) for other in candidate["indistinguishable_from"]], ", "),
@@ -256,9 +279,11 @@ def expected_text(
 def _size(values: Sequence[float], unit: str) -> str:
     """One value, or the range of several, with its unit."""
     if not values:
-        return format_number(None)
+        return format_short(None)
     scale = engineering(unit, max(map(abs, values))) if unit else Scale(1.0, "")
-    ends = [format_number(scale.factor * end) for end in (min(values), max(values))]
+    ends = [
+        format_short(scale.factor * end).replace("-", "−") for end in (min(values), max(values))
+    ]
     text = f"{' … '.join(ends if len(values) > 1 else ends[:1])} {scale.unit}".rstrip()
     return text + (f" ({len(values)} runs)" if len(values) > 1 else "")
 

@@ -203,7 +203,7 @@ def _curves(upper: Axes, lower: Axes, one: xr.Dataset, name: str, factor: float)
         lines = [reading.fold(x, curve) for curve in curves]
     else:
         lines = [_in_order(x, curve) for curve in curves]
-    many = lines[0][0].size > reading.BINS // 2
+    many = not reading.is_few(lines[0][0])
     shape = {"lw": 4.0, "alpha": 0.55} if many else {"lw": 0.0, "marker": "o", "ms": 3.5}
     upper.plot(*lines[0], color=style.MEASURED, label="measured", **shape)
     upper.plot(*lines[1], color=style.BEFORE, lw=1.3, label="predicted")

@@ -123,7 +123,9 @@ class Inference:
         problem.freeze(point.theta)
         if self.error_model == PowerErrors.word:
             problem.effective = effective_at(problem, point.theta)
-        return LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
+        density = LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
+        density.reason = self.reason
+        return density
 
 
 def effective_at(problem: ResidualProblem, theta: Array) -> Array:
@@ -142,7 +144,7 @@ _FEWEST = 20
 _SMALL = 0.1
 _PLAIN = "the noise is white, and no more than noise is left"
 _COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
-_LEFT = "more than noise is left, by a factor of exp({:.3g}) in likelihood"
+_LEFT = "more than noise is left: log odds {:.0f} against noise alone"
 _UNDECIDED = "effects that the data do not tell apart are left: {}"
 #: Probability of a residual by noise alone below which effects of the catalogue are looked for in
 #: it. Of 145 residuals of simulated campaigns that the catalogue explained better than noise, with

@@ -115,6 +115,11 @@ def format_p(value: float | None) -> str:
     )
 
 
+def format_share(gain: float) -> str:
+    """A part of the excess error in per cent; a negative one explains nothing of it."""
+    return f"{100 * gain:.1f} %" if gain >= 0.0005 else "none"
+
+
 def format_probability(value: float) -> str:
     """A probability in the two digits that its computation warrants."""
     return "> 0.99" if value > 0.995 else "< 0.01" if value < 0.005 else f"{value:.2f}"
@@ -122,10 +127,10 @@ def format_probability(value: float) -> str:
 
 def _bar(axes: Axes, row: int, candidate: dict[str, Any], first: bool, alike: bool) -> None:
     """One candidate: bar, share, p-value, and whether it is or is like the accepted one."""
-    colour = style.AFTER if first else style.SIMILAR if alike else style.NEUTRAL
+    colour = style.AFTER if first else style.SIMILAR if alike else style.MEASURED
     axes.barh(row, max(100 * candidate["gain"], 0.0), 0.68, color=colour)
     texts = (
-        f"{100 * candidate['gain']:.1f} %".replace("-", "−"),
+        format_share(candidate["gain"]),
         format_p(candidate["p_value"]),
         "≈" if alike else "",
     )
@@ -149,7 +154,7 @@ def _bar(axes: Axes, row: int, candidate: dict[str, Any], first: bool, alike: bo
 
 def _explain(figure: Figure, entry: dict[str, Any], hidden: int) -> None:
     """What the colours mean, and how many candidates are not shown."""
-    handles = [Patch(facecolor=style.NEUTRAL, label="candidate")]
+    handles = [Patch(facecolor=style.MEASURED, label="candidate")]
     if entry["accepted"]:
         handles = [
             Patch(facecolor=style.AFTER, label="accepted"),

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import interpolate, stats
@@ -309,7 +309,9 @@ def table(
     axes.imshow(np.nan_to_num(np.clip(shades, 0, 1)), cmap=_SHADES, vmin=0, vmax=1, aspect="auto")
     for r, line in enumerate(texts):
         for c, text in enumerate(line):
-            colour = "white" if np.nan_to_num(shades[r, c]) > 0.75 else style.INK
+            colour = style.text_on(
+                to_hex(_SHADES(float(np.nan_to_num(np.clip(shades[r, c], 0, 1)))))
+            )
             axes.text(c, r, text, ha="center", va="center", fontsize=style.SMALL - 1, color=colour)
     axes.set_xticks(range(len(columns)), [style.plain(c, 24) for c in columns], rotation=30)
     axes.xaxis.tick_top()

@@ -137,7 +137,7 @@ def abscissa(tree: xr.DataTree, run: RunView) -> Array:
 
 
 def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
-    """Average values in equal bins of a position from 0 to 1; bins without a sample are NaN.
+    """Average values in equal bins of a position from 0 to 1.
 
     Parameters
     ----------
@@ -148,15 +148,34 @@ def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array
 
     Returns
     -------
-    centres, means : ndarray, shape (bins,)
+    positions, means : ndarray, shape (m,)
+        Averages of position and value in each bin that has samples: of a record with few samples a
+        period, these are its samples. Where no sample lies for far longer than between others,
+        there is one row of NaN, so that a line breaks off.
     """
     keep = np.isfinite(position) & np.isfinite(values)
     index = np.minimum((position[keep] * bins).astype(int), bins - 1)
     count = np.bincount(index, minlength=bins)
-    total = np.bincount(index, weights=values[keep], minlength=bins)
-    means = np.full(bins, np.nan)
-    np.divide(total, count, out=means, where=count > 0)
-    return (np.arange(bins) + 0.5) / bins, means
+    filled = count > 0
+    x, y = (
+        np.bincount(index, weights=part[keep], minlength=bins)[filled] / count[filled]
+        for part in (position, values)
+    )
+    return _broken(x, y, bins)
+
+
+def _broken(x: Array, y: Array, bins: int) -> tuple[Array, Array]:
+    """A row of NaN in each gap of more than three usual distances."""
+    away = np.diff(x)
+    if away.size == 0:
+        return x, y
+    gaps = np.flatnonzero(away > 3.0 * max(float(np.median(away)), 1.0 / bins)) + 1
+    return np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
+
+
+def is_few(x: Array) -> bool:
+    """Whether so few points are drawn that each of them is shown, and not only a line."""
+    return bool(np.count_nonzero(np.isfinite(x)) <= BINS // 2)
 
 
 def is_resolved(position: Array, values: Array) -> bool:
@@ -175,6 +194,14 @@ def thin(x: Array, y: Array, points: int = 2 * BINS) -> tuple[Array, Array]:
         if np.isfinite(y[part]).any():
             chosen += sorted({part[np.nanargmin(y[part])], part[np.nanargmax(y[part])]})
     return x[chosen], y[chosen]
+
+
+def averaged_word(tree: xr.DataTree) -> str:
+    """What the error of an average is called: of periods it repeats; a transient has none.
+
+    A transient's residual is averaged over neighbouring samples instead.
+    """
+    return "repeating" if all(run.periodic for run in runs(tree)) else "averaged"
 
 
 def coordinate_name(data: xr.Dataset, name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -65,12 +65,14 @@ def residual(tree: xr.DataTree, output: str, against: Against = "phase") -> Figu
     for axes, run, row in zip(grid.axes, runs, curves, strict=True):
         _noise(axes, data, output, run, y_scale)
         for (x, y), (_, colour) in zip(row, kinds, strict=True):
-            axes.plot(x_scale.factor * x, y_scale.factor * y, color=colour, lw=1.2)
+            mark: dict[str, Any] = {"marker": "o", "ms": 2.5} if reading.is_few(x) else {}
+            axes.plot(x_scale.factor * x, y_scale.factor * y, color=colour, lw=1.2, **mark)
         if against == "phase":
             style.cycles(axes)
         spans.append(2 * style.magnitude(*(y for _, y in row)))
     style.share_y(grid.axes, spans, symmetric=True)
-    _explain(grid.figure, len(kinds), remark, schema.noise(output) in data)
+    known = schema.noise(output) in data and any(run.periodic for run in runs)
+    _explain(grid.figure, len(kinds), remark, known)
     phase = against == "phase"
     x_text = style.x_name(runs) if phase else x_scale.label(reading.coordinate_name(data, against))
     style.label_outside(grid.figure, x_text, y_scale.label(f"{output} residual"))
@@ -81,21 +83,43 @@ def _curve(
     tree: xr.DataTree, data: xr.Dataset, name: str, run: reading.RunView, against: Against
 ) -> tuple[Array, Array]:
     """What is drawn of one run, in SI."""
-    mean = schema.mean(name)
     if against == "phase":
-        if run.periodic and mean in data and np.isfinite(data[mean].values[run.index]).any():
-            return reading.thin(_phases(data), data[mean].values[run.index])
-        return reading.fold(
-            reading.abscissa(tree, run), data[name].values[run.index], 2 * reading.BINS
-        )
+        return averaged_residual(tree, name, run)
     position, e = reading.abscissa(tree, run), data[name].values[run.index]
     coordinate = data[against].values[run.index]
     if reading.is_resolved(position, coordinate):
-        loop = [reading.fold(position, values)[1] for values in (coordinate, e)]
-        if run.periodic:
+        known = np.where(np.isfinite(coordinate + e), position, np.nan)
+        bins = reading.BINS if run.periodic else 4 * reading.BINS
+        loop = [reading.fold(known, values, bins)[1] for values in (coordinate, e)]
+        if run.periodic and loop[0].size:
             loop = [np.append(part, part[0]) for part in loop]
         return loop[0], loop[1]
     return _by_value(coordinate, e)
+
+
+def averaged_residual(tree: xr.DataTree, name: str, run: reading.RunView) -> tuple[Array, Array]:
+    """Residual averaged over the periods of a run over phase; of a transient as it is over time.
+
+    Parameters
+    ----------
+    tree : DataTree
+        With ``residual``.
+    name : str
+        Of the residual: ``force_before``.
+    run : RunView
+
+    Returns
+    -------
+    positions, values : ndarray
+        Position from 0 to 1, and values in SI.
+    """
+    data, mean = tree[schema.RESIDUAL].to_dataset(), schema.mean(name)
+    if run.periodic and mean in data and np.isfinite(data[mean].values[run.index]).any():
+        return reading.thin(_phases(data), data[mean].values[run.index])
+    position, values = reading.abscissa(tree, run), data[name].values[run.index]
+    if run.periodic:
+        return reading.fold(position, values, 2 * reading.BINS)
+    return reading.thin(position, values, 4 * reading.BINS)
 
 
 def _by_value(coordinate: Array, e: Array) -> tuple[Array, Array]:
@@ -147,6 +171,8 @@ def _explain(figure: Figure, kinds: int, remark: str, noise: bool) -> None:
 TOP, BOTTOM, GAP, ROW = 0.75, 0.62, 0.75, 2.3
 #: Coordinates shown of each output, those first that explain most.
 SHOWN = 7
+#: Excess of which parts are shown: an error that is 15 % larger than its noise.
+LEAST_EXCESS = 1.15**2 - 1
 
 
 def residual_breakdown(tree: xr.DataTree) -> Figure:
@@ -161,10 +187,17 @@ def residual_breakdown(tree: xr.DataTree) -> Figure:
     -------
     Figure
         One row an output. All shares are of the excess over the noise that the model as declared
-        leaves, all runs together; what the extended model leaves is blue.
+        leaves, all runs together; what the extended model leaves is blue. Outputs without such an
+        excess have no shares, and are named instead.
     """
     data = found_in(tree)
-    outputs = [str(name) for name in data[schema.OUTPUT].values]
+    large = {
+        str(n): has_excess(e)
+        for n, e in zip(data[schema.OUTPUT].values, data["excess"].values, strict=True)
+    }
+    outputs, rest = ([n for n in large if large[n] is kept] for kept in (True, False))
+    if not outputs:
+        return _nothing_repeats(rest)
     height = TOP + len(outputs) * ROW + (len(outputs) - 1) * GAP + BOTTOM
     figure = style.blank(style.WIDTH, height)
     stages = [str(stage) for stage in data["stage"].values]
@@ -176,7 +209,26 @@ def residual_breakdown(tree: xr.DataTree) -> Figure:
         _places(figure, (0.64, bottom, 0.34, ROW / height), one, colours)
     words = {"before": "model as declared", "after": "with what was added"}
     handles = [Patch(facecolor=c, label=words[s]) for s, c in zip(stages, colours, strict=True)]
-    style.legend(figure, handles)
+    style.legend(figure, handles, f"no excess: {style.plain(', '.join(rest))}" if rest else "")
+    return figure
+
+
+def has_excess(excess: float) -> bool:
+    """Whether an excess over the noise is so large that parts of it mean something.
+
+    Parameters
+    ----------
+    excess : float
+        Mean square of an averaged error over that of its noise, less one.
+    """
+    return bool(excess > LEAST_EXCESS)
+
+
+def _nothing_repeats(outputs: list[str]) -> Figure:
+    """A line of text in place of shares."""
+    figure = style.blank(style.WIDTH, 1.0)
+    text = f"no error beyond the noise: {style.plain(', '.join(outputs))}"
+    figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=style.TEXT, color=style.INK)
     return figure
 
 
@@ -189,8 +241,9 @@ def _harmonics(
     width = 0.8 / len(colours)
     orders = np.arange(ORDERS + 1)
     for k, colour in enumerate(colours):
-        axes.bar(orders + (k - (len(colours) - 1) / 2) * width, one["power"].values[k], width,
-                 color=colour)  # fmt: skip
+        # Estimates of no power scatter about zero; what is drawn below it would be read as a loss.
+        power = np.maximum(one["power"].values[k], 0.0)
+        axes.bar(orders + (k - (len(colours) - 1) / 2) * width, power, width, color=colour)
     axes.set_xticks(orders, [*map(str, orders[:-1]), f"≥ {ORDERS}"])
     axes.axhline(0, color=style.FAINT, lw=0.8)
     axes.set_xlabel("harmonic", fontsize=style.TEXT)

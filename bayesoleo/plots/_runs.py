@@ -68,7 +68,9 @@ def _channel(axes: Axes, tree: xr.DataTree, name: str, run: reading.RunView, las
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     position, values = reading.abscissa(tree, run), scale.factor * data.values[run.index]
     if reading.is_resolved(position, values):
-        axes.plot(*reading.fold(position, values), color=style.INK, lw=1.2)
+        x, y = reading.fold(position, values)
+        mark: dict[str, Any] = {"marker": "o", "ms": 2.0} if reading.is_few(x) else {}
+        axes.plot(x, y, color=style.INK, lw=0.6 if mark else 1.2, **mark)
     else:
         order = position.argsort()
         axes.plot(*reading.thin(position[order], values[order]), color=style.INK, lw=0.4)
@@ -194,8 +196,9 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
     Returns
     -------
     Figure
-        Averages over the periods of a run. A signal with too many harmonics for that is shown by a
-        stretch of raw samples from the middle of its record.
+        Averages over the periods of a run; a transient as it is. A signal with too many harmonics
+        for that is shown by a stretch of raw samples from the middle of its record. Where there
+        are few samples in a period, each is a dot.
     """
     measured = reading.variable(tree, schema.RECORDS, output)
     scale = engineering(reading.unit(measured), style.magnitude(measured.values))
@@ -210,7 +213,8 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
             reading.variable(tree, schema.PREDICTION, name).values[run.index] for name in shown
         ]
         position = reading.abscissa(tree, run)
-        _draw(axes, position, [scale.factor * np.asarray(curve) for curve in curves])
+        scaled = [scale.factor * np.asarray(curve) for curve in curves]
+        _draw(axes, position, scaled, run.periodic)
         spans.append(np.ptp(axes.get_ylim()))
     style.share_y(grid.axes, spans)
     handles = [style.line(style.MEASURED, "measured", 4.0)]
@@ -223,10 +227,13 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
     return grid.figure
 
 
-def _draw(axes: Axes, position: Array, curves: list[Array]) -> None:
+def _draw(axes: Axes, position: Array, curves: list[Array], periodic: bool) -> None:
     """Measured broad and pale, so that a prediction that lies on it can be seen on it."""
     if reading.is_resolved(position, curves[0]):
         lines = [reading.fold(position, curve) for curve in curves]
+        style.cycles(axes)
+    elif not periodic:
+        lines = [reading.thin(position, curve, 4 * reading.BINS) for curve in curves]
         style.cycles(axes)
     else:
         finite = np.flatnonzero(np.isfinite(curves[0]) & np.isfinite(position))
@@ -237,7 +244,10 @@ def _draw(axes: Axes, position: Array, curves: list[Array]) -> None:
         lines = [(x, curve[part]) for curve in curves]
         axes.set_xlim(x[0], x[-1])
         axes.tick_params(labelbottom=True)
-    axes.plot(*lines[0], color=style.MEASURED, lw=4.0, alpha=0.55, solid_capstyle="round")
+    measured: dict[str, Any] = {"lw": 4.0, "alpha": 0.55, "solid_capstyle": "round"}
+    if reading.is_few(lines[0][0]):
+        measured = {"lw": 0.0, "marker": "o", "ms": 4.0}
+    axes.plot(*lines[0], color=style.MEASURED, **measured)
     dashes = "--" if len(lines) > 2 else "-"
     axes.plot(*lines[1], color=style.BEFORE, lw=1.4, ls=dashes)
     if len(lines) > 2:
@@ -245,8 +255,8 @@ def _draw(axes: Axes, position: Array, curves: list[Array]) -> None:
 
 
 #: What errors are divided by.
-_OF = {schema.RATIO_TO_EXPECTED: "expected", schema.RATIO_TO_NOISE: "noise"}
-ERROR_LEFT, ERROR_TOP, ERROR_BOTTOM, ERROR_ROW = 2.4, 0.85, 0.6, 0.3
+_OF = {schema.RATIO_TO_EXPECTED: "expected", schema.RATIO_TO_NOISE: "standard error"}
+ERROR_LEFT, ERROR_TOP, ERROR_BOTTOM, ERROR_ROW, ERROR_COLUMN = 2.4, 0.85, 0.6, 0.3, 3.6
 
 
 def error(tree: xr.DataTree) -> Figure:
@@ -260,21 +270,23 @@ def error(tree: xr.DataTree) -> Figure:
     Returns
     -------
     Figure
-        On a logarithmic axis; at 1 nothing is missing. Where no run has a noise floor, as with
-        transients, the rms of the raw residual is shown instead.
+        On a logarithmic axis; at 1 nothing is missing. Where the noise of no run is known, the rms
+        of the raw residual is shown instead.
     """
     rounds = reading.summary(tree)["rounds"]
     first, last = rounds[0]["error"], rounds[-1]["error"]
     labels = _order(first)
     height = ERROR_TOP + ERROR_ROW * len(labels) + ERROR_BOTTOM
-    figure = style.blank(style.WIDTH, height)
-    wide = (style.WIDTH - ERROR_LEFT - 0.15) / max(len(first), 1)
+    # A single output needs no wide figure, in which a phone would show small letters.
+    width = min(style.WIDTH, ERROR_LEFT + 0.15 + ERROR_COLUMN * max(len(first), 1))
+    figure = style.blank(width, height)
+    wide = (width - ERROR_LEFT - 0.15) / max(len(first), 1)
     for column, output in enumerate(first):
-        x = (ERROR_LEFT + column * wide) / style.WIDTH
+        x = (ERROR_LEFT + column * wide) / width
         box = (
             x,
             ERROR_BOTTOM / height,
-            0.93 * wide / style.WIDTH,
+            0.93 * wide / width,
             1 - (ERROR_TOP + ERROR_BOTTOM) / height,
         )
         axes = figure.add_axes(box)
@@ -304,7 +316,7 @@ def _column(
     entries = [run for runs in (first, last) for run in runs.values()]
     key = _ratio_key(entries)
     values = [run[key] for run in entries if run[key]]
-    factor, text = 1.0, f"repeating error / {_OF.get(key, '')}"
+    factor, text = 1.0, f"{reading.averaged_word(tree)} error / {_OF.get(key, '')}"
     if key == schema.RMS:
         scale = engineering(_unit(tree, output), max(values, default=0.0))
         factor, text = scale.factor, scale.label("rms")
@@ -333,7 +345,7 @@ def _dumbbell(axes: Axes, row: int, before: float | None, after: float | None, t
     """One run: where it was, where it is, and the way between."""
     if before is None or after is None:
         place = axes.get_yaxis_transform()
-        text = "no noise floor; rms in the table"
+        text = "noise not known; rms in the table"
         axes.text(0.03, row, text, transform=place, va="center", fontsize=7, color=style.FAINT)
         return
     if two:
@@ -405,7 +417,7 @@ def _handles(two: bool) -> list[Artist]:
     hollow.set_label("before")
     full = Line2D([], [], marker="o", ls="", ms=6.5, color=style.AFTER)
     full.set_label("after" if two else "error")
-    floor = Line2D([], [], color=style.INK, lw=1.0, label="noise floor")
+    floor = Line2D([], [], color=style.INK, lw=1.0, label="1: nothing missing")
     return [hollow, full, floor] if two else [full, floor]
 
 

@@ -383,6 +383,8 @@ def to_datasets(
             "prior": _prior(dict(zip(samples.parameters, draws.T, strict=True)), about)
         }
     groups["posterior"].attrs["error_model"] = density.errors.word
+    if density.reason:
+        groups["posterior"].attrs[schema.ERROR_MODEL_REASON] = density.reason
     draws = density.unknowns.sample_prior(rng, PRIOR_CHAINS * PRIOR_DRAWS)
     table = dict(zip(density.unknowns.names, draws.T, strict=True))
     table |= density.errors.sample_prior(rng, PRIOR_CHAINS * PRIOR_DRAWS)

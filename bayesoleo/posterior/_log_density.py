@@ -269,6 +269,8 @@ class LogDensity:
     failures : collections.Counter
         Rows of density zero so far, by the lower-case name of their
         :class:`~bayesoleo.solvers.Status`.
+    reason : str
+        Why this error model was chosen; empty where nobody said.
 
     Raises
     ------
@@ -298,6 +300,7 @@ class LogDensity:
         self.transforms = Transforms.of(problem.priors)
         self.evaluations = 0
         self.failures: Counter[str] = Counter()
+        self.reason = ""
         self._size = len(self.unknowns.names)
         for name in self.unknowns.names:
             if schema.of_errors(name) or name in self.errors.names:

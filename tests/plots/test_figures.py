@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
 from bayesoleo import _schema as schema, plots
 from bayesoleo.errors import InputError
 from bayesoleo.plots import _reading as reading, _style as style
-from bayesoleo.plots._discovery import chosen, similar
+from bayesoleo.plots._discovery import chosen, format_share, similar
+from bayesoleo.plots._estimates import _SHADES
 
 
 def texts(figure):
@@ -219,12 +221,89 @@ def test_thinning_keeps_the_extremes():
     assert (np.diff(x) > 0).all()
 
 
-def test_folding_averages_and_leaves_gaps():
-    centres, means = reading.fold(
-        np.array([0.1, 0.2, 0.9, np.nan]), np.array([1.0, 3.0, 5.0, 7.0]), 4
-    )
-    np.testing.assert_allclose(centres, [0.125, 0.375, 0.625, 0.875])
-    np.testing.assert_array_equal(means, [2.0, np.nan, np.nan, 5.0])
+def test_folding_averages_and_breaks_off_in_a_gap():
+    phase = np.concatenate((np.arange(0.005, 0.3, 0.01), np.arange(0.605, 1.0, 0.01), [np.nan]))
+    x, means = reading.fold(phase, 3.0 * phase, 50)
+    gap = np.flatnonzero(~np.isfinite(x))
+    assert gap.size == 1
+    np.testing.assert_allclose(x[:2], [0.01, 0.03])
+    np.testing.assert_allclose(means, 3.0 * x)
+    assert (x[gap - 1] < 0.3).all()
+    assert (x[gap + 1] > 0.6).all()
+
+
+@pytest.mark.parametrize("per_period", [7, 40, 60, 100, 130])
+def test_few_samples_of_a_period_are_all_drawn(per_period):
+    phase = np.arange(30 * per_period) / per_period % 1.0
+    x, means = reading.fold(phase, np.sin(2 * np.pi * phase))
+    assert np.isfinite(x).all()
+    assert x.size == min(per_period, reading.BINS)
+    np.testing.assert_allclose(means, np.sin(2 * np.pi * x), atol=2e-3)
+    assert reading.is_few(x) == (per_period <= reading.BINS // 2)
+
+
+def sparse(tree, step):
+    """A result whose records have fewer samples."""
+    groups = ("records", "prediction", "residual")
+    thin = {name: tree[name].to_dataset().isel(sample=slice(None, None, step)) for name in groups}
+    found = xr.DataTree.from_dict({**thin, "constant_data": tree["constant_data"].to_dataset()})
+    found.attrs = dict(tree.attrs)
+    return found
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plots.records,
+        lambda tree: plots.fit(tree, "force"),
+        lambda tree: plots.residual(tree, "force"),
+        lambda tree: plots.residual(tree, "force", "velocity"),
+    ],
+)
+def test_no_panel_is_empty_at_26_samples_a_period(oleo, draw):
+    for axes in draw(sparse(oleo, 10)).axes:
+        drawn = [np.count_nonzero(np.isfinite(one.get_ydata())) for one in axes.lines]
+        assert max(drawn) >= 20
+        marked = [one for one in axes.lines if one.get_marker() == "o"]
+        assert marked or all(np.diff(np.flatnonzero(np.isfinite(one.get_xdata()))).min() == 1
+                             for one in axes.lines if one.get_ydata().size > 2)  # fmt: skip
+
+
+def test_shares_of_no_excess_are_not_drawn(oleo):
+    """An output at its noise has no shares; what is left of another has none below zero."""
+    residual = oleo["residual"].to_dataset()
+    noise = residual["pressure_noise"].values[:, None]
+    quiet = np.random.default_rng(2).normal(size=residual["pressure_before_mean"].shape) * noise
+    quiet = residual.assign(pressure_before_mean=(("run", "phase"), quiet))
+    groups = {name: oleo[name].to_dataset() for name in ("records", "constant_data")}
+    figure = plots.residual_breakdown(xr.DataTree.from_dict({**groups, "residual": quiet}))
+    assert len(figure.axes) == 2
+    assert "no excess: pressure" in texts(figure)
+    heights = [bar.get_height() for bar in figure.axes[0].patches]
+    assert min(heights) >= 0.0
+    quiet["force_before_mean"] = quiet["force_noise"] * np.sign(quiet["pressure_before_mean"])
+    nothing = plots.residual_breakdown(xr.DataTree.from_dict({**groups, "residual": quiet}))
+    assert texts(nothing) == ["no error beyond the noise: force, pressure"]
+
+
+def test_a_share_below_nothing_is_none():
+    assert [format_share(gain) for gain in (-1.0, 0.0, 4e-4, 0.0126, 1.0)] == [
+        "none", "none", "none", "1.3 %", "100.0 %"
+    ]  # fmt: skip
+
+
+def test_colours_can_be_read_and_told_from_white():
+    """Contrast of 4.5 of text and of 3 of lines and marks (WCAG 2.1, AA)."""
+    assert style.contrast("#ffffff", "#000000") == pytest.approx(21.0)
+    assert style.contrast("#777777", "white") == pytest.approx(4.48, abs=0.01)
+    for text in (style.INK, style.FAINT, style.BEFORE, style.AFTER):
+        assert style.contrast(text, "white") >= 4.5
+    for ground in (style.NOISE, style.SIMILAR, "#eef4f9"):
+        assert style.contrast(style.INK, ground) >= 4.5
+    for mark in (style.MEASURED, style.BEFORE, style.AFTER, *style.ENSEMBLES):
+        assert style.contrast(mark, "white") >= 3.0
+    shades = [to_hex(_SHADES(value)) for value in np.linspace(0, 1, 21)]
+    assert min(style.contrast(style.text_on(shade), shade) for shade in shades) >= 4.5
 
 
 def test_many_runs_are_cut_and_that_is_said(oleo):

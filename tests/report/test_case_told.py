@@ -27,7 +27,7 @@ def test_what_it_is_how_large_and_whether_it_holds(answers):
     assert "comes nearest: " in found["What else could it be?"]
     assert "95 %" in found["How large?"]
     assert "→" in found["Does it hold on data not used?"]
-    assert "times its noise" in found["Was anything wrong?"]
+    assert "times its standard error" in found["Was anything wrong?"]
     assert "best remaining candidate" in found["What is left?"]
 
 
@@ -79,6 +79,6 @@ def test_nothing_wrong_is_said_so(answers, two_runs):
     quiet["rounds"], quiet["effects"] = quiet["rounds"][:1], []
     quiet["rounds"][0]["accepted"] = None
     found = dict(case(quiet, {}, two_runs))
-    assert found["Was anything wrong?"].startswith("No: no error repeats beyond what chance allows")
+    assert found["Was anything wrong?"].startswith("No: no error is larger than chance allows")
     assert "What is it?" not in found
     assert "Does it hold on data not used?" not in found

@@ -95,7 +95,10 @@ def test_a_search_that_broke_off_is_said_first():
 
 def test_a_run_that_alone_is_too_large_is_named():
     text = told([], None, ratio=1.1, verdict=schema.UNEXPLAINED)
-    assert text == "Something is missing: the error of force in run a is 1.10 times its noise."
+    assert (
+        text
+        == "Something is missing: the error of force in run a is 1.10 times its standard error."
+    )
 
 
 def runs_told(**ratios):
@@ -117,7 +120,7 @@ def test_a_run_without_a_prediction_is_what_is_missing():
 
 def test_less_error_than_chance_allows_is_no_finding():
     text = told([], None, ratio=0.16, verdict=schema.UNEXPLAINED, lowest=0.8)
-    assert text.startswith("No verdict: the error of force on the hold-out runs is 0.160 times")
+    assert text.startswith("No verdict: the error of force on the hold-out runs is 0.16 times")
     assert text.endswith("less than chance allows: its noise is overstated.")
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from importlib.resources import files
 
+import numpy as np
 import pytest
 import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections
-from bayesoleo._report.page import render_report, write_report
+from bayesoleo._report.page import _parameter_words, render_report, write_report
 from bayesoleo._report.sections import Image, encode_formula
-from bayesoleo._report.sentences import headline, reason
+from bayesoleo._report.sentences import headline, reason, runs_used
 from bayesoleo._report.tables import (
     diagnostics,
     diagnostics_by_parameter,
@@ -22,6 +24,7 @@ from bayesoleo._report.tables import (
 )
 from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.errors import ResultsError
+from bayesoleo.plots._style import contrast
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +37,14 @@ def unpainted(monkeypatch):
     """Figures are made, but not painted: that takes most of a page's time and is none of its
     text."""
     monkeypatch.setattr(sections, "encode_figure", lambda figure: Image("data:,", 1.0, 1.0))
+
+
+DATA = '<script type="application/json" id="runs-data">'
+
+
+def viewer_data(page):
+    """What the script of a page draws."""
+    return json.loads(page.split(DATA)[1].split("</script>")[0])
 
 
 def without(tree, *names):
@@ -62,23 +73,27 @@ def test_the_page_makes_its_case(page):
 
 
 def test_the_page_begins_with_the_case(page):
-    assert page.index("Was anything wrong?") < page.index("Data and noise floor")
+    assert page.index("Was anything wrong?") < page.index("Data and noise</h2>")
 
 
 def test_the_page_needs_no_other_file_and_is_not_too_large(page):
     assert len(page) < 6_000_000
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert "<script" not in page
-    assert not re.search(r"url\(|@import", page)
+    # What is called for by address: a clip path of the page itself, and the name of a language.
+    assert set(re.findall(r"url\([^)]*\)", page)) == {"url(#panel)"}
+    assert set(re.findall(r"https?://[^\"\s]+", page)) <= {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"@import|XMLHttpRequest|fetch\(|WebSocket", page)
+    assert "default-src 'none'" in page
 
 
 def test_every_figure_has_a_caption_and_a_text_for_those_who_cannot_see_it(page):
-    pictures = re.findall(r"<figure>\s*<img [^>]*alt=\"([^\"]+)\"", page)
+    pictures = re.findall(r"<figure>\s*<div [^>]*><img [^>]*alt=\"([^\"]+)\"", page)
     assert len(pictures) == page.count("<figure>") == page.count("<figcaption>") == 18
 
 
 def test_no_value_is_left_out_by_accident(page):
-    visible = re.sub(r'src="[^"]*"|<style>.*?</style>|<[^>]+>', " ", page, flags=re.DOTALL)
+    hidden = r'src="[^"]*"|<style>.*?</style>|<script.*?</script>|<[^>]+>'
+    visible = re.sub(hidden, " ", page, flags=re.DOTALL)
     assert not re.search(r"\b(nan|None|inf|undefined)\b", visible)
 
 
@@ -87,8 +102,10 @@ def test_what_a_user_wrote_is_text(synthetic):
     evil = "<script>alert(1)</script>"
     tree = synthetic.oleo_tree(label=f"{evil}&\"'", description=f"rig {evil}\nsecond line")
     page = render_report(tree)
-    assert "<script" not in page
+    assert re.findall(r"<script[^>]*>", page) == [DATA, "<script>"]
+    assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 14 * 3
+    assert viewer_data(page)["runs"][0]["label"].startswith(evil)
 
 
 @pytest.mark.slow
@@ -126,7 +143,7 @@ def test_the_page_of_a_stored_result_is_the_same(two_runs, tmp_path):
 @pytest.mark.parametrize(
     ("effects", "text"),
     [
-        ([], "missing: the error of voltage on the fit runs is 2.50 times its noise."),
+        ([], "missing: the error of voltage on the fit runs is 2.50 times its standard error."),
         (["wall"], "A likeness only: wall was added, and the error of voltage on the fit runs is"),
         (["wall", "lag"], "A likeness only: wall and lag were added, and the error of voltage"),
     ],
@@ -160,9 +177,7 @@ def test_a_candidate_that_stands_open_is_not_denied(two_runs, estimated, p_value
 def test_many_candidates_are_folded_and_a_range_stands_for_the_runs(page):
     assert "<details><summary>" in page
     text = expected_text({"gain": 1060.0, "offset[a]": 2.0, "offset[b]": -1.0})
-    assert (
-        text.replace("\N{NO-BREAK SPACE}", " ") == "gain = 1060, offset = −1.000 … 2.000 (2 runs)"
-    )
+    assert text.replace("\N{NO-BREAK SPACE}", " ") == "gain = 1060, offset = −1.00 … 2.00 (2 runs)"
     assert [format_short(value) for value in (1064.0, 41989.0, 999.7)] == ["1060", "42000", "1000"]
 
 
@@ -212,5 +227,103 @@ def test_sizes_that_are_expected_have_units():
     units = {"k": "N/m**3", "offset[a]": "m", "offset[b]": "m", "ratio": ""}
     values = {"k": -3e7, "offset[a]": 2e-3, "offset[b]": -1e-3, "ratio": 0.5}
     assert expected_text(values, units).replace("\N{NO-BREAK SPACE}", " ") == (
-        "k = −30.00 MN/m³, offset = −1.000 … 2.000 mm (2 runs), ratio = 0.5000"
+        "k = −30.0 MN/m³, offset = −1.00 … 2.00 mm (2 runs), ratio = 0.500"
     )
+
+
+def test_the_viewer_holds_what_the_figures_show(page, oleo):
+    shown = viewer_data(page)
+    assert [output["name"] for output in shown["outputs"]] == ["force", "pressure"]
+    run = shown["outputs"][0]["runs"][0]
+    assert shown["outputs"][0]["labels"] == ["force in kN", "residual in N"]
+    assert run["ends"] == [0.0, 1.0]
+    measured = oleo["records/force"].values[0] / 1e3
+    assert min(run["measured"]) >= 0.999 * np.nanmin(measured)
+    stored = oleo["residual/force_before_mean"].values[0]
+    np.testing.assert_allclose(run["residual"]["before"], stored, rtol=1e-4)
+    assert run["residual"]["band"] == pytest.approx(
+        oleo["residual/force_noise"].values[0], rel=1e-4
+    )
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_a_transient_is_not_averaged_over_periods(two_runs):
+    tree = two_runs.isel(run=[1])
+    summary = json.loads(tree.attrs["summary"])
+    transient = summary["rounds"][0]["error"]["voltage"]
+    summary["rounds"][0]["error"]["voltage"] = {"transient": transient["transient"]}
+    tree.attrs["summary"] = json.dumps(summary)
+    page = render_report(tree)
+    visible = re.sub(r"<script.*?</script>|<style>.*?</style>", "", page, flags=re.DOTALL)
+    assert "the periods" not in visible
+    assert "over periods" not in visible
+    assert "repeating" not in visible
+    assert viewer_data(page)["outputs"][0]["runs"][0]["x_label"] == "time in s"
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_noise_has_one_meaning(oleo):
+    """That of a sample; errors are compared with a standard error, or with what is expected."""
+    page = render_report(oleo)
+    assert "The noise of a channel is the standard deviation of a single sample" in page
+    for text in ("times its noise", "/ noise", "noise floor", "<b>noise</b>"):
+        assert text not in page
+
+
+def test_the_first_screen_says_on_which_runs(page, two_runs):
+    first = page[: page.index("<nav")]
+    assert "Fitted on 11 runs; tested on 3 runs (run e, run j, run m) that were not used." in first
+    assert first.count("<figure>") == 1
+    summary = json.loads(two_runs.attrs["summary"])
+    assert runs_used(summary).endswith("tested on 1 run (transient) that was not used.")
+    for error in summary["rounds"][0]["error"]["voltage"].values():
+        error["role"] = "fit"
+    assert runs_used(summary).endswith("no run was held out to test it.")
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_the_reason_of_the_error_model_is_on_the_page(synthetic):
+    tree = synthetic.oleo_tree()
+    tree["posterior"].attrs |= {
+        "error_model": "catalogue",
+        schema.ERROR_MODEL_REASON: "catalogue errors, chosen because effects that the data do not"
+        " tell apart are left: sensor_lag @ force",
+    }
+    text = "Catalogue errors, chosen because effects that the data do not tell apart are left: lag"
+    assert text in render_report(tree)
+    del tree["posterior"].attrs[schema.ERROR_MODEL_REASON]
+    assert "Catalogue errors, as the settings ask." in render_report(tree)
+
+
+def colours_of(css):
+    """Variables of the style sheet."""
+    return dict(re.findall(r"--([a-z]+): (#[0-9a-f]{3,6})", css))
+
+
+def test_text_on_the_page_has_enough_contrast():
+    """4.5 at least (WCAG 2.1, AA) of every text colour on every ground that it stands on."""
+    css = files("bayesoleo._report").joinpath("report.css").read_text()
+    root = colours_of(css.split("}")[0])
+    grounds = ["#ffffff", root["ground"], root["pale"]]
+    texts = [root[name] for name in ("ink", "faint", "before", "after")]
+    texts += ["#b3261e"]  # a stage that did not finish
+    assert set(re.findall(r"(?<![-\w])color: (?!#fff)([^;]+);", css)) == {
+        "var(--ink)", "var(--faint)", "var(--before)", "var(--after)", "#b3261e"
+    }  # fmt: skip
+    assert min(contrast(text, ground) for text in texts for ground in grounds) >= 4.5
+    verdicts = re.findall(r"--verdict: (#[0-9a-f]{6})", css)
+    assert len(verdicts) == 4
+    assert min(contrast("#ffffff", ground) for ground in verdicts) >= 4.5
+
+
+@pytest.mark.parametrize(
+    ("label", "words"),
+    [
+        ("Stribeck_friction", "Stribeck friction"),
+        ("Stribeck_friction_decay", "Stribeck friction, decay"),
+        ("Stribeck_friction[run 3]", "Stribeck friction [run 3]"),
+        ("damping", "damping"),
+    ],
+)
+def test_parameters_of_an_added_effect_are_called_by_its_title(label, words):
+    assert _parameter_words(label, {"effects": ["Stribeck_friction"]}) == words
