@@ -30,7 +30,7 @@ from bayesoleo._report.tables import (
 )
 from bayesoleo._storage.files import write_text_atomic
 from bayesoleo.assessment._residual_breakdown import GROUP, ORDERS, RUN, residual_breakdown
-from bayesoleo.effects._catalogue import called, listed
+from bayesoleo.effects._catalogue import called, listed, parameter_called
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.plots import _reading as reading
@@ -233,7 +233,7 @@ def _large(summary: Mapping[str, Any]) -> str:
         if row[0].split("[")[0] in new:
             cells = dict(zip(table.head, row, strict=True))
             interval = cells["95 % interval"]
-            what = _parameter_words(row[0], summary)
+            what = parameter_called(row[0], sentences.titles(summary))
             if summary["parameters"][row[0]].get("shared_with"):
                 texts.append(f"{what} {interval}")
                 continue
@@ -245,17 +245,6 @@ def _large(summary: Mapping[str, Any]) -> str:
     drawn = any(one.get("family") == FAMILY for one in added)
     curve = "The curve and its band are drawn below, in the round that added it." if drawn else ""
     return " ".join(filter(None, [f"{', '.join(texts[:most])}{rest}." if texts else "", curve]))
-
-
-def _parameter_words(label: str, summary: Mapping[str, Any]) -> str:
-    """A parameter of an added effect by the effect's title: ``breakaway friction, decay``."""
-    known = sentences.titles(summary)
-    for effect in sorted(summary["effects"], key=len, reverse=True):
-        if label.startswith(effect):
-            rest = label.removeprefix(effect).replace("_", " ").strip()
-            comma = "" if not rest or rest.startswith("[") else ","
-            return " ".join(filter(None, [f"{called(effect, known)}{comma}", rest]))
-    return label
 
 
 def _holds(summary: Mapping[str, Any], units: Mapping[str, str]) -> str:
@@ -366,7 +355,7 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "summary": summary,
         "attributes": tree.attrs,
         "description": str(tree.attrs.get(schema.CAMPAIGN_DESCRIPTION, "")).strip(),
-        "headline": sentences.headline(summary),
+        "headline": sentences.headline_parts(summary),
         "badge": sentences.badge(summary),
         "structures": {
             "lines": structures.section(summary),

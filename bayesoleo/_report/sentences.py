@@ -44,6 +44,25 @@ def headline(summary: Mapping[str, Any]) -> str:
     return f"{lead}{_said(summary)}{_not_tried(summary)}"
 
 
+def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """The headline as a title of what was found, and the rest of it as sentences."""
+    text, names = headline(summary), added(summary)
+    place = text.find(f" {names} was") if names else -1
+    if place < 0:
+        end = text.find(". ", text.find(":"))
+        return (text, "") if end < 0 else (text[: end + 1], text[end + 2 :])
+    # The verb ends the title; of one effect its probability does.
+    verb = place + len(names) + 2
+    ends = [text.find(end, verb) for end in (" missing", " added")]
+    first = min(
+        end + len(word) for end, word in zip(ends, (" missing", " added"), strict=True) if end > 0
+    )
+    likely = structures.with_probability(summary) if len(summary["effects"]) == 1 else ""
+    if likely and text.startswith(likely, first):
+        first += len(likely)
+    return f"{text[:first]}.", begin(text[first:].lstrip(",;. "))
+
+
 def _not_tried(summary: Mapping[str, Any]) -> str:
     """A sentence on effects of the catalogue that the search was not given; empty if none."""
     left_out = summary.get("effects_left_out", 0)
@@ -404,4 +423,6 @@ def _change(before: float | None, after: float | None) -> str:
     if not before or after is None:
         return ""
     change = 100 * (after / before - 1)
-    return f"{change:+.0f} %".replace("-", "−")
+    # Nearly all of it is not all of it.
+    change = max(change, -99.9) if after else change
+    return f"{change:+.{1 if -100 < change < -99 else 0}f} %".replace("-", "−")

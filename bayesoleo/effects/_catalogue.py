@@ -186,7 +186,28 @@ def called(name: str, titles: Mapping[str, str]) -> str:
     """
     effect, _, place = name.partition(" @ ")
     title = titles.get(effect) or catalogue_titles().get(effect) or effect.replace("_", " ")
-    return f"{in_sentence(title)} ({place})" if place else in_sentence(title)
+    own = f" ({parameter_called(place, titles)})" if place else ""
+    return f"{in_sentence(title)}{own}"
+
+
+def parameter_called(label: str, titles: Mapping[str, str]) -> str:
+    """A parameter that an effect brought, by the effect's title: ``breakaway friction, decay``.
+
+    Parameters
+    ----------
+    label : str
+        Of a parameter, or a place; those that do not begin with the id of an effect stay.
+    titles : mapping of str to str
+        Titles by id, in addition to the catalogue. Ids of one word may be words of a model.
+    """
+    ids = [one for one in {**catalogue_titles(), **titles} if "_" in one]
+    own = [one for one in ids if re.match(rf"{re.escape(one)}(?![^_\[])", label)]
+    if not own:
+        return label
+    effect = max(own, key=len)
+    rest = label.removeprefix(effect).replace("_", " ").strip()
+    comma = "," if rest and not rest.startswith("[") else ""
+    return f"{called(effect, titles)}{comma} {rest}".strip()
 
 
 def with_titles(text: str, titles: Mapping[str, str]) -> str:

@@ -16,6 +16,8 @@ from bayesoleo.errors import InputError
 
 BINS = 120
 """Points shown over one period."""
+MERGED = 0.25
+"""Part of a bin's width below which the averages of two bins are one."""
 
 
 @dataclass(frozen=True)
@@ -158,10 +160,14 @@ def fold(position: Array, values: Array, bins: int = BINS) -> tuple[Array, Array
     count = np.bincount(index, minlength=bins)
     filled = count > 0
     x, y = (
-        np.bincount(index, weights=part[keep], minlength=bins)[filled] / count[filled]
+        np.bincount(index, weights=part[keep], minlength=bins)[filled]
         for part in (position, values)
     )
-    return _broken(x, y, bins)
+    # Rounding divides samples of one phase that lies on the edge of two bins.
+    together = np.cumsum(np.diff(x / count[filled], prepend=0.0) > MERGED / bins)
+    size, x, y = (np.bincount(together, weights=part) for part in (count[filled], x, y))
+    size, x, y = (part[np.bincount(together) > 0] for part in (size, x, y))
+    return _broken(x / size, y / size, bins)
 
 
 def _broken(x: Array, y: Array, bins: int) -> tuple[Array, Array]:

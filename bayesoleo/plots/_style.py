@@ -71,8 +71,8 @@ def _luminance(colour: str) -> float:
 
 
 def text_on(ground: str) -> str:
-    """Dark or white, whichever can be read better on a ground."""
-    return max((INK, "white"), key=lambda colour: contrast(colour, ground))
+    """Black or white, whichever can be read better on a ground."""
+    return max(("black", "white"), key=lambda colour: contrast(colour, ground))
 
 
 def plain(text: str, most: int = 60) -> str:

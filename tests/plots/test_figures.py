@@ -234,12 +234,14 @@ def test_folding_averages_and_breaks_off_in_a_gap():
 
 @pytest.mark.parametrize("per_period", [7, 40, 60, 100, 130])
 def test_few_samples_of_a_period_are_all_drawn(per_period):
-    phase = np.arange(30 * per_period) / per_period % 1.0
+    jitter = 1e-12 * np.random.default_rng(0).normal(size=30 * per_period)
+    phase = (np.arange(30 * per_period) / per_period + jitter) % 1.0
     x, means = reading.fold(phase, np.sin(2 * np.pi * phase))
     assert np.isfinite(x).all()
-    assert x.size == min(per_period, reading.BINS)
+    # The sample at the end of the period may be drawn at both of its ends.
+    assert 0 <= x.size - min(per_period, reading.BINS) <= 1
     np.testing.assert_allclose(means, np.sin(2 * np.pi * x), atol=2e-3)
-    assert reading.is_few(x) == (per_period <= reading.BINS // 2)
+    assert reading.is_few(x) == (x.size <= reading.BINS // 2)
 
 
 def sparse(tree, step):
@@ -266,7 +268,7 @@ def test_no_panel_is_empty_at_26_samples_a_period(oleo, draw):
         assert max(drawn) >= 20
         marked = [one for one in axes.lines if one.get_marker() == "o"]
         assert marked or all(np.diff(np.flatnonzero(np.isfinite(one.get_xdata()))).min() == 1
-                             for one in axes.lines if one.get_ydata().size > 2)  # fmt: skip
+                             for one in axes.lines if np.size(one.get_ydata()) > 2)  # fmt: skip
 
 
 def test_shares_of_no_excess_are_not_drawn(oleo):

@@ -8,14 +8,20 @@ import pytest
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import tables as yardstick
-from bayesoleo._report.sentences import headline
+from bayesoleo._report.sentences import headline, headline_parts
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.effects import catalogue
-from bayesoleo.effects._catalogue import called, in_sentence, with_titles
+from bayesoleo.effects._catalogue import called, in_sentence, parameter_called, with_titles
 
 
 def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowest=0.0, **more):
     """The headline of effects, each ``id @ target``."""
+    summary = summary_of(names, sure, ratio=ratio, alike=alike, verdict=verdict, lowest=lowest)
+    return headline(summary | more)
+
+
+def summary_of(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowest=0.0):
+    """What a headline needs of a summary."""
     pairs = [name.split(" @ ") for name in names]
     ranked = {name: [candidate(*name.split(" @ "), alike)] for name in names}
     entries = [
@@ -24,7 +30,7 @@ def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowes
     ]
     errors = {"ratio_to_noise": ratio, "repeating": 1.0, "rms": 1.0, "lowest": lowest}
     last = {"accepted": None, "candidates": [], "error": {"force": {"a": errors}}}
-    summary = {
+    return {
         "effects": [effect for effect, _ in pairs],
         "targets": [place for _, place in pairs],
         "rounds": [*entries, last],
@@ -32,7 +38,6 @@ def told(names, sure, *, ratio=1.0, alike=(), verdict=schema.EFFECT_ADDED, lowes
         "certainty": sure,
         "error_after": {"hold-out": {"force": errors}},
     }
-    return headline(summary | more)
 
 
 def candidate(effect, place, alike):
@@ -175,3 +180,36 @@ def test_settings_count_what_they_leave_out_of_the_catalogue():
     assert Settings().left_out == 0
     assert Settings(without=("coulomb_friction",)).left_out == 1
     assert Settings(effects=catalogue()[:2]).left_out == every - 2
+
+
+@pytest.mark.parametrize("sure", [*schema.CERTAINTIES, None])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_title_of_a_page_is_short_and_nothing_is_lost(sure, count):
+    names = ["coulomb_friction @ x", "sensor_lag @ force", "cubic_stiffness @ x"]
+    names = [] if sure is None else names[:count]
+    for verdict in (schema.EFFECT_ADDED, schema.UNEXPLAINED):
+        summary = summary_of(names, sure, ratio=2.0, verdict=verdict, alike=["play @ x"])
+        title, rest = headline_parts(summary)
+        whole = headline(summary)
+        assert whole.startswith(title[:-1])
+        assert whole.endswith(rest[1:])
+        assert len(title) + len(rest) >= len(whole) - 2
+        assert len(title) < 110 + 45 * count
+        assert title.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("label", "words"),
+    [
+        ("stribeck_friction", "breakaway friction"),
+        ("stribeck_friction_decay", "breakaway friction, decay"),
+        ("stribeck_friction[run 3]", "breakaway friction [run 3]"),
+        ("my_law_b", "law of mine, b"),
+        ("damping", "damping"),
+        ("play_of_mine", "play_of_mine"),
+        ("stroke.damping.pressure", "stroke.damping.pressure"),
+    ],
+)
+def test_parameters_of_an_effect_are_called_by_its_title(label, words):
+    assert parameter_called(label, {"my_law": "Law of mine"}) == words
+    assert called(f"varies_by_run @ {label}", {"my_law": "Law of mine"}).endswith(f"({words})")
