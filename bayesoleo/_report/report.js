@@ -274,7 +274,4 @@
   var data = document.getElementById("runs-data"), box = document.getElementById("viewer");
   if (data && box) { window.viewer = new Viewer(box, JSON.parse(data.textContent)); }
   document.addEventListener("toggle", function () { window.dispatchEvent(new Event("resize")); }, true);
-  window.addEventListener("beforeprint", function () {
-    document.querySelectorAll("details").forEach(function (item) { item.open = true; });
-  });
 }());

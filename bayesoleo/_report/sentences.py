@@ -47,16 +47,16 @@ def headline(summary: Mapping[str, Any]) -> str:
 def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
     """The headline as a title of what was found, and the rest of it as sentences."""
     text, names = headline(summary), added(summary)
-    place = text.find(f" {names} was") if names else -1
+    place = text.find(f" {names} w") if names else -1
     if place < 0:
         end = text.find(". ", text.find(":"))
         return (text, "") if end < 0 else (text[: end + 1], text[end + 2 :])
-    # The verb ends the title; of one effect its probability does.
     verb = place + len(names) + 2
-    ends = [text.find(end, verb) for end in (" missing", " added")]
-    first = min(
-        end + len(word) for end, word in zip(ends, (" missing", " added"), strict=True) if end > 0
-    )
+    ends = [
+        text.find(word, verb) + len(word) for word in (" missing", " added") if word in text[verb:]
+    ]
+    first = min(ends)
+    # One effect has its probability in the title; of several they are in the figure.
     likely = structures.with_probability(summary) if len(summary["effects"]) == 1 else ""
     if likely and text.startswith(likely, first):
         first += len(likely)
@@ -327,7 +327,7 @@ def error_model(attributes: Mapping[Any, Any], summary: Mapping[str, Any]) -> st
     if why:
         return f"{begin(with_titles(why, catalogue_titles() | titles(summary)))}."
     word = str(attributes.get("error_model", ""))
-    return f"{begin(word)} errors, as the settings ask." if word else ""
+    return f"The intervals assume {word} errors." if word else ""
 
 
 def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:

@@ -292,7 +292,7 @@ def test_the_reason_of_the_error_model_is_on_the_page(synthetic):
     text = "Catalogue errors, chosen because effects that the data do not tell apart are left: lag"
     assert text in render_report(tree)
     del tree["posterior"].attrs[schema.ERROR_MODEL_REASON]
-    assert "Catalogue errors, as the settings ask." in render_report(tree)
+    assert "The intervals assume catalogue errors." in render_report(tree)
 
 
 def colours_of(css):
