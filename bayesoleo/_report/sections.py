@@ -22,6 +22,7 @@ import xarray as xr
 from matplotlib import mathtext
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
 from bayesoleo._report.structures import proposal_table
@@ -438,7 +439,9 @@ def _one_run(
     }  # fmt: skip
 
 
-def _telling(curves: list[Array], known: Array, points: int, periodic: bool) -> Array:
+def _telling(
+    curves: list[Array], known: NDArray[np.bool_], points: int, periodic: bool
+) -> NDArray[np.intp]:
     """Indices of samples to draw: extremes of stretches of a transient, else a stretch."""
     every = np.flatnonzero(known)
     if every.size <= points:
@@ -451,7 +454,7 @@ def _telling(curves: list[Array], known: Array, points: int, periodic: bool) -> 
         for curve in curves:
             values = np.where(np.isfinite(curve[part]), curve[part], 0.0)
             chosen |= {int(part[values.argmin()]), int(part[values.argmax()])}
-    return np.array(sorted(chosen))
+    return np.array(sorted(chosen), dtype=np.intp)
 
 
 def _numbers(values: Array) -> list[float | None]:

@@ -306,14 +306,17 @@ def html(text: str, plot: Callable[[], Figure | None]) -> str:
         figure = plot()
     except Exception:  # a figure must not hide the numbers
         figure = None
-    return f"<pre>{escape(text)}</pre>" + ("" if figure is None else _image(figure))
+    # Columns stay aligned where a notebook would wrap lines, and a narrow one scrolls the table.
+    table = f'<pre style="white-space:pre;overflow-x:auto">{escape(text)}</pre>'
+    return table + ("" if figure is None else _image(figure, text.partition("\n")[0]))
 
 
-def _image(figure: Figure) -> str:
+def _image(figure: Figure, what: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     code = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img src="data:image/png;base64,{code}" style="max-width:{WIDTH}px">'
+    shape = f"max-width:min(100%,{WIDTH}px);height:auto"
+    return f'<img src="data:image/png;base64,{code}" alt="figure: {escape(what)}" style="{shape}">'
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -13,7 +13,9 @@ import xarray as xr
 
 import bayesoleo as bo
 from bayesoleo import _schema as schema
+from bayesoleo._session.display import html
 from bayesoleo.errors import ResultsError
+from bayesoleo.plots._style import blank
 from tests.session.conftest import line
 from tests.session.shown import check_shown
 
@@ -248,3 +250,11 @@ def test_correlated_errors_are_no_missing_term() -> None:
         found = bo.Problem(data, line, parameters=parameters).fit().explain(candidates=terms)
         named += bool(found.effects)
     assert named <= 2  # of twelve with the probability 0.01 each, more come once in 5 000 times
+
+
+def test_a_result_in_a_notebook_keeps_its_columns_and_names_its_figure():
+    text = html("a  b\n1 < 2", lambda: blank(2.0, 1.0))
+    assert text.startswith('<pre style="white-space:pre;overflow-x:auto">a  b\n1 &lt; 2</pre><img ')
+    assert 'alt="figure: a  b"' in text
+    assert "<img" not in html("a", lambda: None)
+    assert html("a", lambda: 1 / 0) == html("a", lambda: None)

@@ -68,6 +68,15 @@ def test_close_writes_result_report_and_summary(closed):
     assert "<script src=" not in report
 
 
+def test_why_an_error_model_was_chosen_is_kept_and_reported(closed):
+    tree, folder = closed
+    attributes = tree[schema.POSTERIOR].attrs
+    word, why = attributes["error_model"], attributes[schema.ERROR_MODEL_REASON]
+    assert why.startswith(f"{word} errors")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert f"<p>{why[0].upper()}{why[1:]}.</p>" in page
+
+
 def test_the_truth_lies_in_the_posteriors_interval(closed):
     summary = json.loads(closed[0].attrs[schema.SUMMARY])
     for name, true in {"damping": 200.0, "stiffness": 1000.0, "cubic": 2e6}.items():
