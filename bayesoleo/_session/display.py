@@ -266,6 +266,8 @@ def noise_and_frequency(data: xr.Dataset) -> Figure:
     return figure
 
 
+#: Characters of a line from which it is wrapped where it is narrow.
+LONG = 60
 #: Resolution of the figure below a table in a notebook, and its greatest width in pixels.
 DPI, WIDTH = 60, 640
 
@@ -306,9 +308,17 @@ def html(text: str, plot: Callable[[], Figure | None]) -> str:
         figure = plot()
     except Exception:  # a figure must not hide the numbers
         figure = None
-    # Columns stay aligned where a notebook would wrap lines, and a narrow one scrolls the table.
-    table = f'<pre style="white-space:pre;overflow-x:auto">{escape(text)}</pre>'
+    # Columns stay aligned where a notebook would wrap lines; sentences are wrapped.
+    lines = "\n".join(map(_line, text.splitlines()))
+    table = f'<pre style="white-space:pre;overflow-x:auto">{lines}</pre>'
     return table + ("" if figure is None else _image(figure, text.partition("\n")[0]))
+
+
+def _line(text: str) -> str:
+    """A row of a table as it is, and a long sentence wrapped."""
+    if "  " in text or len(text) < LONG:
+        return escape(text)
+    return f'<span style="white-space:pre-wrap">{escape(text)}</span>'
 
 
 def _image(figure: Figure, what: str) -> str:

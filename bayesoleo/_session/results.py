@@ -561,8 +561,11 @@ class Explanation(Stored):
             write_report(self.tree, path)
         else:
             title = escape(str(self.tree.attrs.get(schema.MODEL, "")))
-            head = f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
-            write_text_atomic(path, head + html(self._text(), self.plot))
+            head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+            head += f"<title>{title}</title>"
+            body = f"<h1>{title}</h1>{html(self._text(), self.plot)}"
+            page = f'<main style="max-width:900px;margin:auto;font-family:sans-serif">{body}</main>'
+            write_text_atomic(path, f'<!doctype html><html lang="en">{head}{page}</html>')
         return Path(path)
 
     def _text(self) -> str:

@@ -257,4 +257,8 @@ def test_a_result_in_a_notebook_keeps_its_columns_and_names_its_figure():
     assert text.startswith('<pre style="white-space:pre;overflow-x:auto">a  b\n1 &lt; 2</pre><img ')
     assert 'alt="figure: a  b"' in text
     assert "<img" not in html("a", lambda: None)
+    sentence = 20 * "words "
+    assert f'<span style="white-space:pre-wrap">{sentence}</span></pre>' in html(
+        sentence, lambda: None
+    )
     assert html("a", lambda: 1 / 0) == html("a", lambda: None)
