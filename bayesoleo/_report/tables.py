@@ -427,12 +427,14 @@ def _constants(constant: xr.Dataset) -> dict[str, list[str]]:
     frequencies = constant[schema.FREQUENCY].values
     known = constant.get(schema.FREQUENCY_SD)
     sd = None if known is None else np.maximum(known.values, FINEST * frequencies)
-    columns["frequency [Hz]"] = [
-        format_number(float(f), None if sd is None else float(sd[i]))
-        for i, f in enumerate(frequencies)
-    ]
-    if schema.PERIODS in constant:
-        columns["periods"] = [f"{int(n)}" for n in constant[schema.PERIODS].values]
+    if np.isfinite(frequencies).any():  # transients have none
+        columns["frequency [Hz]"] = [
+            format_number(float(f), None if sd is None else float(sd[i]))
+            for i, f in enumerate(frequencies)
+        ]
+    if schema.PERIODS in constant and (constant[schema.PERIODS].values > 0).any():
+        periods = constant[schema.PERIODS].values
+        columns["periods"] = [f"{int(n)}" if n > 0 else "–" for n in periods]
     for condition, data in constant.data_vars.items():
         if condition not in KNOWN_CONSTANTS and data.dims == (schema.RUN,):
             columns |= _condition(str(condition), data)

@@ -67,7 +67,9 @@ def _channel(axes: Axes, tree: xr.DataTree, name: str, run: reading.RunView, las
     data = reading.variable(tree, schema.RECORDS, name)
     scale = engineering(reading.unit(data), style.magnitude(data.values))
     position, values = reading.abscissa(tree, run), scale.factor * data.values[run.index]
-    if reading.is_resolved(position, values):
+    if not run.periodic:
+        axes.plot(*reading.thin(position, values, 4 * reading.BINS), color=style.INK, lw=1.0)
+    elif reading.is_resolved(position, values):
         x, y = reading.fold(position, values)
         mark: dict[str, Any] = {"marker": "o", "ms": 2.0} if reading.is_few(x) else {}
         axes.plot(x, y, color=style.INK, lw=0.6 if mark else 1.2, **mark)
@@ -229,11 +231,11 @@ def fit(tree: xr.DataTree, output: str) -> Figure:
 
 def _draw(axes: Axes, position: Array, curves: list[Array], periodic: bool) -> None:
     """Measured broad and pale, so that a prediction that lies on it can be seen on it."""
-    if reading.is_resolved(position, curves[0]):
-        lines = [reading.fold(position, curve) for curve in curves]
-        style.cycles(axes)
-    elif not periodic:
+    if not periodic:
         lines = [reading.thin(position, curve, 4 * reading.BINS) for curve in curves]
+        style.cycles(axes)
+    elif reading.is_resolved(position, curves[0]):
+        lines = [reading.fold(position, curve) for curve in curves]
         style.cycles(axes)
     else:
         finite = np.flatnonzero(np.isfinite(curves[0]) & np.isfinite(position))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from importlib.resources import files
 
 import numpy as np
@@ -39,6 +41,8 @@ def unpainted(monkeypatch):
     monkeypatch.setattr(sections, "encode_figure", lambda figure: Image("data:,", 1.0, 1.0))
 
 
+#: Only the script's own test needs one.
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DATA = '<script type="application/json" id="runs-data">'
 
 
@@ -314,3 +318,28 @@ def test_text_on_the_page_has_enough_contrast():
     verdicts = re.findall(r"--verdict: (#[0-9a-f]{6})", css)
     assert len(verdicts) == 4
     assert min(contrast("#ffffff", ground) for ground in verdicts) >= 4.5
+
+
+def test_transients_have_no_columns_of_frequencies_and_periods(two_runs):
+    table = records(two_runs)
+    assert {"frequency [Hz]", "periods"} <= set(table.head)
+    tree = two_runs.isel(run=[1])
+    tree["constant_data/periods"] = 0 * tree["constant_data/periods"]
+    head = records(tree).head
+    assert "frequency [Hz]" not in head
+    assert "periods" not in head
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_a_browser_draws_one_run(two_runs, tmp_path):
+    """The script runs without an error under the page's own content security policy."""
+    path = tmp_path / "report.html"
+    write_report(two_runs, path)
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", path.as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
+    viewer = shown[shown.index('id="viewer"') : shown.index(DATA)]
+    assert 'hidden=""' not in viewer[: viewer.index(">")]
+    assert viewer.count('class="line ') == 3  # measured, predicted and the residual
+    assert viewer.count("<option") == 2 + 1
+    assert "NaN" not in viewer
