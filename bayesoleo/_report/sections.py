@@ -32,7 +32,7 @@ from bayesoleo.assessment._residual_breakdown import residual_breakdown
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.errors import InputError
 from bayesoleo.plots import _reading as reading, _style as style
-from bayesoleo.plots._residuals import Against, averaged_residual, has_excess
+from bayesoleo.plots._residuals import Against, has_excess
 from bayesoleo.plots._style import Scale, engineering
 
 LARGEST_SVG = 300_000
@@ -412,7 +412,7 @@ def _one_run(
     position = reading.abscissa(tree, run)
     if run.periodic and reading.is_resolved(position, measured):
         folded = {key: reading.fold(position, y, points) for key, y in curves.items()}
-        means = {s: averaged_residual(tree, f"{name}_{s}", run) for s in stages}
+        means = {s: reading.averaged_residual(tree, f"{name}_{s}", run) for s in stages}
         x, below = folded["measured"][0], means[stages[0]][0]
         label, ends = "phase in cycles", [0.0, 1.0]
         curves = {key: y for key, (_, y) in folded.items()}

@@ -202,6 +202,38 @@ def thin(x: Array, y: Array, points: int = 2 * BINS) -> tuple[Array, Array]:
     return x[chosen], y[chosen]
 
 
+def averaged_residual(tree: xr.DataTree, name: str, run: RunView) -> tuple[Array, Array]:
+    """Residual averaged over the periods of a run over phase; of a transient as it is over time.
+
+    Parameters
+    ----------
+    tree : DataTree
+        With ``residual``.
+    name : str
+        Of the residual: ``force_before``.
+    run : RunView
+
+    Returns
+    -------
+    positions, values : ndarray
+        Position from 0 to 1, and values in SI.
+    """
+    data, mean = tree[schema.RESIDUAL].to_dataset(), schema.mean(name)
+    if run.periodic and mean in data and np.isfinite(data[mean].values[run.index]).any():
+        return thin(_phases(data), data[mean].values[run.index])
+    position, values = abscissa(tree, run), data[name].values[run.index]
+    if run.periodic:
+        return fold(position, values, 2 * BINS)
+    return thin(position, values, 4 * BINS)
+
+
+def _phases(data: xr.Dataset) -> Array:
+    """The grid of the averages; if the tree has none it is regular."""
+    if schema.PHASE in data.coords:
+        return np.asarray(data[schema.PHASE].values, dtype=float)
+    return (np.arange(data.sizes[schema.PHASE]) + 0.5) / data.sizes[schema.PHASE]
+
+
 def averaged_word(tree: xr.DataTree) -> str:
     """What the error of an average is called: of periods it repeats; a transient has none.
 

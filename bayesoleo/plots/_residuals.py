@@ -84,7 +84,7 @@ def _curve(
 ) -> tuple[Array, Array]:
     """What is drawn of one run, in SI."""
     if against == "phase":
-        return averaged_residual(tree, name, run)
+        return reading.averaged_residual(tree, name, run)
     position, e = reading.abscissa(tree, run), data[name].values[run.index]
     coordinate = data[against].values[run.index]
     if reading.is_resolved(position, coordinate):
@@ -97,31 +97,6 @@ def _curve(
     return _by_value(coordinate, e)
 
 
-def averaged_residual(tree: xr.DataTree, name: str, run: reading.RunView) -> tuple[Array, Array]:
-    """Residual averaged over the periods of a run over phase; of a transient as it is over time.
-
-    Parameters
-    ----------
-    tree : DataTree
-        With ``residual``.
-    name : str
-        Of the residual: ``force_before``.
-    run : RunView
-
-    Returns
-    -------
-    positions, values : ndarray
-        Position from 0 to 1, and values in SI.
-    """
-    data, mean = tree[schema.RESIDUAL].to_dataset(), schema.mean(name)
-    if run.periodic and mean in data and np.isfinite(data[mean].values[run.index]).any():
-        return reading.thin(_phases(data), data[mean].values[run.index])
-    position, values = reading.abscissa(tree, run), data[name].values[run.index]
-    if run.periodic:
-        return reading.fold(position, values, 2 * reading.BINS)
-    return reading.thin(position, values, 4 * reading.BINS)
-
-
 def _by_value(coordinate: Array, e: Array) -> tuple[Array, Array]:
     """Averages in bins of the coordinate with equally many samples each."""
     keep = np.flatnonzero(np.isfinite(coordinate) & np.isfinite(e))
@@ -130,13 +105,6 @@ def _by_value(coordinate: Array, e: Array) -> tuple[Array, Array]:
         np.array([coordinate[part].mean() for part in parts]),
         np.array([e[part].mean() for part in parts]),
     )
-
-
-def _phases(data: xr.Dataset) -> Array:
-    """The grid of the averages; if the tree has none it is regular."""
-    if schema.PHASE in data.coords:
-        return np.asarray(data[schema.PHASE].values, dtype=float)
-    return (np.arange(data.sizes[schema.PHASE]) + 0.5) / data.sizes[schema.PHASE]
 
 
 def _scale(variable: xr.DataArray, curves: list[Array]) -> Scale:

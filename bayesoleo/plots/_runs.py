@@ -284,14 +284,8 @@ def error(tree: xr.DataTree) -> Figure:
     figure = style.blank(width, height)
     wide = (width - ERROR_LEFT - 0.15) / max(len(first), 1)
     for column, output in enumerate(first):
-        x = (ERROR_LEFT + column * wide) / width
-        box = (
-            x,
-            ERROR_BOTTOM / height,
-            0.93 * wide / width,
-            1 - (ERROR_TOP + ERROR_BOTTOM) / height,
-        )
-        axes = figure.add_axes(box)
+        left, high = ERROR_LEFT + column * wide, height - ERROR_TOP - ERROR_BOTTOM
+        axes = style.add_axes(figure, left, ERROR_BOTTOM, 0.93 * wide, high)
         _column(axes, tree, output, labels, first[output], last[output], len(rounds) > 1)
         _rows(axes, labels, first[output], column == 0)
         axes.set_title(style.plain(output), fontsize=style.TEXT, fontweight="bold", pad=6)
