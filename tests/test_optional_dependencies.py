@@ -15,7 +15,14 @@ from bayesoleo.data._files import read_columns
 from bayesoleo.errors import BayesoleoError, MissingExtraError
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-EXTRAS = {"dask": "distributed", "data": "pooch", "parquet": "pyarrow", "zarr": "zarr"}
+EXTRAS = {
+    "dask": "distributed",
+    "data": "pooch",
+    "formats": "nptdms",
+    "parquet": "pyarrow",
+    "zarr": "zarr",
+}
+PACKAGES = {"nptdms": "npTDMS"}
 
 
 @pytest.fixture
@@ -25,6 +32,7 @@ def bare(monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delenv(VARIABLE, raising=False)
     (tmp_path / "run.parquet").write_bytes(b"PAR1")
+    (tmp_path / "run.tdms").write_bytes(b"TDSm")
     (tmp_path / "result.zarr").mkdir()
     return tmp_path
 
@@ -39,6 +47,7 @@ def connect(folder):
     [
         ("dask", connect),
         ("data", lambda folder: dataset_folder("silverbox")),
+        ("formats", lambda folder: read_columns(folder / "run.tdms")),
         ("parquet", lambda folder: read_columns(folder / "run.parquet")),
         ("zarr", lambda folder: read_tree(folder / "result.zarr")),
         ("zarr", lambda folder: write_tree(xr.DataTree(), folder / "new.zarr")),
@@ -62,6 +71,6 @@ def test_results_are_stored_without_extras(bare):
 def test_extras_are_declared_and_no_dependency_of_the_core():
     declared = PROJECT["optional-dependencies"]
     for extra, module in EXTRAS.items():
-        assert any(one.startswith(module) for one in declared[extra])
+        assert any(one.startswith(PACKAGES.get(module, module)) for one in declared[extra])
         assert not any(one.startswith(module) for one in PROJECT["dependencies"])
     assert declared["all"] == [f"bayesoleo[{','.join(EXTRAS)}]"]

@@ -201,13 +201,15 @@ class Campaign(data.CampaignData):
         return html(repr(self), self.plot)
 
 
-def load_campaign(path: str | os.PathLike[str]) -> Campaign:
+def load_campaign(path: str | os.PathLike[str], *, progress: bool = True) -> Campaign:
     """Load a campaign and check it.
 
     Parameters
     ----------
     path : path-like
         The campaign's folder, or its ``campaign.toml``.
+    progress : bool, optional
+        Whether to show a bar for a file that takes more than two seconds to read.
 
     Returns
     -------
@@ -223,7 +225,7 @@ def load_campaign(path: str | os.PathLike[str]) -> Campaign:
     --------
     >>> campaign = load_campaign("shaker")  # doctest: +SKIP
     """
-    found = data.load_campaign(path)
+    found = data.load_campaign(path, progress=progress)
     return Campaign(**{item.name: getattr(found, item.name) for item in fields(found)})
 
 

@@ -247,7 +247,11 @@ def reduce(
     """
     if isinstance(campaign, ReducedCampaign):
         return campaign
-    loaded = campaign if isinstance(campaign, CampaignData) else load_campaign(campaign)
+    loaded = (
+        campaign
+        if isinstance(campaign, CampaignData)
+        else load_campaign(campaign, progress=bool(progress))
+    )
     reduced = reduce_campaign(loaded, jobs=jobs, progress=progress)
     for sentence in frequency_warnings(reduced.records):
         warnings.warn(sentence, DataWarning, stacklevel=2)

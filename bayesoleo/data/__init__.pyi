@@ -1,6 +1,5 @@
 from ._campaign import (
     CampaignData as CampaignData,
-    Run as Run,
     load_campaign as load_campaign,
 )
 from ._campaign_folders import (
@@ -42,4 +41,7 @@ from ._residual_time_shift import (
     find_frequency as find_frequency,
     period_search as period_search,
     residual_time_shift as residual_time_shift,
+)
+from ._run_samples import (
+    Run as Run,
 )

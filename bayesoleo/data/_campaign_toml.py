@@ -19,6 +19,7 @@ import numpy as np
 
 from bayesoleo._units import Unit, check_kind, parse_unit
 from bayesoleo.data._sample_quality import Stretches, read_stretches
+from bayesoleo.data._text_layout import TIME_UNITS
 from bayesoleo.errors import CampaignError, choose
 
 FILE = "campaign.toml"
@@ -31,11 +32,15 @@ KINDS = ("periodic", "transient")
 ROLES = ("fit", "hold-out")
 _RUN = (
     *("label", "file", "kind", "frequency", "group", "role", "time", "sample_rate"),
-    *("start", "stop", "mask", "delimiter", "header_delimiter", "conditions"),
+    *("time_unit", "start", "stop", "rows", "segment", "mask", "columns", "delimiter"),
+    *("header_delimiter", "encoding", "conditions"),
 )
 _CONDITION = ("value", "unit", "sd")
 FORMAT = 1
-_TOP = ("format", "name", "description", "controlled", "dataset", "channels", "rig", "runs")
+_TOP = (
+    *("format", "name", "description", "controlled", "dataset", "outside_files", "channels"),
+    *("rig", "runs"),
+)
 _CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
 
 
@@ -206,32 +211,35 @@ class RunDeclaration:
     mask: Stretches
     delimiter: str | None
     header_delimiter: str | None
+    encoding: str | None
+    time_unit: str | None
+    rows: tuple[int, int] | None
+    segment: int | tuple[str, float] | None
+    columns: Mapping[str, str]
     conditions: Mapping[str, float]
     condition_units: Mapping[str, str]
     condition_sd: Mapping[str, float]
 
 
-def read_runs(tables: Sequence[Any]) -> tuple[RunDeclaration, ...]:
+def read_runs(tables: Sequence[Any], channels: Sequence[str]) -> tuple[RunDeclaration, ...]:
     runs: list[RunDeclaration] = []
     for number, table in enumerate(tables, 1):
         if not isinstance(table, dict):
             raise CampaignError(
                 "is no table", file=FILE, key="runs", value=table, hint="write [[runs]]"
             )
-        run = _run(table, f"number {number}")
+        run = _run(table, f"number {number}", channels)
         if run.label in {other.label for other in runs}:
             raise CampaignError(
                 "two runs have this label", file=FILE, run=run.label, key="label", hint="rename one"
             )
         runs.append(run)
-    if not any(run.role == "fit" for run in runs):
-        raise CampaignError(
-            "no run to fit", file=FILE, key="role", hint="give one run or more role = 'fit'"
-        )
+    if not runs:
+        raise CampaignError("no run is declared", file=FILE, key="runs", hint="write [[runs]]")
     return tuple(runs)
 
 
-def _run(table: Mapping[str, Any], place: str) -> RunDeclaration:
+def _run(table: Mapping[str, Any], place: str, channels: Sequence[str]) -> RunDeclaration:
     label = get_value(table, "label", str, "a name in quotes", run=place)
     check_keys(table, _RUN, label)
 
@@ -259,17 +267,95 @@ def _run(table: Mapping[str, Any], place: str) -> RunDeclaration:
         frequency=number("frequency", positive=True),
         group=text("group", default=""),
         role=_one_of(text("role", default="fit"), ROLES, "role", label),
-        time=text("time", default=None),
+        time=None if "time" not in table else column_name(table["time"], "time", label),
         sample_rate=number("sample_rate", positive=True),
         start=number("start"),
         stop=number("stop"),
         mask=read_stretches(table.get("mask", []), label, FILE),
         delimiter=text("delimiter", default=None),
         header_delimiter=text("header_delimiter", default=None),
+        encoding=text("encoding", default=None),
+        time_unit=text("time_unit", default=None),
+        rows=_rows(table.get("rows"), label),
+        segment=_segment(table.get("segment"), label),
+        columns=_run_columns(table.get("columns", {}), label, channels),
         **_conditions(table, label),
     )
     _check_consistent(run)
     return run
+
+
+def column_name(value: Any, key: str, run: str | None = None) -> str:
+    """Name of a column; a whole number counts columns of a file without names, from one."""
+    if (isinstance(value, str) and value) or (type(value) is int and value > 0):
+        return str(value)
+    raise CampaignError(
+        "is no column",
+        file=FILE,
+        run=run,
+        key=key,
+        value=value,
+        hint="write its name in quotes, or its number where the file has no names",
+    )
+
+
+def _rows(value: Any, run: str) -> tuple[int, int] | None:
+    """First and last row of values, from one, both included."""
+    if value is None:
+        return None
+    whole = isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)
+    if not whole or not 1 <= value[0] < value[1]:
+        raise CampaignError(
+            "must be the first and the last row",
+            file=FILE,
+            run=run,
+            key="rows",
+            value=value,
+            hint="write rows = [1, 5000]; rows of values are counted from 1",
+        )
+    return value[0], value[1]
+
+
+def _segment(value: Any, run: str) -> int | tuple[str, float] | None:
+    """A part between restarts of time, counted from one, or a column and its value."""
+    if value is None or (type(value) is int and value > 0):
+        return value
+    if isinstance(value, Mapping) and set(value) == {"column", "value"}:
+        number = value["value"]
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            return column_name(value["column"], "segment.column", run), float(number)
+    raise CampaignError(
+        "is no part of a file",
+        file=FILE,
+        run=run,
+        key="segment",
+        value=value,
+        hint="write segment = 2 for the part after time first starts anew, or "
+        'segment = { column = "run", value = 2 }',
+    )
+
+
+def _run_columns(table: Any, run: str, channels: Sequence[str]) -> dict[str, str]:
+    """Columns of a run that differ from those of its channels."""
+    if not isinstance(table, Mapping):
+        raise CampaignError(
+            "is no table",
+            file=FILE,
+            run=run,
+            key="columns",
+            value=table,
+            hint='write columns = { force = "force 2" }',
+        )
+    for name in table:
+        if name not in channels:
+            raise CampaignError(
+                "no such channel",
+                file=FILE,
+                run=run,
+                key=f"columns.{name}",
+                hint=choose(name, channels),
+            )
+    return {name: column_name(value, f"columns.{name}", run) for name, value in table.items()}
 
 
 def _one_of(value: str, allowed: Sequence[str], key: str, run: str) -> str:
@@ -298,6 +384,15 @@ def _check_consistent(run: RunDeclaration) -> None:
             run.sample_rate,
             "leave one out",
         )
+    elif run.time_unit is not None and run.time_unit not in TIME_UNITS:
+        problem = (
+            "is no unit of time",
+            "time_unit",
+            run.time_unit,
+            f"write one of: {', '.join(TIME_UNITS)}",
+        )
+    elif run.rows is not None and run.segment is not None:
+        problem = ("rows and segment are both given", "segment", run.segment, "leave one out")
     elif run.start is not None and run.stop is not None and run.stop <= run.start:
         problem = ("stop is not after start", "stop", run.stop, "write both in seconds")
     if problem is not None:
@@ -389,6 +484,7 @@ class Declaration:
     description: str
     controlled: str | None
     dataset: str | None
+    outside_files: bool
     channels: Mapping[str, Channel]
     runs: tuple[RunDeclaration, ...]
     rig: Mapping[str, tuple[float, float]]
@@ -425,7 +521,18 @@ def read_declaration(path: Path) -> Declaration:
     channels = _channels(
         get_value(table, "channels", dict, "a table [channels.<name>] for each channel")
     )
-    runs = read_runs(get_value(table, "runs", list, "a table [[runs]] for each run"))
+    runs = read_runs(
+        get_value(table, "runs", list, "a table [[runs]] for each run"), list(channels)
+    )
+    outside = table.get("outside_files", False)
+    if not isinstance(outside, bool):
+        raise CampaignError(
+            "wrong kind of value",
+            file=FILE,
+            key="outside_files",
+            value=outside,
+            hint="write true or false, without quotes",
+        )
     controlled = get_value(table, "controlled", str, "a channel's name", default=None)
     if controlled is not None and controlled not in channels:
         raise CampaignError(
@@ -440,6 +547,7 @@ def read_declaration(path: Path) -> Declaration:
         description=get_value(table, "description", str, "text in quotes", default=""),
         controlled=controlled,
         dataset=get_value(table, "dataset", str, "a registered set's name", default=None),
+        outside_files=outside,
         channels=channels,
         runs=runs,
         rig=read_rig(table.get("rig", {}), FILE),
@@ -454,6 +562,12 @@ def _channels(tables: Mapping[str, Any]) -> dict[str, Channel]:
     channels = {name: _channel(name, table) for name, table in tables.items()}
     _check_columns(channels)
     return channels
+
+
+def _declared_column(table: Mapping[str, Any], key: str) -> str:
+    if key not in table:
+        raise CampaignError("missing", file=FILE, key=key, hint="write a column of the run files")
+    return column_name(table[key], key)
 
 
 def _check_columns(channels: Mapping[str, Channel]) -> None:
@@ -500,7 +614,7 @@ def _channel(name: str, table: Any) -> Channel:
             raise CampaignError("must not be zero or negative", file=FILE, key=f"{inside}.{key}")
     return Channel(
         name=name,
-        column=get_value(table, f"{inside}.column", str, "a column of the run files"),
+        column=_declared_column(table, f"{inside}.column"),
         unit=unit.name,
         si_unit=unit.si_name,
         scale=scale,

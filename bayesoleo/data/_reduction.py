@@ -16,11 +16,12 @@ import numpy as np
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
-from bayesoleo.data._campaign import CampaignData, Run
+from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import significant_harmonics, within_bandwidth
 from bayesoleo.data._noise import average_on, innovation_noise, periodic_average
 from bayesoleo.data._residual_time_shift import Frequency, find_frequency
+from bayesoleo.data._run_samples import Run
 from bayesoleo.data._sample_quality import (
     bridged,
     masked,

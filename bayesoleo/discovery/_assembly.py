@@ -92,11 +92,14 @@ def assign(records: Sequence[Record]) -> Roles:
         If no run is to be fitted.
     """
     fitted = tuple(record for record in records if record.role == "fit")
-    held_out = tuple(record for record in records if record.role != "fit")
     if not fitted:
         raise CampaignError(
-            "no run has the role fit", hint='write role = "fit" in at least one run'
+            "no run to fit",
+            file="campaign.toml",
+            key="role",
+            hint='give one run or more role = "fit"; only predict does without',
         )
+    held_out = tuple(record for record in records if record.role != "fit")
     if held_out:
         return Roles(fitted, held_out, "declared", f"{len(held_out)} declared hold-out runs")
     if len(fitted) >= 2:

@@ -80,8 +80,8 @@ def test_a_time_column_is_known_by_its_name(make_campaign, name):
     np.testing.assert_allclose(run.time, table()[:, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["time_ms", "stamp"])
-def test_a_time_column_of_another_name_or_unit_has_to_be_declared(make_campaign, name):
+@pytest.mark.parametrize("name", ["clock_ms", "stamp"])
+def test_a_time_column_of_another_name_has_to_be_declared(make_campaign, name):
     with pytest.raises(CampaignError, match=r"no time column; .* write time = '...', or give"):
         load_campaign(make_campaign(header=f"{name},x_mm,f_kN"))
 
@@ -133,7 +133,7 @@ BAD_VALUES = [
     ),
     (table(1.5), r"run a, key frequency: fewer than two periods .*\(got 1.0\)"),
     (
-        changed(1, slice(20, None), np.nan),
+        changed(1, slice(20, -1), np.nan),
         "run a, column x_mm, key delimiter: column is more than half empty",
     ),
 ]
@@ -190,7 +190,6 @@ BAD_TOML = [
         "key kind: unknown kind .*did you mean periodic",
     ),
     ({'kind = "periodic"': 'role = "holdout"'}, "key role: unknown role .*did you mean hold-out"),
-    ({'kind = "periodic"': 'role = "hold-out"'}, "key role: no run to fit"),
     ({'kind = "periodic"': 'kind = "transient"'}, "transient run with a frequency"),
     ({"frequency = 1.0": ""}, "run a, key frequency: periodic run without frequency"),
     ({"frequency = 1.0": "frequency = -1"}, r"key frequency: must be positive \(got -1"),
