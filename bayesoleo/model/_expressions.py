@@ -208,7 +208,7 @@ def parse(
     try:
         tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
-        raise ModelError(f"{where}: not an expression", value=text, hint=hint) from error
+        raise ModelError(f"{where}: not an expression", value=text, hint=_slip(text)) from error
     builder = _Builder({**known}, {**known, **(whole or {})}, tuple(dynamic), where, text)
     built = sp.sympify(builder.visit(tree.body))
     if built.has(sp.nan, sp.zoo, sp.oo, -sp.oo, sp.I):
@@ -223,6 +223,54 @@ _OPERATORS: dict[type[ast.operator], Callable[[sp.Expr, sp.Expr], sp.Expr]] = {
     ast.Div: lambda a, b: a / b,
     ast.Pow: lambda a, b: a**b,
 }
+
+
+_USE = "use + - * / **, numbers, declared names, and functions such as abs or dot"
+_SWITCHED = "write step(x), which is 1 where x > 0 and 0 elsewhere, as a factor"
+_MAY_NOT: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Compare: ("a comparison", _SWITCHED),
+    ast.IfExp: ("if … else", _SWITCHED),
+    ast.BoolOp: ("and, or", _SWITCHED),
+    ast.Not: ("not", _SWITCHED),
+    ast.Mod: ("% (a remainder)", _USE),
+    ast.FloorDiv: ("// (a whole quotient)", "write / for a quotient"),
+    ast.MatMult: ("@", "write * for a product"),
+    ast.BitOr: ("|", "write abs(x) for the modulus of x"),
+    ast.Subscript: ("an index in brackets", "name each quantity by itself"),
+    ast.Attribute: ("a dot between names", "write the name alone, such as sin(x)"),
+    ast.Tuple: ("a comma", "write a decimal point, 0.5, and one expression"),
+    ast.List: ("a list", _USE),
+    ast.Lambda: ("lambda", _USE),
+}
+
+
+def _foreign(node: ast.AST, text: str) -> tuple[str, str]:
+    """What a part of an expression is called that may not stand there, and what to write."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
+        return "^", f"write ** for a power: {text.strip().replace('^', '**')}"
+    if isinstance(node, ast.Constant):
+        return f"{node.value!r}", _USE
+    inner = getattr(node, "op", node)
+    found = _MAY_NOT.get(type(inner), _MAY_NOT.get(type(node)))
+    return found or (f"{ast.unparse(node)}", _USE)
+
+
+def _slip(text: str) -> str:
+    """What to write in place of text that is no Python."""
+    if re.search(r"(?<![=<>!])=(?!=)", text):
+        return "write all of it on one side: the expression is what is zero, k*q - F for k*q = F"
+    power = re.search(r"([\w)]+)([²³])", text)
+    if power:
+        return f"write {power[1]}**{'23'['²³'.index(power[2])]} for {power[0]}"
+    if "|" in text:
+        return "write abs(x) for the modulus of x"
+    missing = re.search(r"(\d)\s*([A-Za-z_]\w*)|([A-Za-z_]\w*|\))\s+([A-Za-z_]\w*|\()", text)
+    if missing:
+        left, right = missing[1] or missing[3], missing[2] or missing[4]
+        return f"a product needs *: write {left}*{right} for {missing[0]}"
+    if text.count("(") != text.count(")"):
+        return f"there are {text.count('(')} ( and {text.count(')')} )"
+    return "write it as in Python, e.g. k*q**3"
 
 
 class _Builder(ast.NodeVisitor):
@@ -240,10 +288,11 @@ class _Builder(ast.NodeVisitor):
         self.where, self.text = where, text
 
     def generic_visit(self, node: ast.AST) -> sp.Expr:
+        what, hint = _foreign(node, self.text)
         raise ModelError(
-            f"{self.where}: {type(node).__name__} has no place in an expression",
+            f"{self.where}: {what} has no place in an expression",
             value=self.text,
-            hint="use + - * / **, numbers, declared names, and functions such as abs or dot",
+            hint=hint,
         )
 
     def visit_Constant(self, node: ast.Constant) -> sp.Expr:
@@ -282,7 +331,7 @@ class _Builder(ast.NodeVisitor):
         if function is None or not callable(function) or node.keywords:
             allowed = ", ".join(sorted(FUNCTIONS))
             raise ModelError(
-                f"{self.where}: unknown function {name or '?'}",
+                f"{self.where}: unknown function {name or ast.unparse(node.func)}",
                 value=self.text,
                 hint=f"there are dot, ddot, {allowed}",
             )

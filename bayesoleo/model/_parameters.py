@@ -117,11 +117,26 @@ class Parameter:
 
     def _stated_prior(self) -> Prior | None:
         spread = self.sd
+        for key, example in (
+            ("sd", f"sd={0.1 * abs(self.value) or 1:g}"),
+            ("relative_sd", "relative_sd=0.1"),
+        ):
+            stated = getattr(self, key)
+            if stated is not None and not (np.isfinite(stated) and stated > 0):
+                raise ModelError(
+                    "must be positive: it is the width of a prior",
+                    key=key,
+                    value=stated,
+                    hint=f"write {example}, say, or fixed=True without it for a constant",
+                )
         if self.relative_sd is not None:
             spread = self.relative_sd * abs(self.value)
             if spread == 0:
                 raise ModelError(
-                    "relative_sd of a value of zero is no prior", hint="write sd=… instead"
+                    "is relative to a value of zero, and so no prior",
+                    key="relative_sd",
+                    value=self.relative_sd,
+                    hint="write sd=…, in the unit of the parameter, instead",
                 )
         if spread is None:
             return None if self.bounds is None else Uniform(*self.bounds)
