@@ -19,6 +19,7 @@ from bayesoleo.errors import InputError, UnfinishedError
 if TYPE_CHECKING:
     import xarray as xr
 
+    from bayesoleo._workflow.first_look import Started
     from bayesoleo.model._model import Model
 
 
@@ -142,13 +143,76 @@ def _limit(text: str) -> tuple[str, tuple[float, float]]:
     return name.strip(), to_limit(name.strip(), low, high, unit, "--limit")
 
 
+def init(
+    folder: Annotated[Path, options.argument("FOLDER", "Folder with the files of the runs.")],
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Look at a folder of measurements; write campaign.toml and a model to start from.
+
+    Columns, units, times, sampling rates, runs and frequencies are read off the files, whatever
+    their format. What the files do not say is marked with TO FILL IN in campaign.toml, and listed.
+    Nothing is overwritten.
+
+    \b
+    Written to FOLDER:
+      campaign.toml   what the files hold, with comments; it loads as it is
+      model.py        a linear model to start from
+      channels.png    each channel of the first runs over time
+
+    \b
+    Examples:
+      bayesoleo init measurements
+      bayesoleo init measurements --json
+    """
+    from bayesoleo._workflow.first_look import sparkline, start_campaign
+
+    found = start_campaign(
+        folder, progress=shell.progress_shown(quiet), callback=shell.teller(quiet or as_json)
+    )
+    if as_json:
+        facts = {"written": found.written, "kept": found.kept, "to_fill_in": found.questions}
+        shell.print_json({**facts, "notes": found.notes})
+        return
+    run = found.campaign.runs[0]
+    units = found.campaign.units
+    rows = [
+        [name, f"{v.min():.4g}", f"{v.max():.4g}", units[name] or "1", sparkline(v)]
+        for name, v in run.samples.items()
+    ]
+    console = shell.console()
+    head = ["channel", "lowest", "highest", "unit", f"run {run.label}"]
+    console.print(shell.table(head, rows))
+    rows = [
+        [one.label, one.kind, one.frequency, one.time.size, 1 / one.time_step, one.role]
+        for one in found.campaign.runs
+    ]
+    console.print()
+    console.print(shell.table(["run", "kind", "Hz", "samples", "rate [Hz]", "role"], rows, 2))
+    console.print()
+    _tell_start(found, folder)
+
+
+def _tell_start(found: Started, folder: Path) -> None:
+    """What was left out, what is to be filled in, and what comes next."""
+    for note in found.notes:
+        shell.say(f"note      {note}")
+    for question in found.questions:
+        shell.say(f"fill in   {question}")
+    for path in found.written:
+        shell.say(f"written   {path}")
+    for path in found.kept:
+        shell.say(f"kept      {path} was there and is as it was")
+    shell.say(f"next      bayesoleo check {folder} --model {folder / 'model.py'}:model")
+
+
 DEMO_SYSTEM = "f16n2d2"
 FILES = {"report": "report.html", "result": "results.nc", "summary": "summary.json"}
 
 
 def add_loop(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    shell.add(app, PANEL, demo, close, check)
+    shell.add(app, PANEL, demo, init, close, check)
 
 
 @options.of_settings("seed", "jobs")

@@ -308,7 +308,7 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
     found += [
         f"{where}{item.channel} is cut off at its {item.end} value, {item.value:.4g}"
         f"{_unit(units, item.channel)}, for {100 * item.share:.2g} % of the samples; "
-        f"{_about_the_cut(item.channel)}"
+        + _about_the_cut(item.channel)
         for item in clipped(record)
     ]
     for channel, step in coarse_steps(record).items():
@@ -331,8 +331,9 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
 def _about_the_cut(channel: str) -> str:
     """What a record that is cut off may mean: the sensor ends there, or the system does."""
     return (
-        f"if the sensor of {channel} ends there, mask these stretches; if {channel} itself does, as "
-        "a tank that overflows or a part that reaches a stop, the record shows the effect: keep it"
+        f"if the sensor of {channel} ends there, mask these stretches; if {channel} itself does, "
+        "as a tank that overflows or a part that reaches a stop, the record shows the effect: keep "
+        "it"
     )
 
 

@@ -44,6 +44,7 @@ def read_file(
     wanted: Collection[str] | None = None,
     encoding: str | None = None,
     progress: bool = False,
+    every: bool = False,
 ) -> FileColumns:
     """Read a run file.
 
@@ -57,6 +58,8 @@ def read_file(
         Columns that must be numbers; what others hold does not matter. All, by default.
     progress : bool, optional
         Whether to show a bar after two seconds.
+    every : bool, optional
+        Whether to read other columns as well, those of text left out.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def read_file(
         )
     reader = READERS.get(suffix)
     if reader is None:
-        return read_text(path, delimiter, header_delimiter, wanted, encoding, progress)
+        return read_text(path, delimiter, header_delimiter, wanted, encoding, progress, every)
     try:
         found = reader(path)
     except (CampaignError, MissingExtraError):

@@ -44,6 +44,7 @@ def read_text(
     wanted: Collection[str] | None = None,
     encoding: str | None = None,
     progress: bool = False,
+    every: bool = False,
 ) -> FileColumns:
     """Read a delimited text file.
 
@@ -60,6 +61,8 @@ def read_text(
         Found from the file by default.
     progress : bool, optional
         Whether to show a bar after two seconds.
+    every : bool, optional
+        Whether to read the other columns as well, those of text left out.
 
     Returns
     -------
@@ -76,7 +79,7 @@ def read_text(
     read = [
         k
         for k, name in enumerate(names)
-        if name and (wanted is None or name in wanted or is_time(name))
+        if name and (every or wanted is None or name in wanted or is_time(name))
     ]
     columns, clocks = _read_values(path, layout, {k: names[k] for k in read}, wanted, progress)
     _check_filled(path, columns, layout.delimiter, wanted)

@@ -50,9 +50,9 @@ def test_what_is_wrong_is_named(changes, message):
     [
         ({"value": float("nan")}, "finite value"),
         ({"value": 1.0, "sd": 1.0, "relative_sd": 0.1}, "prior stated twice"),
-        ({"value": 0.0, "relative_sd": 0.1}, "value of zero is no prior"),
+        ({"value": 0.0, "relative_sd": 0.1}, "key relative_sd: is relative to a value of zero"),
         ({"value": 3.0, "bounds": (0.0, 2.0)}, "bounds exclude the start.*between 0 and 2"),
-        ({"value": 1.0, "sd": -1.0}, "positive, finite standard deviation"),
+        ({"value": 1.0, "sd": -1.0}, "key sd: must be positive"),
         ({"value": 1.0, "bounds": (2.0, 0.0)}, "low < high"),
     ],
 )
