@@ -204,6 +204,7 @@ def replicate(
     ] = False,
     *,
     chosen: Settings,
+    as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Repeat an experiment by simulation and compare the scatter of the estimates with theory.
@@ -247,9 +248,13 @@ def replicate(
             scheduler=chosen.scheduler,
             progress=shell.progress_shown(quiet),
         )
-    shell.say(found)
+    if as_json:
+        shell.print_json(found.data.drop_dims("replication", errors="ignore").to_dict())
+    else:
+        shell.say(found)
     if out is not None:
         groups = {schema.SAMPLING_DISTRIBUTION: found.data}
         about = {schema.COMMAND: chosen.command, schema.MODEL: fit.model.name}
         shell.write_groups(groups, out / REPLICATIONS, chosen.seed, **about)
-        shell.say(f"result    {out / REPLICATIONS}")
+        if not as_json:
+            shell.say(f"result    {out / REPLICATIONS}")

@@ -231,6 +231,7 @@ def demo(
             help="Draw to the effective size that close asks for; takes longer.",
         ),
     ] = False,
+    as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Simulate a campaign with an effect that the fitted model lacks; close the loop on it.
@@ -259,7 +260,7 @@ def demo(
     with shell.stoppable(out, quiet) as told:
         told["callback"]("simulating a shaker campaign of an oleo")
         campaign = _fresh_campaign(out, chosen.seed, demo_campaign)
-        _closed(campaign, load_model(DEMO_SYSTEM), chosen, out, told)
+        _closed(campaign, load_model(DEMO_SYSTEM), chosen, out, told, as_json)
 
 
 def _fresh_campaign(out: Path, seed: int, make: Callable[[Path, int], Path]) -> Path:
@@ -293,6 +294,7 @@ def close(
     out: options.Out = None,
     *,
     chosen: Settings,
+    as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Close the loop: estimate, find what is missing, add it, compare before and after.
@@ -320,11 +322,16 @@ def close(
 
     folder = shell.output_folder(out, campaign)
     with shell.stoppable(folder, quiet) as told:
-        _closed(campaign, load_model(model), chosen, folder, told)
+        _closed(campaign, load_model(model), chosen, folder, told, as_json)
 
 
 def _closed(
-    campaign: Path, model: Model, chosen: Settings, folder: Path, told: Mapping[str, Any]
+    campaign: Path,
+    model: Model,
+    chosen: Settings,
+    folder: Path,
+    told: Mapping[str, Any],
+    as_json: bool,
 ) -> None:
     """Close the loop and print what came out, also where a late stage failed."""
     from bayesoleo import _workflow as workflow
@@ -332,9 +339,9 @@ def _closed(
     try:
         tree = workflow.close(campaign, model, chosen, out=folder, **told)
     except UnfinishedError as error:
-        _print_loop(error.tree, folder)
+        _print_loop(error.tree, folder, as_json)
         raise
-    _print_loop(tree, folder)
+    _print_loop(tree, folder, as_json)
 
 
 @options.of_settings(*options.SOLVED, "nuisance", "disturbances", "without")
@@ -370,11 +377,14 @@ def check(
         console.print(sentence, style="dim", markup=False, soft_wrap=True)
 
 
-def _print_loop(tree: xr.DataTree, folder: Path) -> None:
-    """The result in a few lines, and where it was written."""
+def _print_loop(tree: xr.DataTree, folder: Path, as_json: bool) -> None:
+    """The result in a few lines, or as in summary.json, and where it was written."""
     from bayesoleo._report.terminal import print_summary
 
     summary = json.loads(tree.attrs[schema.SUMMARY])
     written = {what: folder / name for what, name in FILES.items()}
     present = {what: str(path) for what, path in written.items() if path.exists()}
+    if as_json:
+        shell.print_json({**summary, "files": present})
+        return
     print_summary({**summary, "files": present}, shell.console())

@@ -190,6 +190,7 @@ def report(
             shown="report.html beside the result",
         ),
     ] = None,
+    as_json: options.Json = False,
 ) -> None:
     """Write the report of a result of close or trace again: one self-contained page.
 
@@ -208,7 +209,7 @@ def report(
         raise InputError("is a folder", file=page, hint="give another file or folder with --out")
     shell.check_writable(page.parent)
     _write_page(tree, page, page.parent.resolve() == results.parent.resolve())
-    shell.say(f"report    {page}")
+    _say_written("report", page, as_json)
 
 
 def _write_page(tree: xr.DataTree, page: Path, beside: bool) -> None:
@@ -271,6 +272,7 @@ def simulate(
     ] = None,
     *,
     chosen: Settings,
+    as_json: options.Json = False,
 ) -> None:
     """Simulate a campaign with a model, or with the model and posterior of a result.
 
@@ -312,7 +314,14 @@ def simulate(
         folder = workflow.simulate(
             made_from, like, chosen, out=out, values=changed, draws=draws, **more
         )
-    shell.say(f"campaign  {folder}")
+    _say_written("campaign", folder, as_json)
+
+
+def _say_written(what: str, path: Path, as_json: bool) -> None:
+    if as_json:
+        shell.print_json({what: path})
+    else:
+        shell.say(f"{what:<10}{path}")
 
 
 def pairs(texts: list[str], option: str) -> dict[str, float]:

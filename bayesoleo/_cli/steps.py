@@ -210,6 +210,7 @@ def sample(
     out: options.Out = None,
     *,
     chosen: Settings,
+    as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Sample the posterior from the estimate until the effective size asked for is reached.
@@ -236,6 +237,10 @@ def sample(
         tree = workflow.sample(campaign, load_model(model), chosen, out=folder, **told)
     console = shell.console()
     summary = Posterior(tree).summary()
+    if as_json:
+        written = str(folder / shell.RESULTS)
+        shell.print_json({**summary.data.to_dict(), "files": {"result": written}})
+        return
     shell.say(summary)
     if summary.data.attrs["warning"]:
         shell.complain(f"warning: {summary.data.attrs['warning']}")
@@ -258,6 +263,7 @@ def trace(
     out: options.Out = None,
     *,
     chosen: Settings,
+    as_json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Hold the residual against its noise and rank what may be missing; add nothing.
@@ -282,6 +288,10 @@ def trace(
     with shell.stoppable(out, quiet) as told:
         tree = workflow.trace(campaign, load_model(model), chosen, out=out, **told)
     summary = json.loads(tree.attrs[schema.SUMMARY])
+    if as_json:
+        written = {} if out is None else {"result": str(out / shell.RESULTS)}
+        shell.print_json({**summary, "files": written})
+        return
     console = shell.console()
     first = summary["rounds"][0]
     if first["candidates"]:

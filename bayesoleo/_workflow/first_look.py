@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -64,6 +64,10 @@ _FEWEST, _MOST = 20, 24
 #: Correlation of a record with itself, a period later, that counts as periodic; how nearly the
 #: best a shorter period has to be; and the ratio of sizes, first to last third, of a decay.
 _REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.4
+#: Of a time column whose name does not tell.
+_EVEN = f"{TO_FILL_IN}: it increases evenly, and is taken for time in s; time_unit states another"
+#: Units of mass that stand for forces.
+_AS_FORCE = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "g": "gf", "t": "tf"}
 #: Samples that a frequency is guessed from.
 _LOOKED_AT = 200_000
 
@@ -250,9 +254,23 @@ def _timed(file: str, table: FileColumns) -> LookedAt:
             source = f"column {name}" + (f", in {unit}" if unit in TIME_UNITS else ", taken as s")
             return LookedAt(file, table, name, seconds, None, source)
     rate, source = _stated_rate(table)
+    even = None if rate and "states" in source else _even_column(table)
+    if even is not None:
+        return LookedAt(file, table, even, table.columns[even], None, _EVEN)
     sizes = [values.size for values in table.columns.values()]
     size = max(set(sizes), key=lambda n: (sizes.count(n), n))
     return LookedAt(file, table, None, np.arange(size) / (rate or 1.0), rate, source)
+
+
+def _even_column(table: FileColumns) -> str | None:
+    """A column that increases by equal steps, and does not merely count samples."""
+    for name, values in table.columns.items():
+        steps = np.diff(values)
+        if values.size < _FEWEST or not np.all(steps > 0):
+            continue
+        if np.ptp(steps) < 0.02 * np.median(steps) and not np.allclose(steps, 1.0):
+            return name
+    return None
 
 
 def _increases(values: Array) -> bool:
@@ -289,6 +307,8 @@ def _alike(looks: list[LookedAt], notes: list[str]) -> list[LookedAt]:
 def _channels(looks: Sequence[LookedAt], notes: list[str]) -> tuple[GuessedChannel, ...]:
     """Channels: columns that vary in every file, with as many samples as there are times."""
     first = looks[0]
+    kinds = [_unit_of(c, first.table)[3] for c in first.table.columns if not _no_channel(c, looks)]
+    alone = {kind for kind in kinds if kinds.count(kind) == 1}
     found: list[GuessedChannel] = []
     for column in first.table.columns:
         reason = _no_channel(column, looks)
@@ -296,7 +316,7 @@ def _channels(looks: Sequence[LookedAt], notes: list[str]) -> tuple[GuessedChann
             if column != first.time and f"from {column} =" not in first.source:
                 notes.append(f"column {column} was left out: {reason}")
         elif len(found) < _MOST:
-            found.append(_channel(column, first.table, {one.name for one in found}))
+            found.append(_channel(column, first.table, [one.name for one in found], alone))
         else:
             notes.append(f"column {column} was left out: there are {_MOST} channels already")
     if not found:
@@ -322,23 +342,33 @@ def _no_channel(column: str, looks: Sequence[LookedAt]) -> str:
     return ""
 
 
-def _channel(column: str, table: FileColumns, taken: set[str]) -> GuessedChannel:
+def _unit_of(column: str, table: FileColumns) -> tuple[str, str, bool, str]:
+    """Unit, what it follows from, whether it is known, and the quantity that it measures."""
     stated = table.units.get(column)
-    unit, why = (stated, "as the file states") if stated else (unit_in_name(column), "")
-    why = why or f"from the column's name {column}"
+    unit = stated or unit_in_name(column) or ""
+    why = "as the file states" if stated else f"from the column's name {column}"
     word = next((w for w in _WORDS if w[0].search(_bare_name(column))), None)
-    known = unit is not None and _parses(unit)
-    if not known:
-        unit = word[2] if word else "1"
-        why = f"{TO_FILL_IN}: the file does not say the unit of {column}"
-        why += f"; {unit} is assumed" if word else ""
-    si = parse_unit(str(unit)).si_name
-    name = _QUANTITIES.get(si) or (word[1] if word and not known else "") or _identifier(column)
-    if name in taken:
-        name = _identifier(column)
-    while name in taken or not _fits(name, str(unit)):
+    if unit and word and word[1] == "force" and unit in _AS_FORCE:
+        guess = _AS_FORCE[unit]
+        why = f"{TO_FILL_IN}: {unit} is a mass; {guess} is assumed"
+        return guess, why, False, "force"
+    if unit and _parses(unit):
+        return unit, why, True, _QUANTITIES.get(parse_unit(unit).si_name, "")
+    why = f"{TO_FILL_IN}: the file does not say the unit of {column}"
+    if word is None:
+        return "1", why, False, ""
+    return word[2], f"{why}; {word[2]} is assumed", False, word[1]
+
+
+def _channel(
+    column: str, table: FileColumns, taken: Sequence[str], alone: Collection[str]
+) -> GuessedChannel:
+    """A channel; it has the name of its quantity where it is the only one of its kind."""
+    unit, why, known, quantity = _unit_of(column, table)
+    name = quantity if quantity in alone and quantity else _identifier(column)
+    while name in taken or not _fits(name, unit):
         name += "_signal" if name not in taken else "_2"
-    return GuessedChannel(name, column, str(unit), why, known)
+    return GuessedChannel(name, column, unit, why, known)
 
 
 def _parses(unit: str) -> bool:
@@ -361,7 +391,7 @@ def _fits(name: str, unit: str) -> bool:
 def _bare_name(column: str) -> str:
     """A column's name without group, brackets and unit."""
     last = re.split(r"[/.]", column)[-1] if not re.search(r"[\[(]", column) else column
-    last = re.sub(r"[\[(][^\])]*[\])]", "", last).strip()
+    last = re.sub(r"[\[(][^\]):]*[\])]", "", last).strip()
     unit = unit_in_name(column)
     return re.sub(rf"[ _/]{re.escape(unit)}$", "", last) if unit else last
 
@@ -434,10 +464,10 @@ def guess_frequency(values: Array, seconds: Array) -> float | None:
     best = float(alike[first:].max())
     if best < _REPEATS:
         return None
-    peaks = first + np.flatnonzero(alike[first:] >= _NEARLY * best)
-    lag = int(peaks[0])
-    while lag + 1 < alike.size and alike[lag + 1] > alike[lag]:
-        lag += 1
+    start = first + int(np.flatnonzero(alike[first:] >= _NEARLY * best)[0])
+    lower = np.flatnonzero(alike[start:] < 0.9 * best)
+    end = start + int(lower[0]) if lower.size else alike.size
+    lag = start + int(np.argmax(alike[start:end]))
     thirds = [float(np.std(part)) for part in np.array_split(values[0] - values[0].mean(), 3)]
     if lag < 4 or thirds[0] > _DECAY * thirds[2] or thirds[2] > _DECAY * thirds[0]:
         return None
@@ -523,6 +553,8 @@ def _questions(draft: _Draft) -> list[str]:
         for c in draft.channels
         if not c.known
     ]
+    if any(run.look.source == _EVEN for run in draft.runs):
+        found.append(f"time: column {draft.runs[0].look.time} is taken for time in seconds")
     unknown = [run.label for run in draft.runs if run.look.time is None and run.look.rate is None]
     if unknown:
         found.append(f"sample_rate of run {', '.join(unknown[:4])}: 1.0 Hz stands there now")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from bayesoleo.effects._effect import Effect
 
 RUNNING, SOLVING = "How it is run", "How the model is solved"
+ERRORS, MISSING = "What is assumed about errors", "What may be missing"
 SCHEMES = ("radau2", "radau3", "gauss2", "gauss3", "thesis")
 DISTURBANCES = ("drift", "tone", "tails")
 SOLVERS = ("collocation", "adaptive", "shooting", "hybrid", "library")
@@ -199,7 +200,7 @@ _PRIOR_OPTION = SettingOption(
     str | None,
     "Prior probabilities that nothing is missing, that effects of the catalogue are, and that only"
     " something outside of it is. Parts that are left out share the rest.",
-    RUNNING,
+    MISSING,
     None,
     _read_prior,
     {
@@ -288,26 +289,26 @@ class Settings:
         min=8, metavar="N", show_default="refined until the estimate stays",
     )  # fmt: skip
     max_effects: int = _setting(
-        4, int, RUNNING, "Add at most this many effects.", min=0, metavar="N"
+        4, int, MISSING, "Add at most this many effects.", min=0, metavar="N"
     )
     drive: str | None = _setting(
         None, str | None, SOLVING, "Channel that drives the model; 'model' keeps its own inputs.",
         metavar="CHANNEL|model", show_default="what the campaign says is controlled",
     )  # fmt: skip
     effects: tuple[Effect, ...] | None = _setting(
-        None, str | None, RUNNING,
+        None, str | None, MISSING,
         "Effects of your own, one or a list, besides the built-in ones. A file is code.",
         read=_effects, metavar="FILE.py:OBJECT", show_default=False,
     )  # fmt: skip
     command: str = ""
     nuisance: tuple[str, ...] = _setting(
-        (), str, SOLVING,
+        (), str, ERRORS,
         "Estimate within declared tolerances: conditions (sd), sensors' offset and gain "
         "(accuracy).",
         read=words, metavar="conditions,offset,gain", show_default=False,
     )  # fmt: skip
     error_model: str = _setting(
-        "auto", str, SOLVING,
+        "auto", str, ERRORS,
         "What errors have in common: independent (one variance an output), per-run, full "
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
         "shared-discrepancy (and is partly alike in all runs), catalogue (all effects that the "
@@ -316,7 +317,7 @@ class Settings:
         metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(
-        (), str, SOLVING,
+        (), str, ERRORS,
         "Parameters that scatter between runs: mean and spread are estimated with them.",
         read=words, metavar="NAME,…", show_default=False,
     )  # fmt: skip
@@ -327,7 +328,7 @@ class Settings:
         metavar="ADDRESS|local:N", show_default="threads of this process",
     )  # fmt: skip
     without: tuple[str, ...] = _setting(
-        (), str, RUNNING,
+        (), str, MISSING,
         "Effects to leave out of the search; 'nonparametric' leaves out smooth functions.",
         read=words, metavar="EFFECT,…", show_default=False,
     )  # fmt: skip
@@ -336,13 +337,13 @@ class Settings:
         metavar="NAME",
     )  # fmt: skip
     disturbances: tuple[str, ...] = _setting(
-        DISTURBANCES, str, SOLVING,
+        DISTURBANCES, str, ERRORS,
         "What is no physics and is removed from the outputs of periodic runs where it is found: "
         "drift, tone (no harmonic), tails (outliers); 'none' for nothing.",
         read=_disturbances, metavar="drift,tone,tails",
     )  # fmt: skip
     next_run: str = _setting(
-        "structures", str, RUNNING,
+        "structures", str, MISSING,
         "What the next run is proposed for: structures (which one is true), parameters (all more "
         "precise), or the name of one parameter.",
         metavar="structures|parameters|NAME",

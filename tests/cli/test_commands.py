@@ -25,7 +25,7 @@ COMMANDS = tuple(typer.main.get_command(app).commands)
 def test_the_commands_are_these():
     expected = {"demo", "close", "check", "reduce", "estimate", "sample", "trace"}
     expected |= {"simulate", "report", "systems", "effects", "assess", "replicate", "predict"}
-    expected |= {"propose"}
+    expected |= {"propose", "init"}
     assert set(COMMANDS) == expected
 
 
@@ -35,6 +35,14 @@ def test_help_has_an_example(run, command):
     assert result.exit_code == 0
     assert "Examples:" in result.stdout
     assert f"bayesoleo {command}" in result.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_prints_json(command):
+    names = [
+        flag for one in typer.main.get_command(app).commands[command].params for flag in one.opts
+    ]
+    assert "--json" in names
 
 
 def test_help_of_all(run):

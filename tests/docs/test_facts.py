@@ -74,6 +74,13 @@ def test_the_table_of_effects_holds_every_one_with_formula_scan_and_source(monke
         assert source == effect.source
 
 
+def test_every_option_is_described_as_help_does(monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    import command_options
+
+    assert command_options.written(page("command-line.md")) == page("command-line.md")
+
+
 def test_every_command_is_described() -> None:
     cli = pytest.importorskip("bayesoleo._cli")
     import typer.main
