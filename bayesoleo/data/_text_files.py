@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -183,7 +183,7 @@ def _parts(
     )
     for part in reader:
         yield part
-        bar.update(max(0, stream.buffer.tell() - bar.n))
+        bar.update(max(0, cast(Any, stream.buffer).tell() - bar.n))
 
 
 def _width_with_remarks(path: Path, layout: Layout) -> int | None:

@@ -300,6 +300,9 @@ def uff(path: Path, binary: int = 0) -> None:
             z_axis_spec_data_type=0,
             return_full_dict=True,
         )
+        if binary:
+            record |= {"byte_ordering": 1, "fp_format": 2, "n_ascii_lines": 11}
+            record["n_bytes"] = 8 * values.size
         record = {key: item for key, item in record.items() if item is not None}
         file.write_sets(record, "add" if number > 1 else "overwrite")
 
