@@ -270,7 +270,7 @@ def tdms(groups: int, waveform: bool) -> Callable[[Path], None]:
 def uff(path: Path, binary: int = 0) -> None:
     import pyuff
 
-    file = pyuff.UFF(str(path))
+    file, found = pyuff.UFF(str(path)), []
     for number, (name, values, unit) in enumerate((("x", MOTION, "mm"), ("F", FORCE, "kN")), 1):
         record = pyuff.prepare_58(
             binary=binary,
@@ -304,7 +304,8 @@ def uff(path: Path, binary: int = 0) -> None:
             record |= {"byte_ordering": 1, "fp_format": 2, "n_ascii_lines": 11}
             record["n_bytes"] = 8 * values.size
         record = {key: item for key, item in record.items() if item is not None}
-        file.write_sets(record, "add" if number > 1 else "overwrite")
+        found.append(record)
+    file.write_sets(found, "overwrite")
 
 
 def wav(dtype: str) -> Callable[[Path], None]:

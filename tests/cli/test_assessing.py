@@ -88,6 +88,13 @@ def test_unused_run_is_predicted_and_scored(run, campaign, model, tmp_path):
     assert (tmp_path / "bands-displacement.png").stat().st_size > 10_000
     numbers = json.loads(run(*arguments, "--json").stdout)["data_vars"]
     assert numbers["coverage"]["data"][0][0] == pytest.approx(0.95, abs=0.03)
+    toml = campaign / "campaign.toml"
+    toml.write_text(toml.read_text().replace('role = "fit"', 'role = "hold-out"'))
+    alone = json.loads(run(*arguments, "--json").stdout)["data_vars"]
+    assert alone["rms"] == numbers["rms"]  # no run to fit is needed
+    refused = run("estimate", campaign, "--model", model)
+    assert refused.exit_code == 2
+    assert 'key role: no run to fit; give one run or more role = "fit"' in refused.stderr
     refused = run(*arguments[:-3], "slaw")
     assert refused.exit_code == 2
     assert "no such run" in refused.stderr
