@@ -165,7 +165,8 @@ def init(
       bayesoleo init measurements
       bayesoleo init measurements --json
     """
-    from bayesoleo._workflow.first_look import sparkline, start_campaign
+    from bayesoleo._report.terminal import sparkline
+    from bayesoleo._workflow.first_look import start_campaign
 
     found = start_campaign(
         folder, progress=shell.progress_shown(quiet), callback=shell.teller(quiet or as_json)
@@ -183,12 +184,12 @@ def init(
     console = shell.console()
     head = ["channel", "lowest", "highest", "unit", f"run {run.label}"]
     console.print(shell.table(head, rows))
-    rows = [
+    declared: list[list[Any]] = [
         [one.label, one.kind, one.frequency, one.time.size, 1 / one.time_step, one.role]
         for one in found.campaign.runs
     ]
     console.print()
-    console.print(shell.table(["run", "kind", "Hz", "samples", "rate [Hz]", "role"], rows, 2))
+    console.print(shell.table(["run", "kind", "Hz", "samples", "rate [Hz]", "role"], declared, 2))
     console.print()
     _tell_start(found, folder)
 

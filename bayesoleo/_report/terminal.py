@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -15,6 +16,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._report import sentences, structures, tables
 from bayesoleo._report.structures import proposal_lines
 from bayesoleo._storage.files import write_text_atomic
+from bayesoleo._types import Array
 from bayesoleo.effects._catalogue import called, listed
 from bayesoleo.plots._discovery import chosen, format_p, name
 
@@ -150,3 +152,19 @@ def _accepted(number: int, entry: Mapping[str, Any], titles: Mapping[str, str]) 
         first = f"{called(near[0]['effect'], titles)} (cosine {near[0]['cosine']:.2f})"
         text.append(f"; it has no name, and is most like {first}", style="dim")
     return text
+
+
+def sparkline(values: Array, width: int = 48) -> str:
+    """A record as a line of blocks, for a terminal.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    width : int, optional
+        Characters.
+    """
+    blocks = "▁▂▃▄▅▆▇█"
+    parts = np.array_split(values, min(width, values.size))
+    means = np.array([float(np.mean(part)) for part in parts])
+    span = float(np.ptp(means)) or 1.0
+    return "".join(blocks[round(7 * (m - means.min()) / span)] for m in means)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,11 +18,12 @@ import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo._units import check_kind, parse_unit
+from bayesoleo._workflow.model_files import write_first_model
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._campaign_toml import FILE
 from bayesoleo.data._files import read_file
 from bayesoleo.data._reduction import reduce_campaign
-from bayesoleo.data._run_samples import is_uneven
+from bayesoleo.data._residual_time_shift import guess_frequency
 from bayesoleo.data._text_layout import (
     TIME_UNITS,
     FileColumns,
@@ -61,15 +62,10 @@ _WORDS = (
 )
 #: Samples that a run has at least, and columns that are taken for channels at most.
 _FEWEST, _MOST = 20, 24
-#: Correlation of a record with itself, a period later, that counts as periodic; how nearly the
-#: best a shorter period has to be; and the ratio of sizes, first to last third, of a decay.
-_REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.4
 #: Of a time column whose name does not tell.
 _EVEN = f"{TO_FILL_IN}: it increases evenly, and is taken for time in s; time_unit states another"
 #: Units of mass that stand for forces.
 _AS_FORCE = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "g": "gf", "t": "tf"}
-#: Samples that a frequency is guessed from.
-_LOOKED_AT = 200_000
 
 
 @dataclass(frozen=True)
@@ -196,7 +192,7 @@ def start_campaign(
     draft = _Draft(folder, channels, _runs(looks, channels, callback), notes)
     campaign = _written(draft, toml, callback)
     written, kept = [toml], []
-    for name, write in ((MODEL, _write_model), (PICTURE, draw_channels)):
+    for name, write in ((MODEL, write_first_model), (PICTURE, _draw)):
         path = folder / name
         if path.exists():
             kept.append(path)
@@ -205,6 +201,12 @@ def start_campaign(
         written.append(path)
     questions = tuple(_questions(draft))
     return Started(tuple(written), tuple(kept), questions, tuple(draft.notes), campaign)
+
+
+def _draw(campaign: CampaignData, path: Path) -> None:
+    from bayesoleo.plots._runs import channels
+
+    channels(campaign).savefig(path, dpi=130)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -439,62 +441,6 @@ def _label(file: str, looks: Sequence[LookedAt]) -> str:
     return stem if stems.count(stem) == 1 else file
 
 
-def guess_frequency(values: Array, seconds: Array) -> float | None:
-    """Frequency at which all channels repeat, Hz; None for a transient.
-
-    The shortest lag is taken at which the channels, each correlated with itself, are about as much
-    alike as they are at any lag up to half the record.
-
-    Parameters
-    ----------
-    values : ndarray, shape (channels, N)
-    seconds : ndarray, shape (N,)
-        Their times, s.
-    """
-    count = min(values.shape[1], _LOOKED_AT)
-    seconds, values = seconds[:count], np.nan_to_num(values[:, :count])
-    step = float(np.nanmedian(np.diff(seconds)))
-    if count < 4 * _FEWEST or not step > 0 or is_uneven(seconds):
-        return None
-    alike = np.mean([_likeness(one) for one in values], axis=0)
-    below = np.flatnonzero(alike < 0.3)
-    if not below.size:
-        return None
-    first = int(below[0])
-    best = float(alike[first:].max())
-    if best < _REPEATS:
-        return None
-    start = first + int(np.flatnonzero(alike[first:] >= _NEARLY * best)[0])
-    lower = np.flatnonzero(alike[start:] < 0.9 * best)
-    end = start + int(lower[0]) if lower.size else alike.size
-    lag = start + int(np.argmax(alike[start:end]))
-    thirds = [float(np.std(part)) for part in np.array_split(values[0] - values[0].mean(), 3)]
-    if lag < 4 or thirds[0] > _DECAY * thirds[2] or thirds[2] > _DECAY * thirds[0]:
-        return None
-    return float(f"{1.0 / (_summit(alike, lag) * step):.4g}")
-
-
-def _likeness(signal: Array) -> Array:
-    """Correlation of a signal with itself later, by lag up to half of it, each part normalised."""
-    x = signal - signal.mean()
-    n = x.size
-    spectrum = np.fft.rfft(x, 2 * n)
-    products = np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[: n // 2 + 1]
-    squares = np.concatenate([[0.0], np.cumsum(x**2)])
-    lags = np.arange(n // 2 + 1)
-    size = np.sqrt(squares[n - lags] * (squares[n] - squares[lags]))
-    return np.asarray(products / np.maximum(size, 1e-300))
-
-
-def _summit(values: Array, at: int) -> float:
-    """Place of a maximum between samples, by a parabola."""
-    if not 0 < at < values.size - 1:
-        return float(at)
-    a, b, c = values[at - 1 : at + 2]
-    bend = a - 2 * b + c
-    return at + (0.5 * (a - c) / bend if bend < 0 else 0.0)
-
-
 def _written(draft: _Draft, toml: Path, callback: Callable[[str], None]) -> CampaignData:
     """Write the campaign so that it loads: what cannot be used is left out, with the reason."""
     try:
@@ -627,145 +573,3 @@ def _other_role(role: str) -> str:
     if role == "fit":
         return '"hold-out", to be predicted and not fitted'
     return '"fit"; it is not fitted, so that predictions can be compared with it'
-
-
-def _write_model(campaign: CampaignData, path: Path) -> None:
-    """Write a linear model: all other channels from the first one, or a free oscillation."""
-    units = {name: unit.replace("²", "**2") for name, unit in campaign.units.items()}
-    names = list(units)
-    text = _relation(campaign, units, names) if len(names) > 1 else _free(campaign, units, names[0])
-    path.write_text(text, encoding="utf-8")
-
-
-_HEAD = '''"""A model to start from: {what}.
-
-Written by bayesoleo init. Replace it by the physics of your system, then try
-    bayesoleo check . --model model.py:model
-"""
-
-from bayesoleo import Model, Output, Parameter
-
-'''
-
-
-def _relation(campaign: CampaignData, units: Mapping[str, str], names: Sequence[str]) -> str:
-    first, others = names[0], names[1:]
-    run = campaign.runs[0]
-    x = run.samples[first]
-    terms = np.column_stack([x, np.gradient(x, run.time_step), np.ones_like(x)])
-    parameters, outputs = [], []
-    for name in others:
-        y = run.samples[name]
-        values = np.linalg.lstsq(terms, y, rcond=None)[0]
-        kinds = (
-            ("per", f"({units[name]})/({units[first]})"),
-            ("rate", f"({units[name]})*s/({units[first]})"),
-            ("offset", units[name]),
-        )
-        for (kind, unit), value, column in zip(kinds, values, terms.T, strict=True):
-            width = max(abs(value), float(np.std(y) / max(np.std(column), 1.0)))
-            parameters.append(
-                f'        "{name}_{kind}": Parameter({value:.3g}, "{unit}", sd={width:.3g}),'
-            )
-        law = f"{name}_per*{first} + {name}_rate*dot({first}) + {name}_offset"
-        outputs.append(f'        "{name}": Output("{law}", "{units[name]}"),')
-    what = f"{', '.join(others)} from {first} and its rate, linear"
-    return "\n".join(
-        [
-            _HEAD.format(what=what) + "model = Model(",
-            '    "linear start",',
-            f'    inputs={{"{first}": "{units[first]}"}},',
-            "    parameters={",
-            *parameters,
-            "    },",
-            "    outputs={",
-            *outputs,
-            "    },",
-            ")",
-            "",
-        ]
-    )
-
-
-def _free(campaign: CampaignData, units: Mapping[str, str], name: str) -> str:
-    run = campaign.runs[0]
-    crossings = np.count_nonzero(np.diff(np.sign(run.samples[name] - run.samples[name].mean())))
-    span = float(run.time[-1] - run.time[0])
-    rate = np.pi * max(crossings, 1) / span
-    mean, scale = float(np.mean(run.samples[name])), float(np.std(run.samples[name]))
-    return (
-        _HEAD.format(what=f"{name} as a free, damped oscillation")
-        + f"""model = Model(
-    "free oscillation",
-    dofs={{"motion": "{units[name]}"}},
-    parameters={{
-        "frequency": Parameter({rate:.3g}, "rad/s", relative_sd=0.3),
-        "damping": Parameter({0.02 * rate:.3g}, "1/s", relative_sd=2.0),
-        "rest": Parameter({mean:.3g}, "{units[name]}", sd={scale:.3g}),
-    }},
-    equations={{
-        "motion": "ddot(motion) + damping*dot(motion) + frequency**2*(motion - rest)",
-    }},
-    outputs={{"{name}": Output("motion", "{units[name]}")}},
-)
-"""
-    )
-
-
-def draw_channels(campaign: CampaignData, path: Path) -> None:
-    """Draw each channel of each of the first runs over time, to a file.
-
-    Parameters
-    ----------
-    campaign : CampaignData
-    path : Path
-        Of the picture.
-    """
-    from matplotlib.figure import Figure
-
-    from bayesoleo.plots._style import AFTER, SMALL, engineering, plain
-
-    runs, names = campaign.runs[:4], list(campaign.channels)
-    figure = Figure(figsize=(3.4 * len(runs) + 1.0, 1.5 * len(names) + 0.6), layout="constrained")
-    grid = figure.subplots(len(names), len(runs), squeeze=False)
-    for row, name in zip(grid, names, strict=True):
-        size = float(np.max(np.abs(runs[0].samples[name])))
-        shown = engineering(campaign.units[name], size)
-        for axes, run in zip(row, runs, strict=True):
-            time, values = _thinned(run.time, run.samples[name])
-            axes.plot(time, shown.factor * values, lw=0.8, color=AFTER)
-            axes.tick_params(labelsize=SMALL)
-        row[0].set_ylabel(f"{plain(name)} [{shown.unit or '1'}]", fontsize=SMALL)
-    for axes, run in zip(grid[0], runs, strict=True):
-        axes.set_title(plain(run.label), fontsize=SMALL)
-    for axes in grid[-1]:
-        axes.set_xlabel("time [s]", fontsize=SMALL)
-    figure.savefig(path, dpi=130)
-
-
-def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
-    """Smallest and largest value of each stretch, so that a long record draws in no time."""
-    most = 2000
-    if time.size <= 2 * most:
-        return time, values
-    length = time.size // most
-    parts = values[: length * most].reshape(most, length)
-    at = time[: length * most : length]
-    pairs = np.column_stack([parts.min(axis=1), parts.max(axis=1)]).ravel()
-    return np.repeat(at, 2), pairs
-
-
-def sparkline(values: Array, width: int = 48) -> str:
-    """A record as a line of blocks, for a terminal.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-    width : int, optional
-        Characters.
-    """
-    blocks = "▁▂▃▄▅▆▇█"
-    parts = np.array_split(values, min(width, values.size))
-    means = np.array([float(np.mean(part)) for part in parts])
-    span = float(np.ptp(means)) or 1.0
-    return "".join(blocks[round(7 * (m - means.min()) / span)] for m in means)

@@ -16,14 +16,17 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from bayesoleo import model as declarations
+from bayesoleo.data._campaign import CampaignData
 from bayesoleo.effects._catalogue import catalogue
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._gas import undeclared
@@ -334,3 +337,96 @@ def _declared(item: dict[str, Any]) -> Parameter:
         kind, *rest = item["prior"].items()
         prior = _PRIORS[kind[1]](**{key: float(value) for key, value in rest})
     return Parameter(**{**item, "prior": prior})
+
+
+def write_first_model(campaign: CampaignData, path: Path) -> None:
+    """Write a linear model: all other channels from the first one, or a free oscillation.
+
+    Parameters
+    ----------
+    campaign : CampaignData
+        Whose first run gives the values to start from.
+    path : Path
+        Of the model file.
+    """
+    units = {name: unit.replace("²", "**2") for name, unit in campaign.units.items()}
+    names = list(units)
+    text = _relation(campaign, units, names) if len(names) > 1 else _free(campaign, units, names[0])
+    path.write_text(text, encoding="utf-8")
+
+
+_HEAD = '''"""A model to start from: {what}.
+
+Written by bayesoleo init. Replace it by the physics of your system, then try
+    bayesoleo check . --model model.py:model
+"""
+
+from bayesoleo import Model, Output, Parameter
+
+'''
+
+
+def _relation(campaign: CampaignData, units: Mapping[str, str], names: Sequence[str]) -> str:
+    first, others = names[0], names[1:]
+    run = campaign.runs[0]
+    x = run.samples[first]
+    terms = np.column_stack([x, np.gradient(x, run.time_step), np.ones_like(x)])
+    parameters, outputs = [], []
+    for name in others:
+        y = run.samples[name]
+        values = np.linalg.lstsq(terms, y, rcond=None)[0]
+        kinds = (
+            ("per", f"({units[name]})/({units[first]})"),
+            ("rate", f"({units[name]})*s/({units[first]})"),
+            ("offset", units[name]),
+        )
+        for (kind, unit), value, column in zip(kinds, values, terms.T, strict=True):
+            width = max(abs(value), float(np.std(y) / max(np.std(column), 1.0)))
+            parameters.append(
+                f'        "{name}_{kind}": Parameter({value:.3g}, "{unit}", sd={width:.3g}),'
+            )
+        law = f"{name}_per*{first} + {name}_rate*dot({first}) + {name}_offset"
+        outputs.append(f'        "{name}": Output("{law}", "{units[name]}"),')
+    what = f"{', '.join(others)} from {first} and its rate, linear"
+    return "\n".join(
+        [
+            _HEAD.format(what=what) + "model = Model(",
+            '    "linear start",',
+            f'    inputs={{"{first}": "{units[first]}"}},',
+            "    parameters={",
+            *parameters,
+            "    },",
+            "    outputs={",
+            *outputs,
+            "    },",
+            ")",
+            "",
+        ]
+    )
+
+
+def _free(campaign: CampaignData, units: Mapping[str, str], name: str) -> str:
+    run = campaign.runs[0]
+    crossings = int(
+        np.count_nonzero(np.diff(np.sign(run.samples[name] - run.samples[name].mean())))
+    )
+    span = float(run.time[-1] - run.time[0])
+    rate = np.pi * max(crossings, 1) / span
+    mean, scale = float(np.mean(run.samples[name])), float(np.std(run.samples[name]))
+    return (
+        _HEAD.format(what=f"{name} as a free, damped oscillation")
+        + f"""model = Model(
+    "free oscillation",
+    dofs={{"motion": "{units[name]}"}},
+    parameters={{
+        "frequency": Parameter({rate:.3g}, "rad/s", relative_sd=0.3),
+        "damping": Parameter({0.02 * rate:.3g}, "1/s", relative_sd=2.0),
+        "rest": Parameter({mean:.3g}, "{units[name]}", sd={scale:.3g}),
+    }},
+    equations={{
+        "motion": "ddot(motion) + damping*dot(motion) + frequency**2*(motion - rest)",
+    }},
+    outputs={{"{name}": Output("motion", "{units[name]}")}},
+)
+"""
+    )

@@ -407,3 +407,66 @@ def period_search(values: Array, time_step: float, nominal: float) -> PeriodSear
         period_in_samples=period + bottom,
         time_step=time_step,
     )
+
+
+#: Correlation of a record with itself, a period later, that counts as periodic; how nearly the
+#: best a shorter period has to be; and the ratio of sizes, first to last third, of a decay.
+_REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.4
+#: Samples that a frequency is guessed from, at most and at least.
+_LOOKED_AT, _LEAST = 200_000, 80
+
+
+def guess_frequency(values: Array, seconds: Array) -> float | None:
+    """Frequency at which all channels repeat, Hz; None for a transient.
+
+    The shortest lag is taken at which the channels, each correlated with itself, are about as much
+    alike as they are at any lag up to half the record.
+
+    Parameters
+    ----------
+    values : ndarray, shape (channels, N)
+    seconds : ndarray, shape (N,)
+        Their times, s.
+    """
+    count = min(values.shape[1], _LOOKED_AT)
+    seconds, values = seconds[:count], np.nan_to_num(values[:, :count])
+    step = float(np.nanmedian(np.diff(seconds)))
+    if count < _LEAST or not step > 0:
+        return None
+    alike = np.mean([_likeness(one) for one in values], axis=0)
+    below = np.flatnonzero(alike < 0.3)
+    if not below.size:
+        return None
+    first = int(below[0])
+    best = float(alike[first:].max())
+    if best < _REPEATS:
+        return None
+    start = first + int(np.flatnonzero(alike[first:] >= _NEARLY * best)[0])
+    lower = np.flatnonzero(alike[start:] < 0.9 * best)
+    end = start + int(lower[0]) if lower.size else alike.size
+    lag = start + int(np.argmax(alike[start:end]))
+    thirds = [float(np.std(part)) for part in np.array_split(values[0] - values[0].mean(), 3)]
+    if lag < 4 or thirds[0] > _DECAY * thirds[2] or thirds[2] > _DECAY * thirds[0]:
+        return None
+    return float(f"{1.0 / (_summit(alike, lag) * step):.4g}")
+
+
+def _likeness(signal: Array) -> Array:
+    """Correlation of a signal with itself later, by lag up to half of it, each part normalised."""
+    x = signal - signal.mean()
+    n = x.size
+    spectrum = np.fft.rfft(x, 2 * n)
+    products = np.fft.irfft(np.abs(spectrum) ** 2, 2 * n)[: n // 2 + 1]
+    squares = np.concatenate([[0.0], np.cumsum(x**2)])
+    lags = np.arange(n // 2 + 1)
+    size = np.sqrt(squares[n - lags] * (squares[n] - squares[lags]))
+    return np.asarray(products / np.maximum(size, 1e-300))
+
+
+def _summit(values: Array, at: int) -> float:
+    """Place of a maximum between samples, by a parabola."""
+    if not 0 < at < values.size - 1:
+        return float(at)
+    a, b, c = values[at - 1 : at + 2]
+    bend = a - 2 * b + c
+    return at + (0.5 * (a - c) / bend if bend < 0 else 0.0)

@@ -20,7 +20,7 @@ from bayesoleo.data._text_layout import (
     MISSING,
     WHITESPACE,
     FileColumns,
-    Layout,
+    TextLayout,
     find_layout,
     is_number,
     is_time,
@@ -89,7 +89,7 @@ def read_text(
 
 def _read_values(
     path: Path,
-    layout: Layout,
+    layout: TextLayout,
     read: Mapping[int, str],
     wanted: Collection[str] | None,
     progress: bool,
@@ -108,7 +108,7 @@ def _read_values(
 
 def _collect(
     path: Path,
-    layout: Layout,
+    layout: TextLayout,
     width: int,
     read: Mapping[int, str],
     wanted: Collection[str] | None,
@@ -146,7 +146,7 @@ def _unique(path: Path, names: Sequence[str], wanted: Collection[str] | None) ->
     return found
 
 
-def _tables(path: Path, layout: Layout, width: int, progress: bool) -> Iterator[pd.DataFrame]:
+def _tables(path: Path, layout: TextLayout, width: int, progress: bool) -> Iterator[pd.DataFrame]:
     """Rows of values, a part of the file at a time, with a bar where it takes long."""
     import pandas as pd
 
@@ -164,7 +164,7 @@ def _tables(path: Path, layout: Layout, width: int, progress: bool) -> Iterator[
 
 
 def _parts(
-    stream: io.TextIOWrapper, layout: Layout, width: int, bar: Any
+    stream: io.TextIOWrapper, layout: TextLayout, width: int, bar: Any
 ) -> Iterator[pd.DataFrame]:
     import pandas as pd
 
@@ -186,7 +186,7 @@ def _parts(
         bar.update(max(0, cast(Any, stream.buffer).tell() - bar.n))
 
 
-def _width_with_remarks(path: Path, layout: Layout) -> int | None:
+def _width_with_remarks(path: Path, layout: TextLayout) -> int | None:
     """The largest number of cells in a line, if what stands beyond the last column is no number."""
     width = most = len(layout.names)
     for _, cells in _value_lines(path, layout):
@@ -196,7 +196,7 @@ def _width_with_remarks(path: Path, layout: Layout) -> int | None:
     return most
 
 
-def _value_lines(path: Path, layout: Layout) -> list[tuple[int, list[str]]]:
+def _value_lines(path: Path, layout: TextLayout) -> list[tuple[int, list[str]]]:
     with open_text(path, layout.encoding) as stream:
         return [
             (number, split_cells(without_remark(line), layout.delimiter))
@@ -205,7 +205,7 @@ def _value_lines(path: Path, layout: Layout) -> list[tuple[int, list[str]]]:
         ]
 
 
-def _ragged(path: Path, layout: Layout) -> CampaignError:
+def _ragged(path: Path, layout: TextLayout) -> CampaignError:
     """Which line has too many cells."""
     width = len(layout.names)
     for number, cells in _value_lines(path, layout):
@@ -224,7 +224,7 @@ def _numbers(
     path: Path,
     name: str,
     column: pd.Series,
-    layout: Layout,
+    layout: TextLayout,
     before: int,
     clock: dict[int, pd.Timestamp],
     index: int,
@@ -281,7 +281,7 @@ def _times(column: pd.Series) -> pd.Series | None:
         return None
 
 
-def _place(path: Path, layout: Layout, row: int, cell: str) -> str:
+def _place(path: Path, layout: TextLayout, row: int, cell: str) -> str:
     """Where an editor shows a row of values: blank lines and comments count there."""
     with open_text(path, layout.encoding) as stream:
         filled = (

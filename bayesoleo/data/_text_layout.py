@@ -148,7 +148,7 @@ def unit_in_name(name: str) -> str | None:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextLayout:
     """How a text file is laid out.
 
     Parameters
@@ -396,7 +396,7 @@ def find_layout(
     delimiter: str | None = None,
     header_delimiter: str | None = None,
     encoding: str | None = None,
-) -> Layout:
+) -> TextLayout:
     """Find values, names and units of a text file.
 
     Parameters
@@ -438,7 +438,7 @@ def find_layout(
     if block is not best[1]:
         header = _find_header(lines, block, chosen)
     names = header.names or _numbered(path, block, header)
-    return Layout(
+    return TextLayout(
         encoding=encoding,
         delimiter=block.delimiter,
         decimal=block.decimal,

@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array
+from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._residual_time_shift import PeriodSearch
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._between_runs import Hierarchy, between_runs
@@ -498,3 +499,44 @@ def _panel(
         style.plain(scale.label(name), 45), loc="left", fontsize=style.SMALL, pad=3,
         fontweight="bold",
     )  # fmt: skip
+
+
+def channels(campaign: CampaignData) -> Figure:
+    """Each channel of the first four runs over time.
+
+    Parameters
+    ----------
+    campaign : CampaignData
+
+    Returns
+    -------
+    Figure
+    """
+    runs, names = campaign.runs[:4], list(campaign.channels)
+    figure = Figure(figsize=(3.4 * len(runs) + 1.0, 1.5 * len(names) + 0.6), layout="constrained")
+    grid = figure.subplots(len(names), len(runs), squeeze=False)
+    for row, name in zip(grid, names, strict=True):
+        size = float(np.max(np.abs(runs[0].samples[name])))
+        shown = engineering(campaign.units[name], size)
+        for axes, run in zip(row, runs, strict=True):
+            time, values = _thinned(run.time, run.samples[name])
+            axes.plot(time, shown.factor * values, lw=0.8, color=style.AFTER)
+            axes.tick_params(labelsize=style.SMALL)
+        row[0].set_ylabel(f"{style.plain(name)} [{shown.unit or '1'}]", fontsize=style.SMALL)
+    for axes, run in zip(grid[0], runs, strict=True):
+        axes.set_title(style.plain(run.label), fontsize=style.SMALL)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]", fontsize=style.SMALL)
+    return figure
+
+
+def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
+    """Smallest and largest value of each stretch, so that a long record draws in no time."""
+    most = 2000
+    if time.size <= 2 * most:
+        return time, values
+    length = time.size // most
+    parts = values[: length * most].reshape(most, length)
+    at = time[: length * most : length]
+    pairs = np.column_stack([parts.min(axis=1), parts.max(axis=1)]).ravel()
+    return np.repeat(at, 2), pairs

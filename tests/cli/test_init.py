@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from small_rig import rows
 
-from bayesoleo._workflow.first_look import guess_frequency, sparkline, start_campaign
+from bayesoleo._report.terminal import sparkline
+from bayesoleo._workflow.first_look import start_campaign
 from bayesoleo.data import load_campaign
+from bayesoleo.data._residual_time_shift import guess_frequency
 from bayesoleo.errors import CampaignError
 
 
