@@ -339,8 +339,11 @@ def _no_channel(column: str, looks: Sequence[LookedAt]) -> str:
             return f"it is more than half empty in {look.file}"
         if np.ptp(finite) == 0:
             return f"it is constant in {look.file}"
-        if np.all(np.diff(finite) == 1):
+        steps = np.diff(finite)
+        if np.all(steps == 1):
             return "it counts samples"
+        if np.all(steps > 0) and np.ptp(steps) < 0.02 * np.median(steps):
+            return "it increases evenly, as a time does"
     return ""
 
 

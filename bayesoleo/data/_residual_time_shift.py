@@ -410,8 +410,8 @@ def period_search(values: Array, time_step: float, nominal: float) -> PeriodSear
 
 
 #: Correlation of a record with itself, a period later, that counts as periodic; how nearly the
-#: best a shorter period has to be; and the ratio of sizes, first to last third, of a decay.
-_REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.4
+#: best a shorter period has to be; and the ratio of sizes, of one half to the other, of a decay.
+_REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.1
 #: Samples that a frequency is guessed from, at most and at least.
 _LOOKED_AT, _LEAST = 200_000, 80
 
@@ -445,10 +445,16 @@ def guess_frequency(values: Array, seconds: Array) -> float | None:
     lower = np.flatnonzero(alike[start:] < 0.9 * best)
     end = start + int(lower[0]) if lower.size else alike.size
     lag = start + int(np.argmax(alike[start:end]))
-    thirds = [float(np.std(part)) for part in np.array_split(values[0] - values[0].mean(), 3)]
-    if lag < 4 or thirds[0] > _DECAY * thirds[2] or thirds[2] > _DECAY * thirds[0]:
+    if lag < 4 or any(_grows_or_decays(one, lag) for one in values):
         return None
     return float(f"{1.0 / (_summit(alike, lag) * step):.4g}")
+
+
+def _grows_or_decays(signal: Array, period: int) -> bool:
+    """Whether whole periods at the start and at the end differ in size."""
+    length = period * max(1, signal.size // period // 2)
+    first, last = float(np.std(signal[:length])), float(np.std(signal[-length:]))
+    return max(first, last) > _DECAY * min(first, last)
 
 
 def _likeness(signal: Array) -> Array:

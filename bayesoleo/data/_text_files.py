@@ -249,14 +249,15 @@ def _numbers(
     if wrong.size:
         cell = str(column.iloc[wrong[0]])
         comma = DECIMAL_COMMA.match(cell.strip())
+        hint = _one_sign(layout.decimal) if comma or layout.decimal == "," else "write numbers only"
+        if cell.strip() in layout.names:
+            hint = "the names stand here once more: write each part to a file of its own"
         raise CampaignError(
             f"not a number in {_place(path, layout, before + int(wrong[0]), cell)}",
             file=path.name,
             column=name,
             value=cell,
-            hint=_one_sign(layout.decimal)
-            if comma or layout.decimal == ","
-            else "write numbers only",
+            hint=hint,
         )
     return numbers
 

@@ -438,6 +438,7 @@ def find_layout(
     if block is not best[1]:
         header = _find_header(lines, block, chosen)
     names = header.names or _numbered(path, block, header)
+    _check_once(path, lines[: block.first], block, names)
     return TextLayout(
         encoding=encoding,
         delimiter=block.delimiter,
@@ -446,6 +447,18 @@ def find_layout(
         names=names,
         units=_units_of(names, header.units),
     )
+
+
+def _check_once(path: Path, lines: Sequence[str], block: _Block, names: tuple[str, ...]) -> None:
+    """Raise where the names stand above the values twice: what is between them would be lost."""
+    places = [k for k, line in enumerate(lines, 1) if tuple(_cells(line, block, None)) == names]
+    if block.width > 1 and len(places) > 1:
+        raise CampaignError(
+            f"the names stand in line {places[0]} and once more in line {places[1]}",
+            file=path.name,
+            value=lines[places[0] - 1].strip()[:60],
+            hint="write each part to a file of its own",
+        )
 
 
 def _with_bad_first_row(lines: Sequence[str], block: _Block, header: _Header) -> _Block:

@@ -87,6 +87,11 @@ def test_text_in_a_column_that_is_not_wanted_does_not_matter(tmp_path):
         ),
         ("t,a\n0,1\n1,2,3\n", r"line 3 has 3 cells, the header 2 \(got '1,2,3'\); correct that"),
         ("t;a\n0;1\n\n# a;b;c\n1;2;3\n2;3\n", "line 5 has 3 cells, the header 2"),
+        ("t,a\n0,1\n1,2\nt,a\n0,1\n1,2\n", "the names stand in line 1 and once more in line 4"),
+        (
+            "t,a\n" + "0,1\n1,2\n" * 9 + "t,a\n0,1\n",
+            r"not a number in line 20 \(got '.'\); the names stand here once more",
+        ),
         ("t,a\n0,x\n1,2\n2,3\n", r"column a: not a number in line 2 \(got 'x'\)"),
         ("t;a\n0,1;2,5\n0,2;2.5\n0,3;2,5\n", "column a: not a number in line 3"),
     ],
