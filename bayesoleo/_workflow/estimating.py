@@ -29,7 +29,6 @@ from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit, fit_model
-from bayesoleo.discovery._hold_out_error import Prediction, predict_held_out
 from bayesoleo.discovery._inference import (
     CATALOGUE,
     Inference,
@@ -40,6 +39,7 @@ from bayesoleo.discovery._inference import (
     mode_of,
 )
 from bayesoleo.discovery._result_tree import point_group, posterior_groups, predictive_groups
+from bayesoleo.discovery._run_predictions import Prediction, predict_held_out
 from bayesoleo.error_models._registry import AUTO
 from bayesoleo.estimation._per_run import by_run_dataset
 from bayesoleo.model._model import Model

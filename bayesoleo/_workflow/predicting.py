@@ -24,9 +24,9 @@ from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
 from bayesoleo.data._noise import local_means
 from bayesoleo.data._reduction import ReducedCampaign
-from bayesoleo.discovery._error_table import compared
 from bayesoleo.discovery._fit import weights
-from bayesoleo.discovery._hold_out_error import Prediction
+from bayesoleo.discovery._fit_and_hold_out_error import compared
+from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._nuisance import uncertain_conditions
 from bayesoleo.model._model import Model

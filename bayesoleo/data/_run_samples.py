@@ -352,6 +352,7 @@ def _samples(
         )
     if gap.any():  # masked samples do not count, so that any number serves
         values = bridged(values[None], gap)[0]
+    _check_size(channel, column, values)
     row, beyond = impossible_sample(values)
     if row is not None:
         raise CampaignError(
@@ -369,6 +370,24 @@ def _samples(
             hint="make it a condition of the run, or check the sensor",
         )
     return _frozen(channel.to_si(values))
+
+
+#: Sizes of numbers whose sixth powers, up and down, are numbers too.
+SMALLEST, LARGEST = 1e-50, 1e50
+
+
+def _check_size(channel: Channel, column: str, values: Array) -> None:
+    """Raise where the products of samples would overflow, or vanish, as in a wrong unit."""
+    with np.errstate(all="ignore"):
+        for sizes in (values, channel.to_si(values)):
+            swing, size = float(np.ptp(sizes)), float(np.median(np.abs(sizes)))
+            if size > LARGEST or 0 < swing < SMALLEST:
+                raise CampaignError(
+                    f"{'size' if size > LARGEST else 'swing'} of the samples is out of range",
+                    column=column,
+                    value=size if size > LARGEST else swing,
+                    hint=f"give samples between {SMALLEST:g} and {LARGEST:g}, in this unit and SI",
+                )
 
 
 def _check_periods(declared: RunDeclaration, time: Array) -> None:

@@ -133,8 +133,10 @@ def _collect(
 def _unique(path: Path, names: Sequence[str], wanted: Collection[str] | None) -> list[str]:
     """Names of which the second of two alike is followed by its number."""
     found: list[str] = []
+    seen: dict[str, int] = {}
     for name in names:
-        again = names[: len(found)].count(name)
+        again = seen.get(name, 0)
+        seen[name] = again + 1
         if again and name and (wanted is None or name in wanted):
             raise CampaignError(
                 "two columns have this name",

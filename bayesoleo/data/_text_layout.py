@@ -247,7 +247,11 @@ def split_cells(line: str, delimiter: str) -> list[str]:
         return line.split()
     if delimiter == BLANKS:
         return re.split(r"\s{2,}|\t", line.strip())
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [""])]
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter), [""])
+    except csv.Error:  # a cell of more than 128 kB: a long line without this delimiter
+        cells = line.split(delimiter)
+    return [cell.strip() for cell in cells]
 
 
 def is_number(cell: str, decimal: str = ".") -> bool:

@@ -6,17 +6,14 @@ from ._assembly import (
     Roles as Roles,
     assign as assign,
 )
-from ._error_table import (
-    ErrorTable as ErrorTable,
-    RunError as RunError,
-)
 from ._fit import (
     ModelFit as ModelFit,
     Numerics as Numerics,
     fit_model as fit_model,
 )
-from ._hold_out_error import (
-    Prediction as Prediction,
+from ._fit_and_hold_out_error import (
+    ErrorTable as ErrorTable,
+    RunError as RunError,
 )
 from ._inference import (
     Inference as Inference,
@@ -42,6 +39,9 @@ from ._refit import (
 from ._round import (
     Progress as Progress,
     Round as Round,
+)
+from ._run_predictions import (
+    Prediction as Prediction,
 )
 from ._score_basis import (
     Base as Base,

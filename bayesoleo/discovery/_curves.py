@@ -18,7 +18,6 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, Float
 from bayesoleo.discovery._assembly import AddedEffect
-from bayesoleo.discovery._hold_out_error import Prediction
 from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._nonparametric_quantities import (
     Forced,
@@ -28,6 +27,7 @@ from bayesoleo.discovery._nonparametric_quantities import (
     times_direction,
 )
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._state import State
 from bayesoleo.effects._catalogue import in_sentence

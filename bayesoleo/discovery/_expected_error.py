@@ -33,16 +33,16 @@ from numpy.typing import NDArray
 
 from bayesoleo._types import Array
 from bayesoleo.data._noise import local_means
-from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, weights
-from bayesoleo.discovery._hold_out_error import Prediction
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
 
 #: Errors of one run by output, and the input's noise in them; see
-#: :func:`bayesoleo.discovery._error_table.compared`.
+#: :func:`bayesoleo.discovery._fit_and_hold_out_error.compared`.
 Compared = tuple[list[RunError], Array]
 
 

@@ -19,10 +19,10 @@ from scipy import stats
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.discovery._assembly import Roles, in_halves
 from bayesoleo.discovery._fit import Numerics, weights
-from bayesoleo.discovery._hold_out_error import Prediction, crossed
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._run_predictions import Prediction, crossed
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.prediction._run_errors import input_columns
 

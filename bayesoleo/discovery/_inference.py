@@ -13,7 +13,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.discovery._hold_out_error import Prediction
+from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._signatures import (
     COLOUR_FALSE_ALARM,
     Noise,
@@ -23,7 +23,7 @@ from bayesoleo.discovery._signatures import (
 )
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._base import Frame
-from bayesoleo.error_models._catalogue import CatalogueErrors, Linearised
+from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors, Linearised
 from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors, effective_samples
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.error_models._independent import IndependentErrors

@@ -21,8 +21,8 @@ from bayesoleo import _schema as schema
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, AddedEffect, Assembly, Roles
-from bayesoleo.discovery._error_table import least_noise
 from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit_and_hold_out_error import least_noise
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES

@@ -15,7 +15,6 @@ import numpy as np
 
 from bayesoleo._parallel import single_blas_thread, thread_map
 from bayesoleo._types import Array
-from bayesoleo.discovery._error_table import ErrorTable, RunError
 from bayesoleo.discovery._expected_information import (
     Component,
     Precision,
@@ -26,6 +25,7 @@ from bayesoleo.discovery._expected_information import (
     separate,
 )
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._fit_and_hold_out_error import ErrorTable, RunError
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._predicted_experiment import (
     BEYOND,

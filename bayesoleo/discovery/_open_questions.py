@@ -18,9 +18,8 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Added
-from bayesoleo.discovery._error_table import ErrorTable, error_table
 from bayesoleo.discovery._fit import Numerics
-from bayesoleo.discovery._hold_out_error import predict_fitted
+from bayesoleo.discovery._fit_and_hold_out_error import ErrorTable, error_table
 from bayesoleo.discovery._loop import SURE, ClosedLoop, scored_later
 from bayesoleo.discovery._next_experiment import (
     PARAMETERS,
@@ -37,6 +36,7 @@ from bayesoleo.discovery._predicted_experiment import Range, Rival, sizes_of
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit, refit
 from bayesoleo.discovery._round import Round
+from bayesoleo.discovery._run_predictions import predict_fitted
 from bayesoleo.discovery._structure_search import structure_fits
 from bayesoleo.discovery._structures import StructurePosterior
 from bayesoleo.errors import InputError, ModelError

@@ -14,8 +14,8 @@ import numpy as np
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
-from bayesoleo.discovery._error_table import least_noise
 from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._fit_and_hold_out_error import least_noise
 from bayesoleo.discovery._hold_out_confirmation import confirmed
 from bayesoleo.discovery._nonparametric_search import CurveSearch
 from bayesoleo.discovery._policy import SearchPolicy

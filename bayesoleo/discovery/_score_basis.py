@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from bayesoleo._types import Array
 from bayesoleo.data._noise import NoiseSpectrum
-from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, counted, weights
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.estimation._least_squares import PriorScale

@@ -20,8 +20,8 @@ from bayesoleo._types import Array
 from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, without_masked
-from bayesoleo.discovery._hold_out_error import Prediction, sample_noise
 from bayesoleo.discovery._ranking import scales_of
+from bayesoleo.discovery._run_predictions import Prediction, sample_noise
 from bayesoleo.discovery._score_basis import LEAST, Block, coefficients, sensitivities_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares

@@ -23,8 +23,8 @@ import scipy.fft
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.discovery._assembly import Added
-from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.prediction._records import Record
 

@@ -18,7 +18,9 @@ from bayesoleo._dask import connected, each_done
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly, Roles
-from bayesoleo.discovery._error_table import (
+from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out
+from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, promising
+from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     Noise,
     compared,
@@ -26,10 +28,8 @@ from bayesoleo.discovery._error_table import (
     too_quiet,
     with_same_noise,
 )
-from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out
-from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, promising
-from bayesoleo.discovery._hold_out_error import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._run_predictions import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._score_basis import Base, base_of
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._records import Record

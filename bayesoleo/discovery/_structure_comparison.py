@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Added
-from bayesoleo.discovery._error_table import RunError
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._score_basis import Base, present_constants
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._spectral_data import EstimatedModel, SpectralData, linearised

@@ -21,8 +21,8 @@ from scipy.special import logsumexp
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.discovery._assembly import Added, Assembly
-from bayesoleo.discovery._error_table import RunError
 from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
 from bayesoleo.discovery._nonparametric_search import coarser
 from bayesoleo.discovery._refit import new_parameters, quick_fit

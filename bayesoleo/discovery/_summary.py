@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesoleo import _schema as schema
 from bayesoleo.discovery._curves import CurveFacts
-from bayesoleo.discovery._error_table import limit, lowest
+from bayesoleo.discovery._fit_and_hold_out_error import limit, lowest
 from bayesoleo.discovery._loop import ON_LIMIT, ClosedLoop
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round

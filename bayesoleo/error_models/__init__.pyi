@@ -8,7 +8,7 @@ from ._base import (
     Residuals as Residuals,
     RunSamples as RunSamples,
 )
-from ._catalogue import (
+from ._catalogue_discrepancy import (
     CatalogueErrors as CatalogueErrors,
     Linearised as Linearised,
 )

@@ -24,7 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bayesoleo.error_models._base import ErrorModel, Frame, Measured, ProfiledErrorModel
-from bayesoleo.error_models._catalogue import CatalogueErrors
+from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors
 from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors
 from bayesoleo.error_models._discrepancy import DiscrepancyErrors, SharedDiscrepancyErrors
 from bayesoleo.error_models._full import FullErrors, GivenErrors, ProfiledFullErrors

@@ -42,8 +42,8 @@ from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import prepare
 from bayesoleo.data._noise import periodic_average
 from bayesoleo.discovery._fit import fit_model
-from bayesoleo.discovery._hold_out_error import predict_held_out
 from bayesoleo.discovery._inference import LOOKED_FOR, error_model_by
+from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.discovery._signatures import (
     Lines,
     colour_of,
@@ -55,7 +55,7 @@ from bayesoleo.discovery._signatures import (
 )
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._catalogue import Linearised
+from bayesoleo.error_models._catalogue_discrepancy import Linearised
 from bayesoleo.error_models._correlated import effective_samples
 from bayesoleo.estimation._problem import Evaluation, Misfit
 from bayesoleo.model import Normal

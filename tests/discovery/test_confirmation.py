@@ -20,8 +20,8 @@ from bayesoleo.discovery._hold_out_confirmation import (
     surrogate_variance,
     with_error,
 )
-from bayesoleo.discovery._hold_out_error import crossed
 from bayesoleo.discovery._loop import close_loop
+from bayesoleo.discovery._run_predictions import crossed
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
 

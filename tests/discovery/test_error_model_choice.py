@@ -14,7 +14,7 @@ from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import LOOKED_FOR, Inference, chosen_for
 from bayesoleo.discovery._signatures import more_than_noise_p, noise_of
-from bayesoleo.error_models._catalogue import Linearised
+from bayesoleo.error_models._catalogue_discrepancy import Linearised
 
 SEEDS = 12
 

@@ -15,8 +15,8 @@ from small_campaigns import (
     spring_damper_force,
 )
 
-from bayesoleo.discovery._error_table import error_table
-from bayesoleo.discovery._hold_out_error import Prediction
+from bayesoleo.discovery._fit_and_hold_out_error import error_table
+from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.solvers._orbit import Status
 

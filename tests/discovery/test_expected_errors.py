@@ -14,7 +14,7 @@ from bayesoleo import _schema as schema
 from bayesoleo.data import periodic_average
 from bayesoleo.data._noise import local_average
 from bayesoleo.discovery._assembly import Assembly, RecordNoise, assign
-from bayesoleo.discovery._error_table import (
+from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     RunError,
     least_noise,
@@ -23,8 +23,8 @@ from bayesoleo.discovery._error_table import (
     too_quiet,
     with_same_noise,
 )
-from bayesoleo.discovery._hold_out_error import borne_out
 from bayesoleo.discovery._loop import close_loop
+from bayesoleo.discovery._run_predictions import borne_out
 from bayesoleo.model import Model, Output, Parameter
 
 FEW = (("a", 1.0, 0.003, "fit"), ("b", 1.5, 0.003, "fit"), ("c", 1.0, 0.012, "hold-out"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import PeriodicAverage, periodic_average
-from bayesoleo.discovery._error_table import ErrorTable, RunError, is_at_floor, limit
+from bayesoleo.discovery._fit_and_hold_out_error import ErrorTable, RunError, is_at_floor, limit
 from bayesoleo.discovery._policy import SearchPolicy
 
 

@@ -13,7 +13,7 @@ from small_campaigns import damper, damper_campaign
 
 import bayesoleo
 from bayesoleo._workflow.settings import Settings
-from bayesoleo.discovery._error_table import limit
+from bayesoleo.discovery._fit_and_hold_out_error import limit
 from bayesoleo.discovery._policy import SearchPolicy, policy_table
 
 PACKAGE = Path(bayesoleo.__file__).parent

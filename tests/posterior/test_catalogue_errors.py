@@ -12,7 +12,7 @@ from bayesoleo.discovery._inference import error_model_by
 from bayesoleo.discovery._signatures import Lines, colour_of
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures, error_model
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._catalogue import ALONE
+from bayesoleo.error_models._catalogue_discrepancy import ALONE
 from bayesoleo.error_models._correlated import covariance
 from bayesoleo.error_models._signatures import (
     POINTS,

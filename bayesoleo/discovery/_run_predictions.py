@@ -1,4 +1,4 @@
-"""Noise of a record, and the prediction of hold-out runs.
+"""Predictions of fitted and hold-out runs, and the noise of their records.
 
 Shared parameters keep their estimates in a hold-out run; by-run parameters are estimated on it.
 

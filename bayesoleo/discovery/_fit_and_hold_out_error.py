@@ -1,4 +1,4 @@
-r"""Errors of a prediction against the noise, by run and output.
+r"""Fit and hold-out error: errors of a prediction against the noise, by run and output.
 
 All rounds of the search use the same noise: the smallest that any of its models supports.
 
@@ -38,8 +38,8 @@ from bayesoleo.data._noise import (
 from bayesoleo.data._sample_quality import emptied_lines, rounding_in_average
 from bayesoleo.discovery._assembly import RecordNoise
 from bayesoleo.discovery._fit import counted, of_those_counted, weights, without_masked
-from bayesoleo.discovery._hold_out_error import Prediction, borne_out, sample_noise
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._run_predictions import Prediction, borne_out, sample_noise
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import input_columns
 
