@@ -1,4 +1,4 @@
-"""Canonical names of all stored quantities, and the check of the summary.
+"""Canonical names of stored quantities, results that print as tables, and the summary's check.
 
 One DataTree goes from the closed loop to the disk, the plots and the report. Every writer and
 reader takes the names of its groups, dims, variables and root attributes from here, so that a
@@ -10,11 +10,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
+from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bayesoleo.errors import ResultsError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FORMAT: Final = 1
 """Version of the layout; a reader refuses a later one."""
@@ -381,3 +386,53 @@ def _spell(path: Any) -> str:
     """A path as a person writes it: ``rounds[0].reason``; the top is ``summary``."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return text.lstrip(".") or "summary"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LabelledResult:
+    """Labelled arrays with the words that a person reads first.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        Everything; a group of a result.
+    text : str
+        The table.
+    """
+
+    data: xr.Dataset
+    text: str
+
+    def __getitem__(self, name: str) -> xr.DataArray:
+        """A variable of the data."""
+        return self.data[name]
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.text)}</pre>{self.data._repr_html_()}"
+
+
+def columns(head: list[str], rows: list[list[str]]) -> str:
+    """A plain table: the first column on the left, the others on the right."""
+    table = [head, *rows]
+    width = [max(len(row[k]) for row in table) for k in range(len(head))]
+    lines = []
+    for row in table:
+        cells = [
+            row[0].ljust(width[0]),
+            *(c.rjust(w) for c, w in zip(row[1:], width[1:], strict=True)),
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def variable(dims: tuple[str, ...], values: Any, name: str, unit: str) -> xr.Variable:
+    """A variable with a title for people and its unit."""
+    import xarray as xr
+
+    return xr.Variable(dims, values, {LONG_NAME: name, UNITS: unit})

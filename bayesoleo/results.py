@@ -6,7 +6,7 @@ They are made by methods and functions, not by hand; their names serve annotatio
 
 from __future__ import annotations
 
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo._session.display import Result
 from bayesoleo._session.problem import Check
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import bayesoleo
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.discovery import Numerics, fit_model
 from bayesoleo.estimation import FunctionProblem, sampling_distribution

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from tqdm.auto import tqdm
 
 from bayesoleo import _schema as schema, _workflow as workflow, data
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._session import display as figures
 from bayesoleo._session.display import html
 from bayesoleo._workflow.closing import draw_final, search, written

@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
-from bayesoleo._display import LabelledResult, columns
 from bayesoleo._report import structures
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError, choose

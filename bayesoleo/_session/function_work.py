@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._storage.result_files import provenance
 from bayesoleo._storage.resume import digest
 from bayesoleo._types import Array, Integers

@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from bayesoleo import _schema as schema, plots
-from bayesoleo._display import LabelledResult, columns
 from bayesoleo._report.page import write_report
 from bayesoleo._report.sentences import certainty
 from bayesoleo._report.terminal import print_summary
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._session import display
 from bayesoleo._session.campaign import (
     DELAY,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns, variable
+from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
 from bayesoleo._workflow.simulating import model_of, parameter_sets
 from bayesoleo.assessment._residual_breakdown import judged_errors

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns, variable
+from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.assessment import _residual_tests as tests
 from bayesoleo.assessment._residual_breakdown import Series, series_of_problem, series_of_tree

@@ -21,7 +21,7 @@ from scipy import stats
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.effects._force_effect import FRICTION_SLOPE
+from bayesoleo.effects._forces import FRICTION_SLOPE
 from bayesoleo.effects._nonparametric import Axis, balance_places, bspline_values
 from bayesoleo.effects._places import parse_unit, unit_of, unit_text
 from bayesoleo.errors import ModelError

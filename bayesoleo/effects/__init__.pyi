@@ -10,7 +10,7 @@ from ._effect import (
     Candidate as Candidate,
     Effect as Effect,
 )
-from ._force_effect import (
+from ._forces import (
     InternalState as InternalState,
     force_effect as force_effect,
 )

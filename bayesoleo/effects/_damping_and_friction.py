@@ -23,7 +23,7 @@ from typing import Any
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._force_effect import InternalState, single_force, transition_velocity
+from bayesoleo.effects._forces import InternalState, single_force, transition_velocity
 from bayesoleo.effects._parts import (
     Amplitude,
     Scan,

@@ -18,7 +18,7 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._force_effect import single_force
+from bayesoleo.effects._forces import single_force
 from bayesoleo.effects._parts import Amplitude, ShapeParameter, range_grid
 from bayesoleo.effects._places import force_places, resisting_places, substitute
 from bayesoleo.model._drive_and_start import MAXIMUM_DERIVATIVE

@@ -1,26 +1,326 @@
-"""Constant, periodic and drifting forces, and inertia."""
+"""Force-like effects in a few lines: an expression in the position and the velocity of a place.
+
+Constant, periodic and drifting forces, and inertia, are built in.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import ast
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import sympy as sp
 
-from bayesoleo.effects._effect import BY_RUN, Effect, Names, error_of
-from bayesoleo.effects._force_effect import single_force
-from bayesoleo.effects._parts import Amplitude, Scales, Scan, ShapeParameter
+from bayesoleo.effects._effect import (
+    BY_RUN,
+    Effect,
+    Names,
+    check_names,
+    check_null,
+    check_states,
+    check_unit,
+    error_of,
+    free_name,
+)
+from bayesoleo.effects._parts import (
+    Amplitude,
+    Constant,
+    Scales,
+    Scan,
+    ShapeParameter,
+    coordinate_of,
+    velocity_grid,
+)
 from bayesoleo.effects._places import (
+    Between,
     acceleration,
     balance_terms,
+    between_places,
     drives,
     force_places,
+    is_quantity,
     moving_places,
+    place_at,
     resistance_sense,
     resisting_places,
+    spring_force,
+    with_force,
 )
-from bayesoleo.model._expressions import COSINE, SINE, TIME, symbol, within
+from bayesoleo.errors import InputError
+from bayesoleo.model._expressions import COSINE, SINE, TIME, parse, symbol, within
 from bayesoleo.model._model import Model
+from bayesoleo.model._parameters import Coordinate, Dof
+
+#: A model's own friction slope, in s/m: effects that need a smooth sign use it where it exists.
+FRICTION_SLOPE = "friction_slope"
+
+#: Names under which a model may declare the absolute pressure that seals and glands feel.
+PRESSURES = ("gas_pressure", "pressure")
+
+#: Words of an expression that a motion between two bodies has, and those that it has not: inertia
+#: is that of a body.
+_OF_A_DIFFERENCE = {"position", "velocity", "direction"}
+_OF_A_BODY = {"acceleration", "spring_force"}
+_NEED_VELOCITY = {"velocity", "acceleration", "direction", "largest_velocity"}
+
+
+@dataclass(frozen=True)
+class InternalState:
+    """A new first-order dof that an effect brings with it, such as the memory of friction.
+
+    Parameters
+    ----------
+    equation : str
+        Left-hand side of its equation; the state goes by its own name, ``dot(name)`` its rate.
+    unit : str
+        SI unit.
+    description : str
+        Its meaning.
+    """
+
+    equation: str
+    unit: str = ""
+    description: str = ""
+
+
+def force_effect(
+    id: str,  # noqa: A002 - the word that users of a catalogue know
+    family: str,
+    expression: str,
+    parameters: Mapping[str, str | Amplitude],
+    *,
+    formula: str = "",
+    title: str = "",
+    shapes: tuple[ShapeParameter, ...] = (),
+    states: Mapping[str, InternalState] | None = None,
+    requires: tuple[str, ...] = (),
+    source: str = "",
+    applies_to: str = "",
+) -> Effect:
+    r"""An effect that adds a resisting force to the balance of forces.
+
+    It acts in the equations of second-order dofs, or on the output of a force law. In a system of
+    first-order dofs an effect that needs no velocity acts in every equation. Between two dofs it
+    acts on both, with opposite signs (:func:`between_places`).
+
+    Parameters
+    ----------
+    id : str
+        Canonical name, an identifier; the new term is called so.
+    family : str
+        See :data:`bayesoleo.effects.FAMILIES`.
+    expression : str
+        The force. It may use ``position``, ``velocity``, ``acceleration``; ``direction``, a smooth
+        sign of the velocity; ``spring_force``, the sum of the balance's terms that follow position
+        alone; ``pressure``, the model's definition ``gas_pressure`` or ``pressure``;
+        ``largest_velocity``, ``lowest_position``, ``highest_position`` along the estimated motion;
+        names listed in ``requires``; and its own parameters, shapes and states.
+    parameters : mapping of str to str or Amplitude
+        Amplitudes, zero at the null, and their units, in which the words ``force`` and ``position``
+        stand for the units of the place: ``{"k3": "force/position**3"}``.
+    formula, title : str, optional
+        LaTeX and a few words; by default made from the expression and the id.
+    shapes : tuple of ShapeParameter
+        Parameters that are undefined at the null, with their scan grids.
+    states : mapping of str to InternalState
+        New first-order dofs.
+    requires : tuple of str
+        Names that a model must declare for the effect to apply.
+    source, applies_to : str
+        For listings.
+
+    Raises
+    ------
+    InputError
+        If the expression uses an undeclared name or does not use a parameter; if it is not zero
+        where its amplitudes are, or is not in the unit of a force.
+
+    Examples
+    --------
+    >>> effect = force_effect(
+    ...     "seventh_order_stiffness", "stiffness", "k7*position**7", {"k7": "force/position**7"}
+    ... )
+    >>> effect.title, effect.formula
+    ('Seventh order stiffness', '\\mathrm{k7} q^{7}')
+    """
+    amplitudes = tuple(
+        unit if isinstance(unit, Amplitude) else Amplitude(name, unit, name, f"{id}: {name}")
+        for name, unit in parameters.items()
+    )
+    states = dict(states or {})
+    texts = [expression, *(state.equation for state in states.values())]
+    used = set[str]().union(*(_names_in(text, id) for text in texts))
+    own = {item.name for item in amplitudes} | {shape.name for shape in shapes} | set(states)
+    check_names(used, own, set(requires), id)
+    check_states(states, used, id)
+    in_force = _names_in(expression, id)
+    check_null(expression, in_force, amplitudes, id)
+    check_unit(expression, in_force, amplitudes, shapes, states, id)
+    if "direction" in used:
+        shapes = (*shapes, _SMOOTHING)
+    return Effect(
+        id=id,
+        family=family,
+        title=title or id.replace("_", " ").capitalize(),
+        formula=formula or _latex(expression, used, id),
+        amplitudes=amplitudes,
+        places=_places_for(used, requires),
+        change=_adding_term(id, expression, states),
+        shapes=shapes,
+        constants=tuple(item for item in _MOTION_CONSTANTS if item.name in used),
+        source=source,
+        applies_to=applies_to or _applies_to(used, requires),
+    )
+
+
+def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any) -> Effect:
+    """A :func:`force_effect` with one amplitude, after which it is named."""
+    return force_effect(amplitude.name, family, expression, {amplitude.name: amplitude}, **more)
+
+
+def _latex(expression: str, used: set[str], effect: str) -> str:
+    """LaTeX of an expression."""
+    words = {"position": "q", "velocity": r"\dot q", "acceleration": r"\ddot q"}
+    known = {name: symbol(name) for name in used}
+    symbols = {symbol(k): words.get(k, rf"\mathrm{{{k}}}".replace("_", r"\_")) for k in used}
+    return str(sp.latex(parse(expression, known, (), f"effect {effect}"), symbol_names=symbols))
+
+
+def _lowest(model: Model, target: str, scales: Scales) -> float:
+    return scales.position[coordinate_of(model, target)][0]
+
+
+def _highest(model: Model, target: str, scales: Scales) -> float:
+    return scales.position[coordinate_of(model, target)][1]
+
+
+def _largest(model: Model, target: str, scales: Scales) -> float:
+    return scales.velocity[coordinate_of(model, target)]
+
+
+_MOTION_CONSTANTS = (
+    Constant("largest_velocity", "position/s", "reference velocity", _largest),
+    Constant("lowest_position", "position", "lowest position reached", _lowest),
+    Constant("highest_position", "position", "highest position reached", _highest),
+)
+
+
+def transition_velocity(name: str) -> ShapeParameter:
+    """The velocity of a smooth sign, to be scanned."""
+    words = "velocity at which friction has half its final size"
+    return ShapeParameter(name, "position/s", "v_0", words, velocity_grid(1 / 512, 1 / 4))
+
+
+#: Velocity over which the sign of a dry friction force changes, where the model states no slope.
+_SMOOTHING = replace(
+    transition_velocity("smoothing"), needed=lambda model: FRICTION_SLOPE not in model.parameters
+)
+
+
+def _names_in(text: str, effect: str) -> set[str]:
+    try:
+        tree = ast.parse(text, mode="eval")
+    except SyntaxError as error:
+        hint = "write it as in Python, e.g. k*position**3"
+        raise InputError(f"effect {effect}: not an expression", value=text, hint=hint) from error
+    calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    called = {function.id for function in calls if isinstance(function, ast.Name)}
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)} - called
+
+
+def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], tuple[str, ...]]:
+    """The places of an expression that uses these names."""
+
+    def places(model: Model) -> tuple[str, ...]:
+        if not is_quantity(model, *requires):
+            return ()
+        if "pressure" in used and _pressure(model) is None:
+            return ()
+        found = moving_places(model) if used & _NEED_VELOCITY else force_places(model)
+        if "spring_force" in used:
+            found = {k: item for k, item in found.items() if spring_force(model, item) != 0}
+        elif used & _OF_A_DIFFERENCE and not used & _OF_A_BODY:
+            found = {**found, **between_places(model)}
+        return tuple(found)
+
+    return places
+
+
+def _applies_to(used: set[str], requires: tuple[str, ...]) -> str:
+    base = "equations of motion and force laws"
+    if used & _OF_A_DIFFERENCE and not used & _OF_A_BODY:
+        base += ", between two dofs"
+    if not used & _NEED_VELOCITY:
+        base += ", first-order systems"
+    needed = [*requires, *(["gas_pressure"] if "pressure" in used else [])]
+    return base + (f" of models that declare {', '.join(needed)}" if needed else "")
+
+
+def _pressure(model: Model) -> sp.Symbol | None:
+    for name in PRESSURES:
+        if name in model.definitions:
+            return symbol(name)
+    return None
+
+
+def _adding_term(
+    effect: str, expression: str, states: Mapping[str, InternalState]
+) -> Callable[[Model, str, Names], Model]:
+    """The change that adds the states and the force."""
+
+    def change(model: Model, target: str, names: Names) -> Model:
+        place = place_at(model, target)
+        dofs = {own: free_name(f"{effect}_{own}", model) for own in states}
+        known = _vocabulary(model, place, names) | {own: symbol(n) for own, n in dofs.items()}
+        dynamic = (*model.dofs, *model.inputs, *dofs.values())
+        where = f"effect {effect}"
+        for own, state in states.items():
+            equation = {"memory": parse(state.equation, known, dynamic, where)}
+            dof = Dof(state.unit, 0.0, state.description)
+            model = model.with_dof(dofs[own], dof, equation)
+        force = parse(expression, known, dynamic, where)
+        # An output shows the force itself; in an equation the force has the sign of the inertia.
+        return with_force(model, place, _free_term(effect, model, place), force)
+
+    return change
+
+
+def _free_term(name: str, model: Model, place: Coordinate) -> str:
+    """A name that no term of the balance has: an effect may act on a body and between bodies."""
+    taken = set(balance_terms(model, place))
+    if isinstance(place, Between):
+        taken |= set(model.equations.get(place.other, {}))
+    return name if name not in taken else f"{name} {place.name}"
+
+
+def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.Expr]:
+    """The names that an effect's expression may use, as expressions of the model."""
+    own: tuple[str, ...] = (*model.inputs, *model.dofs, *model.parameters)
+    own += (*model.conditions, *model.definitions)
+    known: dict[str, sp.Expr] = {name: symbol(name) for name in own}
+    known |= {"position": place.position}
+    if not isinstance(place, Between):
+        known["spring_force"] = place.sign * spring_force(model, place)
+    pressure = _pressure(model)
+    if pressure is not None:
+        known["pressure"] = pressure
+    if place.velocity is not None:
+        known |= {"velocity": place.velocity, "acceleration": acceleration(place)}
+        if FRICTION_SLOPE in model.parameters or "smoothing" in names:
+            known["direction"] = smooth_sign(model, place.velocity, names)
+    return known | dict(names)
+
+
+def smooth_sign(model: Model, velocity: sp.Expr, names: Names) -> sp.Expr:
+    r"""Sign of a velocity, :math:`\frac{2}{\pi}\arctan(v/v_0)` (Verbeek 1993, eq. 6.1).
+
+    The model's own ``friction_slope`` is :math:`1/v_0` where it declares one.
+    """
+    if FRICTION_SLOPE in model.parameters:
+        return 2 / sp.pi * sp.atan(symbol(FRICTION_SLOPE) * velocity)
+    return 2 / sp.pi * sp.atan(velocity / names["smoothing"])
+
 
 #: Name under which a model may declare the acceleration of gravity.
 GRAVITY = "gravity"

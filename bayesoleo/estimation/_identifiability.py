@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns, variable
 from bayesoleo._parallel import thread_map
+from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._estimate import Method, estimate, polish

@@ -27,7 +27,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError, check_level, check_names
 from bayesoleo.estimation._identifiability import axes_text, over_variances, principal_axes

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._types import Array
 from bayesoleo.error_models._fitting import LinearisedResidual, inverse_gram
 from bayesoleo.error_models._independent import output_counts, staged_variance, sums_of_squares

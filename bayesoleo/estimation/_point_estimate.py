@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import variable
+from bayesoleo._schema import variable
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.prediction._stability import Stability

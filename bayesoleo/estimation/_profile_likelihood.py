@@ -21,7 +21,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns
+from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._types import Array, Float
 from bayesoleo.error_models._independent import output_counts, staged_variance
 from bayesoleo.errors import InputError, check_level, check_names

@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns, variable
+from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._storage.resume import Arrays, Slots
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult, columns, variable
+from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem

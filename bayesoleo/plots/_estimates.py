@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy import interpolate, stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo.plots import _style as style
 from bayesoleo.plots._reading import dataset
 

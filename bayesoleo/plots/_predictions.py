@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array
 from bayesoleo.errors import ResultsError
 from bayesoleo.estimation._multiple_shooting import EstimatedTrajectory

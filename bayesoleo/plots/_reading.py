@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import LabelledResult
+from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array
 from bayesoleo.assessment._assess import LAGS, correlograms, dependence_on, outliers_of
 from bayesoleo.assessment._residual_breakdown import ORDERS, Series, residual_breakdown as found_in

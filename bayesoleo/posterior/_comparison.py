@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg, stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._display import columns
+from bayesoleo._schema import columns
 from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.estimation._least_squares import PriorScale
