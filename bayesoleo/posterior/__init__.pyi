@@ -15,7 +15,7 @@ from ._datatree import (
 from ._diagnostics import (
     Samples as Samples,
 )
-from ._ensembles import (
+from ._ensemble_moves import (
     MoveWeights as MoveWeights,
 )
 from ._hierarchy import (

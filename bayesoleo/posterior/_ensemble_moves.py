@@ -1,20 +1,32 @@
-"""Moves of emcee's ensembles: differential evolution, snooker, independence proposals.
+"""Independent ensembles of walkers, advanced together by emcee, and their moves.
 
 Differential evolution steps along the difference of two other walkers. A snooker update steps along
 the line to another walker. The independence move proposes from a fixed mixture, wherever the walker
 is. Several independent ensembles are advanced in one call, and the acceptance of each kind of move
 is recorded.
+
+Workers of a cluster evaluate rows of the log density. Each row depends on itself alone, so the
+draws are the same on one machine and on many, whatever the number of ensembles or workers, and even
+if workers are lost.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections import Counter
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
+import emcee
 import numpy as np
 from emcee.moves import DEMove, MHMove, Move, RedBlueMove
 from emcee.state import State
 
+from bayesoleo._dask import WorkerPool
 from bayesoleo._types import Array, Flags, Integers
+from bayesoleo.errors import InputError
+from bayesoleo.posterior._checkpoints import REASONS, Phase, Segment
+from bayesoleo.posterior._log_density import Density
 from bayesoleo.posterior._mixture import Mixture
 
 
@@ -182,3 +194,299 @@ class Counted(Move):  # type: ignore[misc] # emcee has no types
         self.proposed += len(accepted)
         self.accepted += int(np.sum(accepted))
         return state, accepted
+
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: Largest number of redraws of walkers whose log density is not finite.
+REDRAWS = 50
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows evaluated by a worker, with their results and counters."""
+
+    log_density: Density
+
+    def __call__(self, phi: Array) -> tuple[Array, Array, Counter[str], int]:
+        before = Counter(self.log_density.failures)
+        jumps = getattr(self.log_density, "branch_jumps", 0)
+        values, by_run = self.log_density(phi)
+        failures = Counter(self.log_density.failures) - before
+        return values, by_run, failures, getattr(self.log_density, "branch_jumps", 0) - jumps
+
+
+class DistributedDensity:
+    """Log density that sends rows to workers and collects the results.
+
+    Parameters
+    ----------
+    log_density : Density
+        Sent once to each worker, with the anchors that it has.
+    client : distributed.Client
+        Connection to the workers.
+    """
+
+    def __init__(self, log_density: Density, client: Client) -> None:
+        self.log_density = log_density
+        self.evaluations, self.branch_jumps = log_density.evaluations, 0
+        self.failures: Counter[str] = Counter(log_density.failures)
+        self._crew = WorkerPool(client, _Rows(log_density), keep=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the ``d`` coordinates' quantities."""
+        return self.log_density.names
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Labels of the ``N`` parts of the log-likelihood."""
+        return self.log_density.runs
+
+    def natural(self, phi: Array) -> Array:
+        """Quantities in natural units, shape (W, d), from coordinates, shape (W, d)."""
+        return self.log_density.natural(phi)
+
+    def __call__(self, phi: Array) -> tuple[Array, Array]:
+        """Log density, shape (W,), and log-likelihood by run, shape (W, N)."""
+        pieces = np.array_split(phi, min(self._crew.size, len(phi)))
+        found = dict(self._crew.each(pieces))
+        parts = [found[index] for index in range(len(pieces))]
+        self.evaluations += len(phi)
+        for _, _, failures, jumps in parts:
+            self.failures.update(failures)
+            self.branch_jumps += jumps
+        return (
+            np.concatenate([part[0] for part in parts]),
+            np.concatenate([part[1] for part in parts]),
+        )
+
+
+@dataclass(frozen=True)
+class MoveWeights:
+    """How often each kind of move is chosen.
+
+    Parameters
+    ----------
+    independence, differential, snooker : float
+        Relative frequencies.
+    """
+
+    independence: float = 0.8
+    differential: float = 0.15
+    snooker: float = 0.05
+
+    @classmethod
+    def tuned(cls, acceptance: float) -> MoveWeights:
+        """Weights for an acceptance of the independence move.
+
+        An accepted independence move is worth a hundred of the others. Rejections are not uniform:
+        a walker in a tail that the mixture misses, such as the tip of a bent ridge, rejects nearly
+        all of them, and only the other moves bring it back.
+        """
+        share = float(np.clip(2 * acceptance - 0.9, 0.3, 0.9))
+        return cls(share, 0.75 * (1 - share), 0.25 * (1 - share))
+
+
+def default_walkers(dimension: int) -> int:
+    """Walkers of one ensemble: each half spans the space and leaves differences to choose from."""
+    return max(16, 4 * ((dimension + 2) // 2 + 1))
+
+
+@dataclass(frozen=True)
+class Ensembles:
+    """Sampler that advances the walkers of several ensembles.
+
+    Parameters
+    ----------
+    log_density : Density
+        Target, called with rows of all ensembles.
+    ensembles : int
+        Number of independent ensembles.
+    walkers : int
+        Walkers of each, even and at least ``2 (d + 1)``.
+    weights : MoveWeights
+        How often each kind of move is chosen.
+
+    Raises
+    ------
+    InputError
+        If there are too few walkers.
+    """
+
+    log_density: Density
+    ensembles: int
+    walkers: int
+    weights: MoveWeights = MoveWeights()
+
+    def __post_init__(self) -> None:
+        least = 2 * (len(self.log_density.names) + 1)
+        if self.walkers < least or self.walkers % 2:
+            raise InputError(
+                "an ensemble needs an even number of walkers that spans the space twice",
+                key="walkers",
+                value=self.walkers,
+                hint=f"write an even number from {least}, or leave it out",
+            )
+        if self.ensembles < 2:
+            raise InputError(
+                "agreement between ensembles needs at least two",
+                key="ensembles",
+                value=self.ensembles,
+            )
+
+    @property
+    def chains(self) -> int:
+        """Walkers of all ensembles."""
+        return self.ensembles * self.walkers
+
+    def start(self, mixture: Mixture, seed: int) -> Segment:
+        """Draw the walkers from a mixture; those without a finite log density are drawn again.
+
+        Parameters
+        ----------
+        mixture : Mixture
+            Mixture to draw from.
+        seed : int
+            Seeds the generator of the whole run.
+
+        Returns
+        -------
+        Segment
+            One draw, in phase ``"start"``.
+
+        Raises
+        ------
+        InputError
+            If walkers without a finite log density remain after fifty redraws.
+        """
+        random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
+        before = _Tally.of(self.log_density)
+        coords = mixture.sample(random, self.chains)
+        log_density, by_run = self.log_density(coords)
+        for _ in range(REDRAWS):
+            bad = np.flatnonzero(~np.isfinite(log_density))
+            if not bad.size:
+                break
+            coords[bad] = mixture.sample(random, bad.size)
+            log_density[bad], by_run[bad] = self.log_density(coords[bad])
+        tally = _Tally.of(self.log_density) - before
+        left = int(np.sum(~np.isfinite(log_density)))
+        if left:
+            raise InputError(
+                f"{left} of {self.chains} walkers found no point of finite log density",
+                value=dict(tally.failures),
+                hint="give starts further inside the priors' supports",
+            )
+        return Segment(
+            "start",
+            coords[None],
+            log_density[None],
+            by_run[None],
+            random.get_state(legacy=True),
+            mixture.defended(),
+            tally.evaluations,
+            tally.failures,
+            branch_jumps=tally.branch_jumps,
+        )
+
+    def advance(self, last: Segment, steps: int, phase: Phase) -> Segment:
+        """Continue after a segment.
+
+        Parameters
+        ----------
+        last : Segment
+            The new segment continues from its last draw, generator and mixture.
+        steps : int
+            Draws of each walker.
+        phase : {"warm-up", "kept"}
+            After a warm-up segment the mixture is adapted to it; after a kept one it is the same.
+
+        Returns
+        -------
+        Segment
+        """
+        moves = self._moves(last.mixture)
+        sampler = emcee.EnsembleSampler(
+            self.chains, len(self.log_density.names), self._rows, moves=moves, vectorize=True
+        )
+        # emcee wraps the function in one that prints the traceback and all rows of whatever passes
+        # through, an interrupt too.
+        sampler.log_prob_fn = self._rows
+        tallies = [_Tally.of(self.log_density)]
+        state = State(
+            last.coords[-1],
+            log_prob=last.log_density[-1],
+            # emcee drops an axis of length one from blobs
+            blobs=last.by_run[-1].squeeze(axis=1) if len(self._runs) == 1 else last.by_run[-1],
+            random_state=last.random_state,
+            copy=True,
+        )
+        for _ in sampler.sample(state, iterations=steps, skip_initial_state_check=True):
+            tallies.append(_Tally.of(self.log_density))
+        coords = sampler.get_chain()
+        mixture = last.mixture
+        if phase == "warm-up":
+            mixture = mixture.refitted(coords.reshape(-1, mixture.dimension))
+        tally = tallies[-1] - tallies[0]
+        return Segment(
+            phase,
+            coords,
+            sampler.get_log_prob(),
+            sampler.get_blobs().reshape(steps, self.chains, -1),
+            sampler.random_state,
+            mixture,
+            tally.evaluations,
+            tally.failures,
+            Counter({move.name: move.proposed for move, _ in moves}),
+            Counter({move.name: move.accepted for move, _ in moves}),
+            tally.branch_jumps,
+            np.array([(after - before).by_reason for before, after in pairwise(tallies)]),
+        )
+
+    @property
+    def _runs(self) -> tuple[str, ...]:
+        return self.log_density.runs
+
+    def _rows(self, coords: Array) -> Array:
+        log_density, by_run = self.log_density(coords)
+        return np.column_stack([log_density, by_run])
+
+    def _moves(self, mixture: Mixture) -> list[tuple[Counted, float]]:
+        kinds = (
+            ("independence", IndependenceMove(mixture), self.weights.independence),
+            (
+                "differential",
+                Grouped(differential_evolution(), self.ensembles),
+                self.weights.differential,
+            ),
+            ("snooker", Grouped(SnookerMove(), self.ensembles), self.weights.snooker),
+        )
+        return [(Counted(name, move), weight) for name, move, weight in kinds]
+
+
+@dataclass(frozen=True)
+class _Tally:
+    """A density's counters at one moment, or between two."""
+
+    evaluations: int
+    failures: Counter[str]
+    branch_jumps: int
+
+    @classmethod
+    def of(cls, log_density: Density) -> _Tally:
+        jumps = getattr(log_density, "branch_jumps", 0)  # of densities that solve something
+        return cls(log_density.evaluations, Counter(log_density.failures), jumps)
+
+    @property
+    def by_reason(self) -> list[int]:
+        """Failures in the order of a segment's table."""
+        return [self.failures[reason] for reason in REASONS]
+
+    def __sub__(self, other: _Tally) -> _Tally:
+        return _Tally(
+            self.evaluations - other.evaluations,
+            self.failures - other.failures,
+            self.branch_jumps - other.branch_jumps,
+        )

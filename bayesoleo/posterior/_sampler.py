@@ -22,7 +22,7 @@ from bayesoleo.posterior._diagnostics import (
     nested_rhat,
     rhat_limit,
 )
-from bayesoleo.posterior._ensembles import (
+from bayesoleo.posterior._ensemble_moves import (
     DistributedDensity,
     Ensembles,
     MoveWeights,
