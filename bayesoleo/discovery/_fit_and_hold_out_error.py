@@ -1,6 +1,8 @@
 r"""Fit and hold-out error: errors of a prediction against the noise, by run and output.
 
-All rounds of the search use the same noise: the smallest that any of its models supports.
+Hold-out runs are predicted in ``_run_predictions.py``; how large their error may be follows in
+``_expected_error.py``, and whether an effect lowers it in ``_hold_out_confirmation.py``. All rounds
+of the search use the same noise: the smallest that any of its models supports.
 
 A test decides whether a residual agrees with its expected error. The squared ratio of the two is a
 sum of squares of the noise's coefficients, which are many, and of the unknowns' errors, which may

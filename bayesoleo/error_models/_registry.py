@@ -2,7 +2,7 @@
 
 Each model has up to two forms: quantities that are sampled with the parameters
 (:class:`ErrorModel`), and a covariance that point estimators eliminate in each iteration
-(:class:`ProfiledErrorModel`). A new model is one file and one line in the table below.
+(:class:`ProfiledErrorModel`). A new model is one file, its import and one line in ``_REGISTRY``.
 
 ====================== =============================================================================
 word                   errors
@@ -15,6 +15,8 @@ word                   errors
 ``shared-discrepancy`` as ``discrepancy``, with a part of the process that all runs share
 ``catalogue``          all effects that the model might lack, and a smooth remainder
 ``power``              as ``independent``, the likelihood to the power of the effective samples
+``common``             one variance for all outputs; eliminated only
+``given``              known variances or covariances; eliminated only
 ====================== =============================================================================
 """
 
