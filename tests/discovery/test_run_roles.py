@@ -82,7 +82,7 @@ def test_a_lone_short_run_cannot_be_split(tmp_path):
 
 
 def test_no_run_to_fit_is_an_error(records):
-    with pytest.raises(CampaignError, match="no run has the role fit"):
+    with pytest.raises(CampaignError, match="no run to fit; give one run or more role"):
         assign([r for r in records if r.role != "fit"])
 
 

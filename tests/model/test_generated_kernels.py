@@ -297,6 +297,8 @@ def flipped(content):
 @pytest.mark.parametrize("damage", [lambda _: b"", cut, flipped], ids=["empty", "cut", "flipped"])
 def test_a_damaged_file_of_the_cache_is_made_anew(tmp_path, monkeypatch, damage):
     monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    # Numba's own setting would send its files elsewhere.
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
     assert evaluate(SMALL) == [1.5, 2.5, 3.5]
     whole = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     kinds = {"".join(path.suffixes[-1:]) for path in whole}
