@@ -179,9 +179,11 @@ class Evidence:
         """Whether a structure's effects were estimated together."""
         return self._depth.get(key, -1) == len(key[0])
 
-    def nearest(self, effects: tuple[Added, ...]) -> EstimatedModel:
+    def nearest(self, effects: tuple[Added, ...], declared: EstimatedModel) -> EstimatedModel:
         """The best estimate of the largest part of some effects, from which all are estimated."""
         there = [k for k in self._anchors if self.estimated(k) and not k[1] and k[0] < {*effects}]
+        if not there:  # nothing could be compared about the declared model
+            return declared
         return self._anchors[max(there, key=lambda key: (len(key[0]), self.found[key]))]
 
     def without_outside(self) -> list[tuple[Added, ...]]:
@@ -198,6 +200,8 @@ class Evidence:
             height = self.evidence_of(key) + prior.log_probability(effects, key[1], weights)
             place = (len(effects), key[1])
             best[place] = max(best.get(place, (-np.inf, ())), (height, effects))
+        if not best:
+            return []
         closed = max((item for place, item in best.items() if not place[1]), default=(0.0, ()))
         if closed[0] > max(item[0] for place, item in best.items() if place[1]):
             return []
@@ -293,7 +297,8 @@ def structure_posterior(
     curves = curves_of(base, assembly, numerics.jobs)
     comparison = Comparison.of(base, errors, scores, prior, curves)
     evidence = Evidence(replace(comparison, later=later))
-    evidence.add(EstimatedModel(base.fit, {}))
+    declared = EstimatedModel(base.fit, {})
+    evidence.add(declared)
     for grown, fit in known:
         evidence.add(_anchor(grown, fit, by_key))
     tried: set[tuple[Added, ...]] = set()
@@ -308,7 +313,7 @@ def structure_posterior(
             break
         callback(f"estimate {len(chosen)} structures")
         tried |= set(chosen)
-        starts = [(effects, evidence.nearest(effects)) for effects in chosen]
+        starts = [(effects, evidence.nearest(effects, declared)) for effects in chosen]
         for found in thread_map(lambda one: extended(*one), starts, numerics.jobs):
             if found is not None:
                 evidence.add(found)

@@ -127,7 +127,10 @@ def test_an_estimate_does_not_depend_on_where_it_starts(two):
     """The mode is one: from the estimate of a part, or from the declared model."""
     evidence, (one, _, both, other) = evidence_with(two)
     evidence.add(one)
-    assert evidence.nearest(PAIR) is one
+    assert evidence.nearest(PAIR, both) is one
+    nothing_compared = Evidence(evidence.comparison)
+    assert nothing_compared.nearest(PAIR, both) is both
+    assert nothing_compared.without_outside() == []
     for name, value in both.fit.values.items():
         # Estimates for comparison end where steps are small parts of a standard deviation.
         sd = float(
