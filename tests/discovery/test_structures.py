@@ -123,6 +123,14 @@ def test_two_effects_are_found_where_none_was_tried_as_a_pair(two, monkeypatch):
     assert all(found.effects[key] > 0.9 for key in PAIR)
 
 
+def test_parts_of_a_probable_pair_are_estimated_each(two):
+    evidence, (one, _, both, _) = evidence_with(two)
+    evidence.add(both)
+    assert set(evidence.parts(np.log(0.1))) == {(key,) for key in PAIR}
+    evidence.add(one)
+    assert evidence.parts(np.log(0.1)) == [(PAIR[1],)]
+
+
 def test_an_estimate_does_not_depend_on_where_it_starts(two):
     """The mode is one: from the estimate of a part, or from the declared model."""
     evidence, (one, _, both, other) = evidence_with(two)
