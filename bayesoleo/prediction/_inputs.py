@@ -13,6 +13,7 @@ from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._expressions import COSINE, SINE, WITHIN
 from bayesoleo.model._kernels import kernels
 from bayesoleo.model._model import Model
+from bayesoleo.prediction._band_limited import Smoothed, declared
 from bayesoleo.prediction._records import Harmonics, Record, Signal
 from bayesoleo.solvers._initial_value import Dynamics
 from bayesoleo.solvers._switching import InputSignal, periodic_signal
@@ -61,7 +62,7 @@ def signal_of(record: Record, channel: str, highest: int = 0) -> Signal:
         If the record lacks the channel.
     """
     if channel not in record.signals:
-        restricted = _restricted(record, channel)
+        restricted = _restricted(record, channel, highest)
         if restricted is not None:
             return restricted.for_derivative(highest)
         raise CampaignError(
@@ -80,16 +81,16 @@ def highest_derivatives(rows: tuple[tuple[str, int], ...]) -> dict[str, int]:
     return highest
 
 
-def _restricted(record: Record, name: str) -> Signal | None:
+def _restricted(record: Record, name: str, highest: int = 0) -> Signal | None:
     """One channel at the harmonics of another, as :func:`~bayesoleo.model._expressions.within`
-    names it; of a transient, the channel itself."""
+    names it; of a transient, in the band of the other."""
     channel, _, other = name.partition(WITHIN)
     if channel in (COSINE, SINE) and other in record.harmonics:
         return _turning(record.harmonics[other], channel)
     if channel not in record.signals or other not in record.signals:
         return None
     if not record.periodic:
-        return record.signals[channel]
+        return _in_band_of(record, channel, other, highest)
     item = record.harmonics[channel]
     like = record.harmonics[other]
     kept = np.isin(item.orders, like.orders)
@@ -100,6 +101,25 @@ def _restricted(record: Record, name: str) -> Signal | None:
         coefficients=item.coefficients[kept],
         variances=item.variances[kept],
     )
+
+
+def _in_band_of(record: Record, channel: str, other: str, highest: int) -> Signal:
+    """A channel of a transient, cut off where another one is.
+
+    The channel is an output of the model. Its noise above the band of what moves the model would
+    be noise of the prediction as well: the two can cancel, and what feeds an output back would
+    seem to explain it.
+    """
+    own = record.signals[channel].for_derivative(highest)
+    like = record.signals[other].for_derivative(highest)
+    if not (isinstance(own, Smoothed) and isinstance(like, Smoothed)) or like.band is None:
+        return own
+    if own.band is not None and own.band.cut <= like.band.cut:
+        return own
+    if not np.isfinite(like.band.cut):
+        return own
+    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+    return declared(record.samples[channel], step, like.band.cut)
 
 
 def _turning(item: Harmonics, part: str) -> Harmonics | None:

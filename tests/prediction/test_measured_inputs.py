@@ -1,12 +1,15 @@
 """A measured channel as an input at another one's harmonics: what a frame's compliance needs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bayesoleo.errors import CampaignError
 from bayesoleo.model._expressions import within
+from bayesoleo.prediction._band_limited import declared
 from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
-from bayesoleo.prediction._records import Harmonics, Record
+from bayesoleo.prediction._records import Harmonics, Record, transient_record
 
 
 def harmonics(**amplitudes):
@@ -49,3 +52,29 @@ def test_what_both_channels_show_alike_cancels(record):
 def test_an_unknown_channel_is_still_one(record):
     with pytest.raises(CampaignError, match="the model needs channel 'torque_within_displacement'"):
         signal_of(record, "torque_within_displacement")
+
+
+def test_of_a_transient_noise_above_the_band_of_the_motion_is_not_fed_back():
+    """A force whose noise nobody can tell from signal, behind a frame: the noise of the output must
+    not enter its prediction."""
+    rng, time = np.random.default_rng(3), np.arange(400) / 100.0
+    motion = 0.01 * np.sin(2 * np.pi * 1.3 * time) * np.exp(-time) + 1e-6 * rng.standard_normal(400)
+    noise = rng.standard_normal(400)
+    force = 2e3 * motion + noise
+    record = transient_record("a", time, {"force": force, "displacement": motion})
+    whole = declared(force, 0.01, 50.0)  # as where its spectrum shows no floor
+    record = replace(record, smoothed={**record.smoothed, "force": whole})
+    cut = signal_of(record, "displacement", 1).band.cut
+    assert cut < 10.0
+    restricted = signal_of(record, within("force", "displacement"), 1)
+    shown = restricted.at(time)
+    window = np.hanning(time.size)  # the ends differ
+    spectrum = np.abs(np.fft.rfft(window * (shown - shown.mean()))) ** 2
+    frequency = np.fft.rfftfreq(time.size, 0.01)
+    measured = np.abs(np.fft.rfft(window * noise)) ** 2
+    above = frequency > 2.0 * cut  # the curve fades out over half its bandwidth
+    # A thousandth of the power: amplitude is down by thirty.
+    assert spectrum[above].sum() < 1e-3 * measured[above].sum()
+    # What moves the frame is left as it is.
+    slow = 2e3 * motion
+    assert np.std((shown - slow)[20:-20]) < 0.6 * noise.std()
