@@ -148,7 +148,7 @@ def _yield_in_law(model: Model, place: Coordinate, compliance: sp.Symbol) -> Mod
     measured = within(place.target, place.name)
     table = {
         derivative_symbol(place.name, n): derivative_symbol(place.name, n)
-        - compliance * derivative_symbol(measured, n)
+        - place.sign * compliance * derivative_symbol(measured, n)
         for n in range(MAXIMUM_DERIVATIVE)
     }
     unit = model.outputs[place.target].unit

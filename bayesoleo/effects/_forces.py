@@ -174,6 +174,12 @@ def force_effect(
     )
 
 
+def resisting_side(model: Model, target: str) -> int:
+    """The likely sign of what damps: motion is resisted, unless a declared term did so too much."""
+    place = place_at(model, target)
+    return 1 if place.kind == "equation" else place.sign * resistance_sense(model, place)
+
+
 def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any) -> Effect:
     """A :func:`force_effect` with one amplitude, after which it is named."""
     return force_effect(amplitude.name, family, expression, {amplitude.name: amplitude}, **more)
@@ -355,7 +361,7 @@ def _side_of_mass(model: Model, target: str) -> int:
     terms = balance_terms(model, place).values()
     if place.kind == "equation" or any(model.expand(one).has(acceleration(place)) for one in terms):
         return 0
-    return resistance_sense(model, place)
+    return place.sign * resistance_sense(model, place)
 
 
 MASS = replace(

@@ -6,8 +6,10 @@ that is not used is reported, because most are typing errors.
 
 from __future__ import annotations
 
+import cmath
 import hashlib
 import keyword
+import math
 import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from copy import copy
@@ -24,6 +26,14 @@ from bayesoleo.model._parameters import Condition, Coordinate, Dof, Output, Para
 
 type Text = str | float | sp.Expr
 type Terms = Mapping[str, sp.Expr]
+
+
+def _slope(term: sp.Expr, moving: sp.Symbol) -> float:
+    """Change of a term with a motion, at a state that is off every zero; zero if it has none."""
+    others = {item: 0.5 for item in term.free_symbols if item != moving}
+    low, high = (complex(term.subs(others).subs(moving, value)) for value in (0.25, 0.75))
+    change = high - low
+    return change.real if cmath.isfinite(change) and change.imag == 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -315,12 +325,21 @@ class Model:
             names = {split_derivative(item)[0] for item in self.output(output).free_symbols}
             for name in self.inputs:
                 if name in names:
-                    places.append(
-                        Coordinate(
-                            name, symbol(name), derivative_symbol(name, 1), "output", output, 1
-                        )
-                    )
+                    velocity, sign = derivative_symbol(name, 1), self._sense(output, name)
+                    places.append(Coordinate(name, symbol(name), velocity, "output", output, sign))
         return tuple(places)
+
+    def _sense(self, output: str, name: str) -> int:
+        """Sign with which an output shows what resists a motion: -1 if it is the force on the other
+        body. What damps decides, without it what springs back; +1 where terms disagree."""
+        numbers = self.nominal()
+        terms = [self.expand(term).subs(numbers) for term in self.output_terms(output).values()]
+        for moving in (derivative_symbol(name, 1), symbol(name)):
+            values = [_slope(term, moving) for term in terms if term.has(moving)]
+            found = {math.copysign(1.0, value) for value in values if value}
+            if found:
+                return -1 if found == {-1.0} else 1
+        return 1
 
     def digest(self) -> str:
         """SHA-256 of what the model says; equal for models that say the same in the same words."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import pytest
+import sympy as sp
 
 from bayesoleo.effects import catalogue, find_effect
 from bayesoleo.effects._nonparametric import balance_places
+from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import force_places
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.model._expressions import derivative_symbol
 
 
 def law(output: tuple[str, str], terms: str, **inputs: str) -> Model:
@@ -78,7 +81,8 @@ def test_a_force_acts_on_a_motion(model, places):
     ("model", "side"),
     [
         (law(("force", "N"), "a*dot(x) + b*x", x="m"), 1),
-        (law(("force", "N"), "-a*dot(x) - b*x", x="m"), -1),
+        # What a load cell on the other body shows is added in the same sense.
+        (law(("force", "N"), "-a*dot(x) - b*x", x="m"), 1),
         (law(("force", "N"), "a*dot(x) + b*dot(x)**2*tanh(dot(x))", x="m"), 1),
         (law(("force", "N"), "a*dot(x) - b*dot(x)*abs(x)", x="m"), 0),  # nobody knows
         (law(("force", "N"), "a*dot(x) + b*ddot(x)", x="m"), 0),  # what is stated may be too large
@@ -124,3 +128,48 @@ def test_a_name_alone_is_not_the_quantity(name, right, wrong, effect):
     assert effect in offered(with_unit(right))
     assert effect in offered(with_unit(""))
     assert effect not in offered(with_unit(wrong))
+
+
+def _law(sense: str) -> Model:
+    terms = {"damping": "damping*dot(x)", "spring": "stiffness*x + cubic*x**3"}
+    known = {"damping": 200.0, "stiffness": 1e3, "cubic": 2e6}
+    units = {"damping": "N*s/m", "stiffness": "N/m", "cubic": "N/m**3"}
+    return Model(
+        "law",
+        inputs={"x": "m"},
+        parameters={n: Parameter(v, units[n], relative_sd=0.5) for n, v in known.items()},
+        outputs={"force": Output({n: f"{sense}({t})" for n, t in terms.items()}, "N")},
+    )
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        effect
+        for effect in catalogue()
+        if effect.family in ("damping", "friction", "stiffness", "contact", "compliance")
+        and "force" in effect.places(_law(""))
+    ],
+    ids=lambda effect: effect.id,
+)
+def test_a_load_cell_on_the_other_body_shows_every_effect_reversed(effect):
+    """Of the force that the specimen exerts instead of the one that it feels only the sign differs,
+    so that what only resists is found with either."""
+    scales = Scales({"x": (-0.01, 0.01)}, {"x": 0.1}, {"force": 50.0}, 1.0, 1.0)
+    felt, exerted = (effect.extend(_law(sense), "force", scales) for sense in ("", "-"))
+    fed_back = [derivative_symbol("force_within_x", order) for order in range(3)]
+    turned = {one: -one for one in fed_back}
+    whole = felt.model.expand(felt.model.output("force")).subs(turned, simultaneous=True)
+    other = exerted.model.expand(exerted.model.output("force"))
+    assert sp.simplify(whole + other) == 0
+    assert (felt.sign, felt.usual) == (exerted.sign, exerted.usual)
+
+
+def test_a_spring_alone_says_in_which_sense_a_load_cell_reads():
+    spring = Model(
+        "spring",
+        inputs={"x": "m"},
+        parameters={"stiffness": Parameter(1e3, "N/m", relative_sd=0.5)},
+        outputs={"force": Output("-stiffness*x", "N")},
+    )
+    assert [place.sign for place in spring.coordinates()] == [-1]
