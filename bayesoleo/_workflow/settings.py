@@ -6,9 +6,8 @@ metadata are set from Python only. This file imports no numerics, so that ``--he
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, cast
@@ -169,15 +168,17 @@ def _read_prior(text: str) -> StructurePrior:
         )  # fmt: skip
     given |= {name: rest * weight / sum(left.values()) for name, weight in left.items()}
     found = replace(default, **cast(dict[str, Any], given))
-    _check_prior(found, (), _PRIOR_FLAG)
+    _check_prior(found, {}, _PRIOR_FLAG)
     return found
 
 
-def _check_prior(prior: StructurePrior, families: Collection[str], key: str) -> None:
-    """Refuse a prior of structures that allows no logarithm, or names no family."""
+def _check_prior(prior: StructurePrior, known: Mapping[str, Collection[str]], key: str) -> None:
+    """Refuse a prior of structures that allows no logarithm, or names no family or effect."""
     parts: dict[str, Any] = {name: getattr(prior, name) for name in PRIOR_PARTS}
     parts |= {f"numbers[{k}]": number for k, number in enumerate(prior.numbers)}
-    parts |= {f"families[{name!r}]": weight for name, weight in prior.families.items()}
+    for kind in ("families", "effects"):
+        weights = getattr(prior, kind)
+        parts |= {f"{kind}[{name!r}]": weight for name, weight in weights.items()}
     for name, value in parts.items():
         if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
             raise InputError(
@@ -187,12 +188,11 @@ def _check_prior(prior: StructurePrior, families: Collection[str], key: str) -> 
     if not prior.numbers:
         hint = "write (0.75, 0.2, 0.04, 0.01) for one, two, three and four effects"
         raise InputError("is empty", key=f"{key}.numbers", value=prior.numbers, hint=hint)
-    for name in prior.families if families else ():
-        if name not in families:
-            close = difflib.get_close_matches(name, families, 1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            hint += f"families are: {', '.join(sorted(families))}"
-            raise InputError("unknown family", key=f"{key}.families", value=name, hint=hint)
+    for kind, names in known.items():
+        for name in getattr(prior, kind).keys() - names:
+            hint = choose(name, sorted(names), len(names) if kind == "families" else 3)
+            one = {"families": "family", "effects": "effect"}[kind]
+            raise InputError(f"unknown {one}", key=f"{key}.{kind}", value=name, hint=hint)
 
 
 #: The setting is made where it is needed, so that ``--help`` needs no numerics.
@@ -390,8 +390,9 @@ class Settings:
                 "no prior of structures", key="structure_prior", value=self.structure_prior,
                 hint="write bayesoleo.discovery.StructurePrior(nothing=0.8)",
             )  # fmt: skip
-        families = {effect.family for effect in (*self._offered, *catalogue())}
-        _check_prior(self.structure_prior, families, "structure_prior")
+        every = (*self._offered, *catalogue())
+        known = {"families": {e.family for e in every}, "effects": {e.id for e in every}}
+        _check_prior(self.structure_prior, known, "structure_prior")
 
     @property
     def _offered(self) -> tuple[Effect, ...]:

@@ -26,8 +26,10 @@ from bayesoleo.discovery._structure_evidence import (
     Likelihood,
     Reduced,
     Remainders,
+    by_side,
     effect_evidence,
     fewer,
+    log_difference,
     mean_of,
     pair_evidence,
     sizes_between,
@@ -38,6 +40,8 @@ from bayesoleo.prediction._run_errors import input_columns
 #: Effects whose pairs are considered, and directions that a law outside the catalogue is made of.
 IN_PAIRS, DIRECTIONS = 10, 40
 _LOG_2 = float(np.log(2.0))
+#: Prior probability of the likely side of an effect of which both sides are possible.
+LIKELY_SIDE = 0.9
 #: Columns whose products with each other are kept at a time.
 CHUNK = 64
 #: A direction of the law weaker than this part of the strongest is left out.
@@ -155,9 +159,9 @@ class Comparison:
             size, shapes = len(score.names), score.option.candidate.shapes
             if size == 1 and len(shapes) == 1 and len(own) > 1:
                 own = self._finer(own)
-            sign = score.option.candidate.sign.get(score.names[0], 0) if size == 1 else 0
+            positive = positive_part(score)
             groups[score.option.key] = tuple(
-                Group(tuple(range(start + k, start + k + size)), sign)
+                Group(tuple(range(start + k, start + k + size)), positive)
                 for k in range(0, len(own), size)
             )
             rows.append(own)
@@ -179,6 +183,15 @@ class Comparison:
         found = np.empty((2 * len(rows) - 1, rows.shape[1]))
         found[::2], found[1::2] = rows, between
         return found
+
+
+def positive_part(score: Score) -> float:
+    """Prior probability that an effect's size is above zero; one half with several sizes."""
+    if len(score.names) != 1:
+        return 0.5
+    candidate, (name,) = score.option.candidate, score.names
+    sign = candidate.sign.get(name, 0)
+    return 0.5 * (1.0 + (sign or (2.0 * LIKELY_SIDE - 1.0) * candidate.usual.get(name, 0)))
 
 
 def _directions(rows: Array, variance: Array) -> Array:
@@ -299,20 +312,43 @@ def evidences_about(
     for outside, value in zip((False, True), at.remainders.split(totals), strict=True):
         found[own, outside] = mean_of(value)
     similar = _like_own(at, tuple(anchor.effects), totals)
+    logs = {key: _curve(at, groups) for key, groups in at.curves.items()}
+    by_curve = _like_own_by_curves(at, tuple(anchor.effects), logs, len(columns.curves))
+    for pair, log in by_curve.items():
+        similar[pair] = float(np.logaddexp(similar[pair], log) - _LOG_2)
     for some in _chunks(at.groups):
         more, alike = _one_more(at, some)
         found |= {(own | {key}, outside): value for (key, outside), value in more.items()}
         similar |= {(own, key): value for key, value in alike.items()}
     if chosen is None:
         found |= _pairs(at, best_alone(found, IN_PAIRS))
-    every = {key: _curve(at, groups) for key, groups in at.curves.items()}
-    curves = {key: value for key, value in every.items() if np.isfinite(value)}
+    curves = {key: mean_of(value) for key, value in logs.items()}
+    curves = {key: value for key, value in curves.items() if np.isfinite(value)}
     if curves:
         # Half of what is outside the catalogue is a function of one quantity; those that are not
         # tried here explain next to nothing.
         total = logsumexp(list(curves.values())) - np.log(len(columns.curves))
         found[own, True] = float(np.logaddexp(found[own, True], total) - _LOG_2)
-    return Reached(found, curves, similar)
+    # Where both signs are possible, an anchor has the one of its estimate.
+    side = _side_of_own(anchor, comparison)
+    return Reached(
+        {key: value + side for key, value in found.items()},
+        curves,
+        {pair: value + side for pair, value in similar.items()},
+    )
+
+
+def _side_of_own(anchor: EstimatedModel, comparison: Comparison) -> float:
+    """What the prior of its effects' signs adds to the evidence of an anchor."""
+    names, point = list(anchor.fit.problem.names), anchor.fit.point
+    total = 0.0
+    for score in (*comparison.scores, *comparison.later):
+        own = anchor.effects.get(score.option.key, ())
+        if len(own) == 1 and own[0] in names:
+            k = names.index(own[0])
+            distance = point.theta[k] / np.sqrt(point.covariance[k, k])
+            total += float(by_side(positive_part(score), distance))
+    return total
 
 
 def _like_own(at: _At, effects: Sequence[Added], totals: Array) -> Similar:
@@ -329,14 +365,37 @@ def _like_own(at: _At, effects: Sequence[Added], totals: Array) -> Similar:
     return found
 
 
-def _curve(at: _At, groups: Sequence[Group]) -> float:
-    """Log evidence of the anchor's structure with an unnamed function."""
+def _curve(at: _At, groups: Sequence[Group]) -> Array:
+    """Log evidence of the anchor's structure with an unnamed function, by fineness, sizes of the
+    anchor's own effects, and size of the function."""
     values = []
     for group in groups:
         local = Group(tuple(range(len(group.columns))))
         noise = [part.of_some([0], local.columns) for part in at.parts(group.columns)]
-        values += [effect_evidence(part, at.likelihood, [local], at.sizes) for part in noise]
-    return mean_of(np.array(values))
+        found = [effect_evidence(part, at.likelihood, [local], at.sizes) for part in noise]
+        values.append([logs[0, 0] for logs in found])
+    return np.array(values)
+
+
+def _like_own_by_curves(
+    at: _At, effects: Sequence[Added], logs: Mapping[Added, Array], number: int
+) -> Similar:
+    """The same as :func:`_like_own`, of a law that differs from the effect by a function of one
+    quantity, of which there are so many."""
+    few, every = fewer(at.sizes), frozenset(effects)
+    finite = [value for value in logs.values() if np.isfinite(value).all()]
+    if not effects or not finite:
+        return {}
+    share = log_difference(at.sizes / few[:, None])
+    share = share - logsumexp(share, axis=1, keepdims=True)  # (own sizes, sizes of the function)
+    found: Similar = {}
+    for place, key in enumerate(effects):
+        grid = np.arange(few.size)
+        if len(effects) == 2:
+            grid = np.repeat(grid, few.size) if place == 0 else np.tile(grid, few.size)
+        each = [mean_of(logsumexp(value + share[grid], axis=2)) for value in finite]
+        found[every - {key}, key] = float(logsumexp(each) - np.log(number))
+    return found
 
 
 def _chunks(groups: Mapping[Added, Sequence[Group]]) -> list[list[Added]]:
@@ -379,7 +438,7 @@ def _local(at: _At, keys: Sequence[Added]) -> tuple[list[int], dict[Added, list[
     columns = [c for key in keys for group in at.groups[key] for c in group.columns]
     place = {column: k for k, column in enumerate(columns)}
     groups = {
-        key: [Group(tuple(place[c] for c in g.columns), g.sign) for g in at.groups[key]]
+        key: [Group(tuple(place[c] for c in g.columns), g.positive) for g in at.groups[key]]
         for key in keys
     }
     return columns, groups
@@ -419,7 +478,7 @@ def _anchored(
         for group in chosen:
             start = len(own) + len(index)
             index.extend(group.columns)
-            found.append(Group(tuple(range(start, start + len(group.columns))), group.sign))
+            found.append(Group(tuple(range(start, start + len(group.columns))), group.positive))
         return found
 
     groups = {key: placed(columns.groups[key]) for key in beside}

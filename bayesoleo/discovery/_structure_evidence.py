@@ -36,7 +36,7 @@ SIZES, LAW_SIZES, SMOOTH_SIZES = 10, 5, 5
 VISIBLE = 3.0
 #: Difference of a law from the effect that it resembles, as a part of the effect's size, and the
 #: spread of its logarithm.
-DIFFERENCE, DIFFERENCE_SPREAD = 0.4, 1.0
+DIFFERENCE, DIFFERENCE_SPREAD = 0.25, 1.2
 _LOG_2 = float(np.log(2.0))
 
 
@@ -268,12 +268,16 @@ class Remainders:
     def similar(self, logs: Array, sizes: Array) -> Array:
         """Log evidence of a law that resembles an effect, from that of all parts and sizes of the
         effect (parts, ..., sizes): it differs from it by some part of the effect's size."""
-        ratio = np.sqrt(self.power[1:, None]) / sizes
         share = np.log([w for _, _, w in self.weights[1:]])[:, None]
-        share = share - 0.5 * (np.log(ratio / DIFFERENCE) / DIFFERENCE_SPREAD) ** 2
+        share = share + log_difference(np.sqrt(self.power[1:, None]) / sizes)
         share = share - logsumexp(share, axis=0)
         shape = (len(share), *(1,) * (logs.ndim - 2), sizes.size)
         return np.asarray(logsumexp(logs[1:] + share.reshape(shape), axis=0))
+
+
+def log_difference(ratio: Array) -> Array:
+    """Log prior of the size of the difference of a law from an effect, over the effect's size."""
+    return np.asarray(-0.5 * (np.log(ratio / DIFFERENCE) / DIFFERENCE_SPREAD) ** 2)
 
 
 @dataclass(frozen=True)
@@ -305,12 +309,12 @@ class Group:
     Parameters
     ----------
     columns : tuple of int
-    sign : int
-        Side of the null that is physical; zero for both.
+    positive : float
+        Prior probability that the size is above zero; one or zero where only one side is physical.
     """
 
     columns: tuple[int, ...]
-    sign: int = 0
+    positive: float = 0.5
 
 
 def effect_evidence(
@@ -332,20 +336,24 @@ def effect_evidence(
     index = np.array([groups[k].columns[0] for k in single], dtype=int)
     square, logs = parts.square[:, None, None], parts.log_det[:, None, None]
     if single:
-        signs = np.array([groups[k].sign for k in single])[:, None]
+        positive = np.array([groups[k].positive for k in single])[:, None]
         slope = parts.slope[:, index, None]
         grown = 1.0 + sizes**2 * np.maximum(parts.gram[:, index, index, None], 0.0)
         value = likelihood(square - sizes**2 * slope**2 / grown, logs + np.log(grown))
-        found[:, single] = value + _one_side(signs, slope * sizes / np.sqrt(grown))
+        found[:, single] = value + by_side(positive, slope * sizes / np.sqrt(grown))
     for k, group in enumerate(groups):
         if len(group.columns) > 1:
             found[:, k] = _together(parts, likelihood, group, sizes)
     return found
 
 
-def _one_side(signs: Array, distance: Array) -> Array:
-    """What a prior on one side of zero adds, which is twice as high there."""
-    return np.where(signs != 0, _LOG_2 + log_ndtr(signs * distance), 0.0)
+def by_side(positive: Array | float, distance: Array | float) -> Array:
+    """What a prior adds that is higher on one side of zero, by the distance from zero in standard
+    deviations."""
+    with np.errstate(divide="ignore"):  # one side may be impossible
+        above, below = np.log(positive), np.log1p(-np.asarray(positive))
+    sides = np.logaddexp(above + log_ndtr(distance), below + log_ndtr(-np.asarray(distance)))
+    return np.asarray(_LOG_2 + sides)
 
 
 def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array) -> Array:
@@ -378,8 +386,7 @@ def pair_evidence(
     # Each side by itself: the two are nearly independent where both are seen.
     here = (its * first - mixed * second) / np.sqrt(its * det)
     there = (own * second - mixed * first) / np.sqrt(own * det)
-    both = _one_side(np.array(one.sign), here) + _one_side(np.array(other.sign), there)
-    return np.asarray(found + both)
+    return np.asarray(found + by_side(one.positive, here) + by_side(other.positive, there))
 
 
 def mean_of(logs: Array) -> float:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 from scipy.special import logsumexp
@@ -89,6 +90,8 @@ class Evidence:
     _similar: dict[frozenset[Added], dict[Added, float]] = field(default_factory=dict)
     _anchors: dict[Key, EstimatedModel] = field(default_factory=dict)
     _resemblance: dict[Added, float] = field(init=False)
+    #: Sets of several effects, by the other effects that they were compared beside.
+    _several: dict[frozenset[Added], set[frozenset[Added]]] = field(default_factory=dict)
     _shaped: set[Added] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -131,19 +134,32 @@ class Evidence:
                 self.found[key], self._depth[key] = value, here
                 self._anchors[key] = anchor
                 self._beyond[key] = max(value - result[own, key[1]], 0.0)
+        for every in {effects for effects, outside in result if not outside}:
+            for count in range(2, len(every) + 1):
+                for more in map(frozenset, combinations(sorted(every), count)):
+                    self._several.setdefault(every - more, set()).add(more)
 
     def evidence_of(self, key: Key) -> float:
         """Log evidence of a structure.
 
-        Half of the laws outside the catalogue resemble one of its effects.
+        Half of the laws outside the catalogue resemble one of its effects, or several together.
         """
         effects, outside = key
-        weights = self._resemblance if outside else {}
-        like = self._similar.get(effects, {})
-        alike = [np.log(weights[k]) + value for k, value in like.items() if weights.get(k, 0.0) > 0]
-        if not alike:
+        if not outside:
             return self.found[key]
-        return float(np.logaddexp(self.found[key], logsumexp(alike)) - np.log(2.0))
+        prior, share = self.comparison.prior, self._resemblance
+        like = [
+            value + prior.log_of_set([share[one]])
+            for one, value in self._similar.get(effects, {}).items()
+        ]
+        # Several resemble whatever is missing so nearly that half the time no difference is seen.
+        for more in self._several.get(effects, ()):
+            beyond = self.found.get((effects | more, True), -np.inf)
+            here = np.logaddexp(self.found[effects | more, False], beyond) - np.log(2.0)
+            like.append(here + prior.log_of_set([share[one] for one in more]))
+        if not like:
+            return self.found[key]
+        return float(np.logaddexp(self.found[key], logsumexp(like)) - np.log(2.0))
 
     def posterior(self) -> StructurePosterior:
         """Probabilities by the evidence and the prior.
@@ -368,10 +384,11 @@ def _extended(
             present = grown.model().parameters
             shared = near.fit.shared
             grown = grown.with_values({name: shared[name] for name in shared if name in present})
+            known |= near.fit.values
+            fit = quick_fit(base, grown.model(), known, numerics, "be")
         except ModelError:
+            # Effects may exclude each other: what drifts has no periodic state that lags behind it.
             return None
-        known |= near.fit.values
-        fit = quick_fit(base, grown.model(), known, numerics, "be")
         # A fit that stopped early is linearised where it is, which does nearly as well.
         solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
         return _anchor(grown, fit, scores) if solved else None

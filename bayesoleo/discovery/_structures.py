@@ -3,7 +3,8 @@ catalogue; their prior and their posterior probabilities.
 
 The prior is stated: 0.45 that nothing is missing, 0.4 for effects of the catalogue, 0.15 for
 something outside of it: no catalogue has every law. The share of the catalogue is divided equally
-among families, then among the effects of a family, so that near copies do not weigh more.
+among families, then among the effects of a family, so that near copies do not weigh more. Within a
+family the laws that textbooks begin with weigh more than their refinements.
 """
 
 from __future__ import annotations
@@ -18,6 +19,29 @@ from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 
 #: Prior weight of a family that absorbs any model error, beside that of one which names a cause.
 ABSORBING = 0.2
+#: The same of a family whose members multiply a declared term by any quantity, and name no law.
+UNNAMED = 0.5
+#: The laws that textbooks begin with, and their weight within a family. A power law, a Bouc-Wen
+#: model or a contact law fits what each of these does as well, but is rarer.
+COMMON = 3.0
+COMMON_EFFECTS = frozenset(
+    {
+        "viscous_damping",
+        "quadratic_damping",
+        "direction_dependent_damping",
+        "stroke_dependent_damping",
+        "coulomb_friction",
+        "dahl_friction",
+        "linear_stiffness",
+        "cubic_stiffness",
+        "end_stop_lower",
+        "end_stop_upper",
+        "preload",
+        "sensor_offset",
+        "sensor_gain",
+        "sensor_lag",
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +58,10 @@ class StructurePrior:
     families : mapping of str to float
         Weights of families of effects. By default they are one, but less for parameters that vary
         from run to run and forces that repeat with the drive, because these absorb a part of
-        whatever is missing and name no cause.
+        whatever is missing and name no cause, and for terms that depend on any quantity.
+    effects : mapping of str to float
+        Weights of effects within their family, by id. By default they are three for the laws that
+        textbooks begin with (:data:`COMMON_EFFECTS`), and one.
     """
 
     nothing: float = 0.45
@@ -42,6 +69,7 @@ class StructurePrior:
     outside: float = 0.15
     numbers: tuple[float, ...] = (0.75, 0.2, 0.04, 0.01)
     families: Mapping[str, float] = field(default_factory=dict)
+    effects: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def also_outside(self) -> float:
@@ -55,19 +83,21 @@ class StructurePrior:
 
     def weights(self, families: Mapping[Added, str]) -> dict[Added, float]:
         """Prior probability of each effect as the only one."""
-        members: dict[str, list[Added]] = {}
+        members: dict[str, dict[Added, float]] = {}
         for key, family in families.items():
-            members.setdefault(family, []).append(key)
-        share = {
-            family: self.families.get(family, ABSORBING if family in ABSORBING_FAMILIES else 1.0)
-            for family in members
-        }
+            members.setdefault(family, {})[key] = self._within(key[0])
+        usual = dict.fromkeys(ABSORBING_FAMILIES, ABSORBING) | {"dependence": UNNAMED}
+        share = {name: self.families.get(name, usual.get(name, 1.0)) for name in members}
         total = sum(share.values())
         return {
-            key: share[family] / total / len(keys)
+            key: share[family] / total * own / sum(keys.values())
             for family, keys in members.items()
-            for key in keys
+            for key, own in keys.items()
         }
+
+    def _within(self, effect: str) -> float:
+        """Weight of an effect within its family."""
+        return self.effects.get(effect, COMMON if effect in COMMON_EFFECTS else 1.0)
 
     def resemblance(self, families: Mapping[Added, str]) -> dict[Added, float]:
         """Probability that a law outside the catalogue resembles each effect.
@@ -84,6 +114,12 @@ class StructurePrior:
             found |= {key: share * weights[key] / total for key in some if total > 0}
         return found
 
+    def log_of_set(self, weights: Sequence[float]) -> float:
+        """Logarithm of the probability of a set of effects, given that some act or are resembled,
+        from those of its members; it comes about in any order."""
+        number = self.numbers[min(len(weights), len(self.numbers)) - 1] / sum(self.numbers)
+        return float(np.log(number * np.prod(weights) * np.prod(np.arange(1, len(weights) + 1))))
+
     def log_probability(
         self, effects: Sequence[Added], outside: bool, weights: Mapping[Added, float]
     ) -> float:
@@ -91,13 +127,10 @@ class StructurePrior:
         total = self.nothing + self.catalogue + self.outside
         if not effects:
             return float(np.log((self.outside if outside else self.nothing) / total))
-        numbers = np.array(self.numbers) / sum(self.numbers)
-        number = numbers[min(len(effects), numbers.size) - 1]
-        # A set of effects comes about in any order.
-        sets = float(np.prod([weights[key] for key in effects]))
-        sets *= float(np.prod(np.arange(1, len(effects) + 1)))
         rest = self.also_outside if outside else 1.0 - self.also_outside
-        return float(np.log(self.catalogue / total * number * sets * rest))
+        return float(np.log(self.catalogue / total * rest)) + self.log_of_set(
+            [weights[key] for key in effects]
+        )
 
 
 @dataclass(frozen=True)

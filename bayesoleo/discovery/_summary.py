@@ -112,6 +112,7 @@ def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, A
             "outside": prior.outside / whole,
             "numbers": [number / sum(prior.numbers) for number in prior.numbers],
             "families": dict(prior.families),
+            "effects": dict(prior.effects),
         },
         "nothing": found.nothing,
         "outside": found.outside,

@@ -18,12 +18,18 @@ Verbeek (1993), eq. 6.1 (orifice damping) and section 6.4 (metering pin, rebound
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._forces import InternalState, single_force, transition_velocity
+from bayesoleo.effects._forces import (
+    InternalState,
+    resisting_side,
+    single_force,
+    transition_velocity,
+)
 from bayesoleo.effects._parts import (
     Amplitude,
     Scan,
@@ -69,38 +75,47 @@ QUINTIC = _power(5, "quintic")
 STIFFNESS_EFFECTS = (LINEAR, STIFFNESS_QUADRATIC, CUBIC, QUINTIC)
 
 
-VISCOUS = single_force(
-    Amplitude("viscous_damping", "force/(position/s)", "c_1", "viscous damping"),
-    "damping",
-    "viscous_damping*velocity",
-    formula=r"c_1 \dot q",
-    title="Viscous damping",
-    source="Den Hartog (1956), Mechanical Vibrations, section 2.1",
+VISCOUS = replace(
+    single_force(
+        Amplitude("viscous_damping", "force/(position/s)", "c_1", "viscous damping"),
+        "damping",
+        "viscous_damping*velocity",
+        formula=r"c_1 \dot q",
+        title="Viscous damping",
+        source="Den Hartog (1956), Mechanical Vibrations, section 2.1",
+    ),
+    side=resisting_side,
 )
 
-QUADRATIC = single_force(
-    Amplitude("quadratic_damping", "force/(position/s)**2", "c_2", "quadratic damping"),
-    "damping",
-    "quadratic_damping*velocity*abs(velocity)",
-    formula=r"c_2 \dot q |\dot q|",
-    title="Quadratic damping (orifice)",
-    source="Verbeek (1993), eq. 6.1",
+QUADRATIC = replace(
+    single_force(
+        Amplitude("quadratic_damping", "force/(position/s)**2", "c_2", "quadratic damping"),
+        "damping",
+        "quadratic_damping*velocity*abs(velocity)",
+        formula=r"c_2 \dot q |\dot q|",
+        title="Quadratic damping (orifice)",
+        source="Verbeek (1993), eq. 6.1",
+    ),
+    side=resisting_side,
 )
 
 # Smooth at rest: a power below one has an infinite slope there, which no Newton iteration survives.
-POWER_LAW = single_force(
-    Amplitude("power_law_damping", "force", "F_a", "damping force at the largest velocity"),
-    "damping",
-    "power_law_damping*velocity/largest_velocity"
-    "*((velocity/largest_velocity)**2 + 1e-6)**((exponent - 1)/2)",
-    shapes=(
-        ShapeParameter(
-            "exponent", "", "a", "exponent of the velocity", values(0.25, 0.5, 1.0, 1.5, 2.5)
+POWER_LAW = replace(
+    single_force(
+        Amplitude("power_law_damping", "force", "F_a", "damping force at the largest velocity"),
+        "damping",
+        "power_law_damping*velocity/largest_velocity"
+        "*((velocity/largest_velocity)**2 + 1e-6)**((exponent - 1)/2)",
+        shapes=(
+            ShapeParameter(
+                "exponent", "", "a", "exponent of the velocity", values(0.25, 0.5, 1.0, 1.5, 2.5)
+            ),
         ),
+        formula=r"F_a |\dot q / v_\mathrm{max}|^a \operatorname{sign} \dot q",
+        title="Power-law damping",
+        source="Symans and Constantinou (1998), ISET J. Earthquake Technology 35(4), 185-206",
     ),
-    formula=r"F_a |\dot q / v_\mathrm{max}|^a \operatorname{sign} \dot q",
-    title="Power-law damping",
-    source="Symans and Constantinou (1998), ISET J. Earthquake Technology 35(4), 185-206",
+    side=resisting_side,
 )
 
 
@@ -266,14 +281,17 @@ def _decay(grid: Scan) -> ShapeParameter:
     return ShapeParameter("decay", "position/s", "v_s", words, grid)
 
 
-COULOMB = single_force(
-    Amplitude("coulomb_friction", "force", "F_c", "Coulomb friction"),
-    "friction",
-    "coulomb_friction*2/pi*atan(velocity/transition)",
-    shapes=(transition_velocity("transition"),),
-    formula=r"F_c \, \frac{2}{\pi} \arctan(\dot q / v_0)",
-    title="Coulomb friction",
-    source="Verbeek (1993), eq. 6.1",
+COULOMB = replace(
+    single_force(
+        Amplitude("coulomb_friction", "force", "F_c", "Coulomb friction"),
+        "friction",
+        "coulomb_friction*2/pi*atan(velocity/transition)",
+        shapes=(transition_velocity("transition"),),
+        formula=r"F_c \, \frac{2}{\pi} \arctan(\dot q / v_0)",
+        title="Coulomb friction",
+        source="Verbeek (1993), eq. 6.1",
+    ),
+    side=resisting_side,
 )
 
 ASYMMETRIC = single_force(

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import sympy as sp
 
-from bayesoleo.effects._effect import BY_RUN, Effect, Names, free_name
+from bayesoleo.effects._effect import BY_RUN, Effect, Names, either_side, free_name
 from bayesoleo.effects._nonparametric import COEFFICIENT
 from bayesoleo.effects._parts import (
     Amplitude,
@@ -243,6 +243,7 @@ def _sensor(
     places: Callable[[Model], Sequence[str]],
     change: Callable[[Model, str, Names], Model],
     term: str,
+    side: Callable[[Model, str], int] = either_side,
 ) -> Effect:
     return Effect(
         id=id,
@@ -255,6 +256,7 @@ def _sensor(
         source=f"{VOCABULARY}, {term}",
         applies_to="outputs" if id == "sensor_drift" else "every channel",
         own_name_per_target=True,
+        side=side,
     )
 
 
@@ -287,6 +289,8 @@ LAG = _sensor(
     _laggable,
     _lag,
     "4.23: step response time",
+    # A channel that leads is one beside which the others lag.
+    lambda model, channel: 1,
 )
 # The time constant is a shape: at the null of a time constant a long lag looks like a short delay.
 # A part below zero would be a sensor that leads: what relaxes in the process, such as a gas that

@@ -316,6 +316,10 @@ def test_parts_of_the_prior_that_are_left_out_share_the_rest():
         (StructurePrior(numbers=(0.5, 0.0)), r"structure_prior.numbers\[1\]: must be a finite"),
         (StructurePrior(numbers=()), r"structure_prior.numbers: is empty"),
         (StructurePrior(families={"frction": 2.0}), r"unknown family .*did you mean friction\?"),
+        (
+            StructurePrior(effects={"colomb_friction": 2.0}),
+            r"unknown effect .*mean coulomb_friction",
+        ),
     ],
 )
 def test_priors_in_python_are_checked_where_they_are_given(prior, message):

@@ -12,6 +12,7 @@ from bayesoleo.discovery._structure_evidence import (
     Group,
     Likelihood,
     Reduced,
+    by_side,
     effect_evidence,
     mean_of,
     pair_evidence,
@@ -97,7 +98,9 @@ def test_a_pair_is_one_effect_after_the_other(problem):
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_sign_halves_the_prior(problem, sign):
     part, likelihood, size = reduced(problem), Likelihood(SAMPLES, 1e9), 0.8
-    found = effect_evidence(part, likelihood, [Group((1,), sign)], np.array([size]))[0, 0, 0]
+    found = effect_evidence(part, likelihood, [Group((1,), float(sign > 0))], np.array([size]))[
+        0, 0, 0
+    ]
     slope, gram = part.slope[0, 1], part.gram[0, 1, 1]
 
     def density(b: float) -> float:
@@ -140,6 +143,26 @@ def test_prior_of_single_effects_adds_up_and_near_copies_share():
     ]
     share = prior.numbers[0] / sum(prior.numbers)
     assert np.exp(logsumexp(single)) == pytest.approx(prior.catalogue * share)
+
+
+def test_common_laws_weigh_more_within_their_family_and_a_user_can_say_otherwise():
+    names = {"coulomb_friction": "friction", "lugre_friction": "friction", "a": "stiffness"}
+    families = {(name, "x"): family for name, family in names.items()}
+    weights = StructurePrior().weights(families)
+    assert weights["coulomb_friction", "x"] == pytest.approx(3 * weights["lugre_friction", "x"])
+    assert weights["a", "x"] == pytest.approx(0.5)  # its family as a whole weighs the same
+    told = StructurePrior(effects={"coulomb_friction": 1.0, "lugre_friction": 4.0})
+    weights = told.weights(families)
+    assert weights["lugre_friction", "x"] == pytest.approx(4 * weights["coulomb_friction", "x"])
+
+
+@pytest.mark.parametrize("positive", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_a_likely_side_of_zero_has_its_share_of_a_normal_prior(positive):
+    """A normal posterior under the prior that is flat by sides: the integral by hand."""
+    for distance in (-3.0, -0.5, 0.0, 2.0, 8.0):
+        weight = 2 * positive * stats.norm.cdf(distance)
+        weight += 2 * (1 - positive) * stats.norm.cdf(-distance)
+        assert np.exp(by_side(positive, distance)) == pytest.approx(weight, rel=1e-12)
 
 
 def test_posterior_probabilities_are_right_as_often_as_they_say():

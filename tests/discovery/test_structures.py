@@ -21,6 +21,7 @@ from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structure_comparison import (
+    LIKELY_SIDE,
     Comparison,
     grids_of,
 )
@@ -120,7 +121,8 @@ def test_two_effects_are_found_where_none_was_tried_as_a_pair(two, monkeypatch):
     found = compared(two)
     assert set(found.structures[0].effects) == set(PAIR)
     assert found.structures[0].estimated
-    assert all(found.effects[key] > 0.9 for key in PAIR)
+    # The rest is of laws that resemble one of the two, or both.
+    assert all(found.effects[key] > 0.8 for key in PAIR), found.effects
 
 
 def test_parts_of_a_probable_pair_are_estimated_each(two):
@@ -225,6 +227,7 @@ def _sampled(comparison: Comparison, anchor) -> float:
                 # At the mean of the grid that the package uses for its own effects.
                 each = stats.norm.logpdf(draw[k], scale=fewer(sizes) * unit)
                 logs[n] += logsumexp(each) - np.log(each.size)
+                logs[n] += np.log(2 * (LIKELY_SIDE if draw[k] > 0 else 1 - LIKELY_SIDE))
             elif name in anchor.shapes:
                 centre, width = scan_prior(anchor.shapes[name])
                 logs[n] += stats.norm.logpdf(np.log(draw[k]), centre, width)
