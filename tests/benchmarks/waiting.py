@@ -1,0 +1,113 @@
+"""How long a user waits: commands from start to end, as they are typed, and single solves.
+
+Each command runs in a process and a folder of its own. ``close_cold_extra_s`` is what an empty
+cache of compiled code adds, ``first_word_s`` the time to the first line or bar that a user sees.
+Times are those of this machine now; solves are CPU times of one thread. Run as
+``python tests/benchmarks/waiting.py --json``, with the data found through ``BAYESOLEO_DATA``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import transients
+from cases import campaign
+from solves import scaling
+
+from bayesoleo.data import dataset_folder
+from bayesoleo.systems import system
+
+ROOT = Path(__file__).resolve().parents[2]
+#: The campaign of fourteen runs and what it is closed with.
+WALL = ("shaker-wall", "--model", "f16n2d2", "--quick")
+SILVERBOX = ROOT / "studies" / "measured"
+
+
+def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> tuple[float, float]:
+    """Seconds to the first output of a command and to its end.
+
+    Raises
+    ------
+    RuntimeError
+        If it failed, with what it wrote.
+    """
+    line = [sys.executable, "-m", "bayesoleo", *arguments]
+    begin = time.perf_counter()
+    process = subprocess.Popen(
+        line, cwd=folder, env={**os.environ, **more}, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    assert process.stdout is not None
+    first = process.stdout.read(1)
+    seen = time.perf_counter() - begin
+    rest = process.stdout.read()
+    status = process.wait()
+    if status:
+        raise RuntimeError((first + rest).decode(errors="replace")[-2000:])
+    return seen, time.perf_counter() - begin
+
+
+def commands(say: Callable[[str], object]) -> dict[str, float]:
+    """Seconds of whole commands."""
+    table: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        cache = {"BAYESOLEO_CACHE": str(folder / "cache"), "NUMBA_CACHE_DIR": str(folder / "numba")}
+        wall = ["close", str(dataset_folder(WALL[0])), *WALL[1:]]
+        word, cold = waited([*wall, "--out", "cold"], folder, cache)
+        say(f"close, nothing compiled: first word {word:.2f} s, {cold:.1f} s")
+        _, warm = waited([*wall, "--out", "warm"], folder, cache)
+        say(f"close, compiled: {warm:.1f} s")
+        table |= {
+            "first_word_s": word,
+            "close_warm_s": warm,
+            "close_cold_extra_s": cold - warm,
+        }
+        _, table["demo_s"] = waited(["demo"], folder, {})
+        say(f"demo: {table['demo_s']:.1f} s")
+        if (SILVERBOX / "silverbox").is_dir():
+            model = SILVERBOX / "silverbox" / "model.py"
+            line = ["close", str(SILVERBOX / "silverbox"), "--model", str(model), "--quick"]
+            _, table["silverbox_s"] = waited([*line, "--out", "silverbox"], folder, {})
+            say(f"silverbox: {table['silverbox_s']:.1f} s")
+    return table
+
+
+def solves() -> dict[str, float]:
+    """CPU times of periodic solves by the number of dofs, and of transients against CVODES."""
+    found = scaling(system("f16n2d2"), campaign())
+    table = {key: value for key, value in found.items() if "dofs" in key}
+    return table | {
+        key: value for key, value in transients.figures().items() if not key.startswith("cvodes_1")
+    }
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--json", action="store_true", help="one flat object")
+    parser.add_argument("--only", choices=("commands", "solves"), help="one part")
+    given = parser.parse_args()
+    table: dict[str, float] = {}
+    if given.only != "solves":
+        table |= commands(lambda text: print(text, file=sys.stderr, flush=True))
+    if given.only != "commands":
+        table |= solves()
+    if given.json:
+        print(json.dumps(table))
+        return
+    for key, value in table.items():
+        print(f"{key:28} {value:.4g}")
+
+
+if __name__ == "__main__":
+    main()
