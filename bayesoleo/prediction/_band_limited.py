@@ -375,5 +375,5 @@ def answered(values: Array, others: list[Array], step: float, above: float) -> b
 def _curve(values: Array, step: float, band: Band, noise: float) -> Smoothed:
     """The curve of one band, on a grid as fine as it asks for."""
     per_sample = max(int(np.ceil(_FINE * step * min(band.upper, 0.5 / step))), 1)
-    states = filtered(values, step, band, per_sample)
+    states = filtered(values, step, band, per_sample, noise=noise)
     return Smoothed(step / per_sample, states, noise, band=band, per_sample=per_sample)

@@ -39,6 +39,10 @@ DIFFUSE = 1e9
 #: Lengths in periods of the highest frequency: of the end that the spline is fitted to (it is
 #: joined over half of it), and of the continuation beyond the record.
 _END, _BEYOND = 8.0, 8.0
+#: The same of the end that follows from the spectrum, with its fewest and most samples; part of the
+#: cut-off frequency up to which its lines count; size of its mean and slope over the signal's; its
+#: weakest line and smallest noise over the signal's, in power and in size.
+_KNOWN, _FEWEST, _MOST, _PASSED, _FREE, _LEAST, _SMALLEST = 16.0, 32, 256, 1.5, 10.0, 1e-9, 1e-7
 #: Roughness of a spline that goes through its samples, to 3e-5; more would compete with the start,
 #: of which nothing is known.
 _EXACT = 1e7
@@ -232,7 +236,12 @@ class Band:
 
 
 def filtered(
-    values: Array, step: float, band: Band, per_sample: int, exponent: float = 1.0
+    values: Array,
+    step: float,
+    band: Band,
+    per_sample: int,
+    exponent: float = 1.0,
+    noise: float | None = None,
 ) -> Array:
     """Value and two derivatives of the band-limited curve on a finer grid.
 
@@ -248,12 +257,18 @@ def filtered(
         Points of the grid in an interval.
     exponent : float
         Power of the band's gain.
+    noise : float, optional
+        Standard deviation of a sample's noise where the curve is that of a signal, whose own
+        spectrum then says how it goes on to its ends.
 
     Returns
     -------
     ndarray, shape ((N - 1) * per_sample + 1, 3)
     """
-    first, last = _end(values, step, band), _end(values[::-1], step, band)
+    if noise is None or not np.isfinite(band.cut):
+        first, last = _end(values, step, band), _end(values[::-1], step, band)
+    else:
+        first, last = (_end_by_spectrum(x, step, band.cut, noise) for x in (values, values[::-1]))
     inside = _transformed(values, step, band, per_sample, exponent, first[0], last[0])
     backward = np.array([1.0, -1.0, 1.0])
     states = _joined(inside, first, step, per_sample)
@@ -269,6 +284,41 @@ def _end(values: Array, step: float, band: Band) -> Array:
     states = smooth(np.ascontiguousarray(values[:count] - level), roughness)
     states[:, 0] += level
     return states / step ** np.arange(3)
+
+
+def _end_by_spectrum(values: Array, step: float, cut: float, noise: float) -> Array:
+    """States ``(n, 3)`` at the first samples: the mean of a stationary process with the spectrum of
+    the whole record, given these samples (Wiener 1949).
+
+    At an end a spline has neighbours on one side only, and its second derivative is off by a tenth
+    of its size even without noise. The spectrum knows how such a signal goes on.
+    """
+    size = values.size
+    count = min(max(int(_KNOWN / (cut * step)), _FEWEST), size, _MOST)
+    centre, spread = float(np.mean(values[:count])), float(np.std(values)) or 1.0
+    omega = 2.0 * np.pi * fft.rfftfreq(size, step)
+    window = np.hanning(size)
+    power = np.abs(fft.rfft(window * (values - values.mean()))) ** 2
+    power *= 2.0 / (size * float(np.sum(window**2)))
+    chosen = (omega > 0) & (omega <= 2.0 * np.pi * _PASSED * cut)
+    omega, power = omega[chosen], power[chosen]
+    # Less the noise's own share of each line; what is left is never quite nothing.
+    amplitude = np.sqrt(np.maximum(power - 2.0 * noise**2 / size, _LEAST * spread**2 / size))
+    time = step * np.arange(count)
+    turn = np.multiply.outer(omega, time)
+    cosine, sine = (amplitude[:, None] * part(turn) for part in (np.cos, np.sin))
+    slope, flat, one = spread / (step * size), np.zeros((1, count)), np.ones((1, count))
+    rows = np.concatenate([_FREE * spread * one, _FREE * slope * time[None], cosine, sine])
+    rates = np.concatenate([flat, _FREE * slope * one, -omega[:, None] * sine])
+    rates = np.concatenate([rates, omega[:, None] * cosine])
+    bends = np.concatenate([flat, flat, -(omega[:, None] ** 2) * cosine])
+    bends = np.concatenate([bends, -(omega[:, None] ** 2) * sine])
+    left, sizes, right = np.linalg.svd(rows, full_matrices=False)
+    shrunk = sizes / (sizes**2 + max(noise, _SMALLEST * spread) ** 2)
+    weights = left @ (shrunk * (right @ (values[:count] - centre)))
+    states = np.stack([weights @ part for part in (rows, rates, bends)], axis=1)
+    states[:, 0] += centre
+    return states
 
 
 def _transformed(
