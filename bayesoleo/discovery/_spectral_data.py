@@ -37,7 +37,7 @@ FEWEST_HARMONICS, BEYOND = 60, 1e-5
 FIRST_COSINES = 300
 #: A measured level of few lines is averaged with that of all lines as if it had so many more.
 PRIOR_LINES = 8.0
-#: Errors of the inputs' harmonics that are kept in a run.
+#: Directions of the errors of the inputs that are kept in a run.
 MOST_INPUTS = 40
 #: Lengths, in cycles, of the squared exponentials whose mean is the spectrum of a smooth remainder.
 SMOOTHNESS = (0.02, 0.05, 0.2)
@@ -205,18 +205,19 @@ class SpectralData:
         ]
         return np.concatenate(levels)
 
-    def input_noise(self, inputs: Callable[[int], Array]) -> tuple[Array, Array]:
+    def input_noise(self, inputs: Callable[[int], tuple[Array, bool]]) -> tuple[Array, Array]:
         """Errors of the outputs by noise of measured inputs.
 
-        An input's harmonic has one error, which all outputs and all their harmonics share. The
-        largest of these are therefore kept as they are. For a transient only some draws are known,
-        whose variances are taken.
+        An input's harmonic has one error, which all outputs and all their harmonics share, and
+        which may be large where a force changes with the direction of motion. The largest of their
+        principal directions are therefore kept as they are. Of draws the variances are taken.
 
         Parameters
         ----------
         inputs : callable
             Change of the outputs ``(outputs, k, N)`` of a run, by its number, by one standard
-            deviation of each of its inputs' coefficients, SI.
+            deviation of each of its inputs' coefficients, SI; whether these are all errors, or
+            draws of them.
 
         Returns
         -------
@@ -228,17 +229,27 @@ class SpectralData:
         rows, variances = [], []
         sizes = [run.size * len(self.outputs) for run in self.runs]
         for r, run in enumerate(self.runs):
-            moved = np.moveaxis(run.transformed(inputs(r)), 1, 0).reshape(-1, sizes[r])
-            order = np.argsort(-np.sum(moved**2, axis=1))
-            kept = order[: MOST_INPUTS if run.record.periodic else 0]
+            found, known = inputs(r)
+            moved = np.moveaxis(run.transformed(found), 1, 0).reshape(-1, sizes[r])
+            kept = _principal(moved) if known else moved[:0]
             before, after = sum(sizes[:r]), sum(sizes[r + 1 :])
-            rows.append(np.pad(moved[kept], ((0, 0), (before, after))))
-            variances.append(np.sum(moved[order[kept.size :]] ** 2, axis=0))
+            rows.append(np.pad(kept, ((0, 0), (before, after))))
+            rest = np.sum(moved**2, axis=0) - np.sum(kept**2, axis=0)
+            variances.append(np.maximum(rest, 0.0))
         return np.concatenate(rows), np.concatenate(variances)
 
     def smooth(self) -> Array:
         """Variance on each coefficient of a smooth remainder of unit mean square, shape (n,)."""
         return np.concatenate([np.tile(run.smooth(), len(self.outputs)) for run in self.runs])
+
+
+def _principal(rows: Array) -> Array:
+    """The largest principal directions of changes ``(k, n)`` by independent errors, as changes."""
+    if len(rows) <= MOST_INPUTS:
+        return rows
+    values, vectors = np.linalg.eigh(rows @ rows.T)
+    order = np.argsort(-values)[:MOST_INPUTS]
+    return np.asarray(vectors[:, order].T @ rows)
 
 
 @dataclass(frozen=True)

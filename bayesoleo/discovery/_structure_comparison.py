@@ -35,7 +35,7 @@ from bayesoleo.discovery._structure_evidence import (
     sizes_between,
 )
 from bayesoleo.discovery._structures import StructurePrior
-from bayesoleo.prediction._run_errors import input_columns
+from bayesoleo.prediction._run_errors import errors_known, input_columns
 
 #: Effects whose pairs are considered, and directions that a law outside the catalogue is made of.
 IN_PAIRS, DIRECTIONS = 10, 40
@@ -118,11 +118,11 @@ class Comparison:
         fit, data = base.fit, base.data
         assert data is not None
 
-        def inputs(r: int) -> Array:
-            label = fit.records[r].label
+        def inputs(r: int) -> tuple[Array, bool]:
+            run, label = fit.predictor.runs[r], fit.records[r].label
             scale = np.array([errors[label, output].input_scale for output in data.outputs])
-            columns = input_columns(fit.predictor.runs[r], present_constants(fit, r))
-            return np.asarray(columns * scale[:, None, None])
+            columns = input_columns(run, present_constants(fit, r))
+            return np.asarray(columns * scale[:, None, None]), errors_known(run)
 
         used = [errors[r.record.label, o] for r in data.runs for o in data.outputs]
         freedom = float(sum(max(entry.free, 1.0) for entry in used))

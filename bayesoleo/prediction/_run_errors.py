@@ -23,10 +23,12 @@ from bayesoleo.prediction._inputs import (
     harmonics_of,
     highest_derivatives,
     input_rows,
+    signal_of,
     signal_of_rows,
 )
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
+from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
 from bayesoleo.solvers._mesh import equidistant, tableau
@@ -37,6 +39,8 @@ from bayesoleo.solvers._switching import evaluate
 
 #: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
 DRAWS = 16
+#: Lines of the noise that a curve of a transient's input holds, up to which each is one error.
+MOST_LINES = 256
 #: Error over the swing below which nothing more is resolved: what no channel shows.
 TOLERANCE = 1e-6
 #: Points of a run at which its equations are looked at: every run of every fit is.
@@ -60,8 +64,9 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     Returns
     -------
     ndarray, shape (ny, k, N)
-        Real and imaginary parts of all significant harmonics of all inputs, of a transient draws
-        over the root of their number; SI; no columns where the run could not be solved.
+        Real and imaginary parts of all significant harmonics of all inputs; of a transient the
+        lines of the noise that its inputs hold, or where these are too many draws over the root of
+        their number; SI; no columns where the run could not be solved.
     """
     derived = run.kernels.derived
     ny, samples = run.measured.shape
@@ -112,7 +117,7 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
     """Change of every input row by one standard deviation of each coefficient, shape (nu, k, N)."""
     rows, record = run.kernels.derived.inputs, run.record
     if not record.periodic:
-        return _drawn_changes(run, phase)
+        return _transient_changes(run, phase)
     highest = highest_derivatives(rows)
     channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
     blocks = []
@@ -151,20 +156,57 @@ def _errors(signal: Smoothed) -> tuple[Smoothed, ...]:
     return tuple(signal.errors(DRAWS))
 
 
-def _drawn_changes(run: RunPredictor, position: Array) -> Array:
-    """The same of a transient: draws of its inputs' errors."""
+def _transient_changes(run: RunPredictor, position: Array) -> Array:
+    """The same of a transient: every line of the noise that a curve holds, or draws of its error
+    where there are too many."""
     rows, record = run.kernels.derived.inputs, run.record
-    highest, blocks = highest_derivatives(rows), []
+    highest, blocks = highest_derivatives(rows), [np.zeros((len(rows), 0, position.size))]
     for channel in run.model.inputs:
-        if any(row[0] == channel for row in rows):
-            draws = _errors(record.smoothed[channel].for_derivative(highest[channel]))
-            block = np.zeros((len(rows), len(draws), position.size))
-            for k, (name, derivative) in enumerate(rows):
-                if name == channel:
-                    for j, draw in enumerate(draws):
-                        block[k, j] = draw.evaluate(position, record.rate, derivative)
-            blocks.append(block / np.sqrt(DRAWS))
-    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, position.size))
+        orders = {k: order for k, (name, order) in enumerate(rows) if name == channel}
+        if not orders:
+            continue
+        curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
+        lines = _noise_lines(curve, record)
+        draws = () if lines is not None else _errors(curve)
+        size = len(draws) if lines is None else lines[0].size
+        block = np.zeros((len(rows), size, position.size))
+        for k, order in orders.items():
+            if lines is not None:
+                omega, sd = lines
+                turn = np.multiply.outer(omega, position * record.span) + order * np.pi / 2
+                block[k] = (sd * omega**order)[:, None] * np.cos(turn)
+            for j, draw in enumerate(draws):
+                block[k, j] = draw.evaluate(position, record.rate, order) / np.sqrt(DRAWS)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=1)
+
+
+def _noise_lines(curve: Smoothed, record: Record) -> tuple[Array, Array] | None:
+    """Angular frequencies of the noise in a band-limited curve, and the standard deviation of each
+    amplitude; None where they are too many, or the curve is a spline.
+
+    Cosines with whole numbers of half turns in a record are orthogonal at its samples, so that
+    white noise has independent amplitudes. A curve is right up to noise times the root of its gain.
+    """
+    band = curve.band
+    if band is None or not np.isfinite(band.cut) or curve.noise == 0.0:
+        return None
+    count = int(2.0 * record.span * band.cut * (1.0 + band.fade)) + 1
+    if count > MOST_LINES:
+        return None
+    frequency = np.asarray(0.5 * np.arange(count) / record.span, dtype=np.float64)
+    size = np.sqrt(np.where(frequency > 0, 2.0, 1.0) / record.time.size)
+    return 2.0 * np.pi * frequency, curve.noise * size * np.sqrt(band.gain(frequency))
+
+
+def errors_known(run: RunPredictor) -> bool:
+    """Whether the columns of :func:`input_columns` are all errors of the inputs, and not draws."""
+    record, highest = run.record, highest_derivatives(run.kernels.derived.inputs)
+    if record.periodic:
+        return True
+    channels = [name for name in run.model.inputs if name in highest]
+    curves = [cast(Smoothed, signal_of(record, name, highest[name])) for name in channels]
+    return all(c.noise == 0.0 or _noise_lines(c, record) is not None for c in curves)
 
 
 def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:

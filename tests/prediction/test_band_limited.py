@@ -10,6 +10,8 @@ from bayesoleo.prediction._band_limited import (
     declared,
     sample_noise,
 )
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.prediction._run_errors import _noise_lines
 
 STEP = 1e-3
 TIME = STEP * np.arange(5000)
@@ -157,3 +159,38 @@ def test_noise_of_a_sample():
     rng = np.random.default_rng(8)
     values = sines((2.3, 1.0))[0] + 0.01 * rng.standard_normal(TIME.size)
     assert sample_noise(values, STEP) == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.parametrize(("noise", "most"), [(1e-6, 0.01), (1e-3, 0.06)])
+def test_ends_go_on_as_the_spectrum_says(noise, most):
+    """The second derivative of three sines, within five samples of an end, over its size.
+
+    A spline with neighbours on one side only is off by a tenth, with and without noise.
+    """
+    squares = []
+    for seed in range(10):
+        rng, time = np.random.default_rng(seed), np.arange(300) / 50.0
+        frequency, phase = rng.uniform(0.2, 1.5, 3), rng.uniform(0.0, 6.3, 3)
+        waves = np.sin(2 * np.pi * np.multiply.outer(time, frequency) + phase)
+        values, bends = waves.sum(axis=1), -(waves @ (2 * np.pi * frequency) ** 2)
+        seen = values + noise * values.std() * rng.standard_normal(time.size)
+        error = band_limited(seen, 0.02).for_derivative(2).at(time, 2) - bends
+        squares.append(np.r_[error[:5], error[-5:]] / bends.std())
+    assert rms(squares) < most
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_lines_of_noise_are_as_large_as_draws_of_it(order):
+    """Two ways to the error of a curve: its lines, and what white noise leaves of itself."""
+    rng, time = np.random.default_rng(5), np.arange(800) / 100.0
+    values = np.sin(2 * np.pi * 1.1 * time) + 0.01 * rng.standard_normal(800)
+    record = transient_record("a", time, {"x": values, "y": values})
+    curve = record.smoothed["x"].for_derivative(2)
+    omega, sd = _noise_lines(curve, record)
+    inside = slice(100, -100)
+    lines = sd[:, None] * omega[:, None] ** order
+    lines = lines * np.cos(np.multiply.outer(omega, time) + order * np.pi / 2)
+    expected = rms(np.sqrt(np.sum(lines**2, axis=0))[inside])
+    drawn = rms([draw.at(time, order)[inside] for draw in curve.errors(40)])
+    # Forty draws of some sixty lines each: three per cent.
+    assert expected == pytest.approx(drawn, rel=0.1)
