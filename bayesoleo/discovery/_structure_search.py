@@ -21,7 +21,7 @@ from scipy.special import logsumexp
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, ProgressCallback
-from bayesoleo.discovery._assembly import Added, Assembly
+from bayesoleo.discovery._assembly import Added, Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
@@ -348,15 +348,40 @@ def _anchor(assembly: Assembly, fit: ModelFit, scores: Mapping[Added, Score]) ->
     return EstimatedModel(fit, effects, shapes)
 
 
+def _named_as(score: Score, option: Option) -> Score:
+    """A score with the names that its parameters have beside other effects: where these make a
+    second place for it, they are called after the place."""
+    own, other = score.option.candidate, option.candidate
+    table = dict(zip(own.parameters, other.parameters, strict=True))
+    # A shape that another effect has brought already is not needed twice.
+    table |= {name: new for name in own.shapes for new in other.shapes if _alike(name, new)}
+
+    def new(name: str) -> str:
+        bare, bracket, run = name.partition("[")
+        return table[bare] + bracket + run
+
+    return replace(
+        score,
+        option=option,
+        names=tuple(map(new, score.names)),
+        shapes={table[name]: value for name, value in score.shapes.items() if name in table},
+    )
+
+
+def _alike(name: str, other: str) -> bool:
+    """Whether two names are the same but for the place after which one is called."""
+    return name == other or other.startswith(f"{name}_") or name.startswith(f"{other}_")
+
+
 def _parameters(grown: Assembly, score: Score, part: float, base: Base) -> dict[str, Parameter]:
     """New parameters of an effect, which start at a part of what it explains alone, its shapes with
     the prior by which they are compared."""
     found = new_parameters(grown, score, base.policy)
     found = {name: replace(one, value=part * one.value) for name, one in found.items()}
-    for name, values in score.option.candidate.shapes.items():
-        centre, spread = scan_prior(values)
+    for name, guess in score.shapes.items():
+        centre, spread = scan_prior(score.option.candidate.shapes[name])
         found[name] = replace(
-            found[name], value=score.shapes[name], prior=LogNormal(float(np.exp(centre)), spread)
+            found[name], value=guess, prior=LogNormal(float(np.exp(centre)), spread)
         )
     return found
 
@@ -371,12 +396,14 @@ def _extended(
 
     def estimated(effects: tuple[Added, ...], near: EstimatedModel) -> EstimatedModel | None:
         grown, known = assembly.with_values(base.fit.shared), dict(base.fit.values)
+        named: dict[Added, Score] = {}
         try:
             # What exists beside another effect only comes after it.
             for key in sorted(effects, key=lambda one: order[one]):
-                score = scores[key]
-                step = score.option.assembly.steps[-1]
-                grown = grown.option(step.effect, step.target, step.scales).assembly
+                step = scores[key].option.assembly.steps[-1]
+                option = grown.option(step.effect, step.target, step.scales)
+                score = named[key] = _named_as(scores[key], option)
+                grown = option.assembly
                 # Beside others an effect has less to explain than alone.
                 part = LESS if near.effects else 1.0
                 grown = grown.with_parameters(_parameters(grown, score, part, base))
@@ -391,7 +418,7 @@ def _extended(
             return None
         # A fit that stopped early is linearised where it is, which does nearly as well.
         solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
-        return _anchor(grown, fit, scores) if solved else None
+        return _anchor(grown, fit, named) if solved else None
 
     return estimated
 

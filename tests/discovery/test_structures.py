@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from discovery.fitted_states import NUMERICS, fitted
@@ -27,7 +29,12 @@ from bayesoleo.discovery._structure_comparison import (
 )
 from bayesoleo.discovery._structure_evidence import Likelihood, fewer
 from bayesoleo.discovery._structure_parameters import _summary
-from bayesoleo.discovery._structure_search import Evidence, _extended, structure_posterior
+from bayesoleo.discovery._structure_search import (
+    Evidence,
+    _extended,
+    _named_as,
+    structure_posterior,
+)
 from bayesoleo.effects import find_effect
 
 FEW = ("coulomb_friction", "quadratic_damping", "preload", "quadratic_stiffness", "sensor_gain")
@@ -276,3 +283,22 @@ def test_averages_cover_where_effects_cannot_be_told_apart(tmp_path):
         # Three standard deviations: three parameters of one seed are no test of coverage.
         assert abs(shown.mean - truth[name]) < 3 * shown.sd
     assert max(off) > 4
+
+
+def test_estimates_know_parameters_that_a_second_place_renames(two):
+    """Beside an effect that makes a second place for it, an effect is called after its place."""
+    evidence, _ = evidence_with(two)
+    score = next(s for s in evidence.comparison.scores if s.option.key == FRICTION)
+    candidate = score.option.candidate
+    after = {name: f"{name}_force" for name in (*candidate.parameters, *candidate.shapes)}
+    renamed = replace(
+        candidate,
+        parameters=tuple(after[name] for name in candidate.parameters),
+        shapes={after[name]: values for name, values in candidate.shapes.items()},
+    )
+    found = _named_as(score, replace(score.option, candidate=renamed))
+    assert found.names == tuple(after[name] for name in score.names)
+    assert found.shapes == {after[name]: value for name, value in score.shapes.items()}
+    # What another effect has brought already is not there a second time.
+    bare = _named_as(score, replace(score.option, candidate=replace(renamed, shapes={})))
+    assert bare.shapes == {}
