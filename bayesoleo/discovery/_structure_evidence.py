@@ -32,8 +32,9 @@ from bayesoleo._types import Array, Integers
 
 #: Sizes of one effect, of the law outside the catalogue, and of the remainder over phase.
 SIZES, LAW_SIZES, SMOOTH_SIZES = 10, 5, 5
-#: Standard deviations by which the smallest change of interest differs from nothing.
-VISIBLE = 3.0
+#: Standard deviations by which the smallest change of interest differs from nothing: about the size
+#: at which a score is significant in half of all campaigns, among sixty candidates.
+VISIBLE = 4.0
 #: Difference of a law from the effect that it resembles, as a part of the effect's size, and the
 #: spread of its logarithm.
 DIFFERENCE, DIFFERENCE_SPREAD = 0.25, 1.2
