@@ -10,7 +10,7 @@ import xarray as xr
 from bayesoleo._dask import connected
 from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.data import dataset_folder
-from bayesoleo.data._campaign_folders import VARIABLE
+from bayesoleo.data._campaign import VARIABLE
 from bayesoleo.data._files import read_columns
 from bayesoleo.errors import BayesoleoError, MissingExtraError
 

@@ -289,7 +289,7 @@ def simulate(
     from bayesoleo._storage.files import only_writer
     from bayesoleo._storage.result_files import read_tree
     from bayesoleo._workflow.model_files import load_model
-    from bayesoleo.data._campaign_folders import is_vacant
+    from bayesoleo.data._campaign import is_vacant
 
     if out.is_dir() and not is_vacant(out):
         raise InputError("folder is not empty", file=out, hint="choose another with --out")

@@ -22,8 +22,7 @@ from bayesoleo._storage.files import check_writable
 from bayesoleo._workflow.model_files import from_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, choose_drive, reduce
-from bayesoleo.data._campaign import CampaignData
-from bayesoleo.data._campaign_folders import SimulatedRun, write_campaign
+from bayesoleo.data._campaign import CampaignData, SimulatedRun, write_campaign
 from bayesoleo.effects._catalogue import find_effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.errors import InputError, ResultsError

@@ -1,10 +1,8 @@
 from ._campaign import (
     CampaignData as CampaignData,
-    load_campaign as load_campaign,
-)
-from ._campaign_folders import (
     SimulatedRun as SimulatedRun,
     dataset_folder as dataset_folder,
+    load_campaign as load_campaign,
     write_campaign as write_campaign,
 )
 from ._campaign_toml import (

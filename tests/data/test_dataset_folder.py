@@ -4,7 +4,7 @@ import pooch
 import pytest
 
 from bayesoleo.data import dataset_folder
-from bayesoleo.data._campaign_folders import REGISTERED, VARIABLE
+from bayesoleo.data._campaign import REGISTERED, VARIABLE
 from bayesoleo.errors import CampaignError
 
 
