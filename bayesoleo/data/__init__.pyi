@@ -17,6 +17,9 @@ from ._data_warnings import (
 from ._fourier import (
     HarmonicBasis as HarmonicBasis,
 )
+from ._frequency_response import (
+    frequency_response as frequency_response,
+)
 from ._harmonics import (
     SpectralLine as SpectralLine,
     significant_harmonics as significant_harmonics,
