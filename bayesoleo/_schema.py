@@ -51,6 +51,8 @@ ERROR_MODEL_REASON: Final = "error_model_reason"
 """Attribute of the posterior: why its error model was chosen; absent where the user chose it."""
 COMPARISON: Final = "comparison"
 PROPOSAL: Final = "proposal"
+FREQUENCY_RESPONSE: Final = "frequency_response"
+"""Group, and key of the summary; of multisine runs only."""
 
 GROUPS: Final = (
     RECORDS,
@@ -77,6 +79,7 @@ GROUPS: Final = (
     ERROR_MODEL,
     COMPARISON,
     PROPOSAL,
+    FREQUENCY_RESPONSE,
 )
 
 # Dims; each that is not just a counter has a coordinate of the same name

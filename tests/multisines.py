@@ -64,7 +64,9 @@ def campaign(runs: Sequence[Run], controlled: str | None = "force") -> CampaignD
         name: Channel(name=name, column=name, unit=units[name], si_unit=units[name])
         for name in runs[0].samples
     }
-    return CampaignData("multisine", "", controlled, __import__("pathlib").Path(), channels, tuple(runs), "")
+    return CampaignData(
+        "multisine", "", controlled, __import__("pathlib").Path(), channels, tuple(runs), ""
+    )
 
 
 def multisine_campaign(

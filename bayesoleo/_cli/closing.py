@@ -373,7 +373,10 @@ def check(
     console = shell.console()
     sentences = plan.pop("data_warnings")
     plan.pop("start")
+    shown = plan.pop(schema.FREQUENCY_RESPONSE, [])
     shell.print_mapping(plan, console)
+    for sentence in shown:
+        console.print(sentence, markup=False, soft_wrap=True)
     for sentence in sentences:
         console.print(sentence, style="dim", markup=False, soft_wrap=True)
 

@@ -449,6 +449,7 @@ def _figures(
 ) -> dict[str, list[sections.CaptionedFigure]]:
     makers = {
         "data": ("the data", sections.data_figures),
+        "response": ("the frequency response", sections.response_figures),
         "fit": ("the fit", sections.fit_figures),
         "structures": ("the probabilities of structures", sections.structures_figure),
         "where": ("the residual breakdown", sections.breakdown_figure),

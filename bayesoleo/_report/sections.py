@@ -25,6 +25,7 @@ from matplotlib.font_manager import FontProperties
 from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
+from bayesoleo._report.sentences import begin, response_entries, response_sentence
 from bayesoleo._report.structures import proposal_table
 from bayesoleo._report.tables import words
 from bayesoleo._types import Array
@@ -162,6 +163,29 @@ def data_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
         f"The records as measured{averaged_over(tree)}. All runs of a channel share its scale."
     )
     return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
+
+
+def response_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+    """What multisine runs show before any model; nothing without such runs."""
+    group = reading.group(tree, schema.FREQUENCY_RESPONSE)
+    if group is None:
+        return []
+    lead = (
+        "Left: the best linear approximation, its standard deviation by noise (between periods) "
+        "and in total (between realisations). Right: the output at excited lines and at detection "
+        "lines, which the input does not excite and where a linear system has noise only; squares "
+        "are the stochastic distortion of one realisation."
+    )
+    entries: list[tuple[Draw, str]] = []
+    for output in map(str, group[schema.OUTPUT].values):
+        said = [
+            response_sentence(entry) + "."
+            for entry in response_entries(group)
+            if entry["output"] == output
+        ]
+        draw = partial(plots.frequency_response, group, output)
+        entries.append((draw, f"{lead} {' '.join(map(begin, said))}"))
+    return _drawn(entries)
 
 
 def averaged_over(tree: xr.DataTree, lead: str = ", averaged over the periods of each run") -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import structures
@@ -19,6 +21,7 @@ from bayesoleo._report.tables import (
     too_small,
     words,
 )
+from bayesoleo.data import _frequency_response as response
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.effects._catalogue import (
     PROPER,
@@ -29,7 +32,7 @@ from bayesoleo.effects._catalogue import (
     with_titles,
 )
 from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
-from bayesoleo.plots._style import Scale
+from bayesoleo.plots._style import Scale, format_value
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -426,3 +429,96 @@ def _change(before: float | None, after: float | None) -> str:
     # Nearly all of it is not all of it.
     change = max(change, -99.9) if after else change
     return f"{change:+.{1 if -100 < change < -99 else 0}f} %".replace("-", "−")
+
+
+#: Amplitude of an input at detection lines, as a part of that at excited lines, that is told.
+_INPUT_SHARE = 1e-3
+
+
+def response_entries(data: xr.Dataset) -> list[dict[str, Any]]:
+    """What multisine runs show before any model, by level and output, as plain values.
+
+    Parameters
+    ----------
+    data : Dataset
+        Of :func:`bayesoleo.data.frequency_response`, or as a result holds it.
+
+    Returns
+    -------
+    list of dict
+        As in ``summary.json``; SI, None where nothing is known.
+    """
+    found = []
+    for place in range(data.sizes[response.LEVEL]):
+        level = data.isel({response.LEVEL: place})
+        lines = level[schema.FREQUENCY].values[level[response.KIND].values == response.EXCITED]
+        shared = {
+            "drive": data.attrs["drive"],
+            "drive_unit": str(level["input_rms"].attrs[schema.UNITS]),
+            "runs": json.loads(str(level[schema.RUNS].values)),
+            "realisations": int(level["realisations"]),
+            "periods": int(level[schema.PERIODS]),
+            "input_rms": float(level["input_rms"]),
+            "input_share": _known(level["input_share"]),
+            "lines": int(lines.size),
+            "band": [float(lines[0]), float(lines[-1])],
+        }
+        for output in data[schema.OUTPUT].values:
+            one = level.sel({schema.OUTPUT: output})
+            kinds = {
+                str(kind): _sizes(one.sel({response.PARITY: kind}), "distortion")
+                for kind in one[response.PARITY].values
+            }
+            found.append(
+                {
+                    **shared,
+                    "output": str(output),
+                    "distortion": {kind: sizes for kind, sizes in kinds.items() if sizes},
+                    "stochastic": _sizes(one, "stochastic"),
+                }
+            )
+    return found
+
+
+def _sizes(one: xr.Dataset, name: str) -> dict[str, float | None] | None:
+    """Rms of a distortion, of its noise, and probability; None where there are no such lines."""
+    rms, noise, p = (_known(one[key]) for key in (name, f"{name}_noise", f"{name}_p"))
+    return None if rms is None else {"rms": rms, "noise": noise, "p_value": p}
+
+
+def _known(value: xr.DataArray) -> float | None:
+    return float(value) if np.isfinite(float(value)) else None
+
+
+def response_sentence(entry: Mapping[str, Any]) -> str:
+    """What one level of multisine runs shows of one output.
+
+    Parameters
+    ----------
+    entry : mapping
+        Of :func:`response_entries`.
+    """
+    size = format_value(entry["input_rms"], entry["drive_unit"])
+    low, high = (f"{one:.3g}" for one in entry["band"])
+    many = f"{entry['realisations']} realisation" + "s" * (entry["realisations"] > 1)
+    shown = [
+        f"{kind} distortion {_times_noise(sizes)}" for kind, sizes in entry["distortion"].items()
+    ]
+    if entry["stochastic"]:
+        shown.append(f"scatter between realisations {_times_noise(entry['stochastic'])}")
+    else:
+        shown.append("one realisation, so that stochastic distortion is not known")
+    share = entry["input_share"]
+    if share is not None and share >= _INPUT_SHARE:
+        shown.append(f"the input has {100 * share:.2g} % of its amplitude at unexcited lines too")
+    return (
+        f"from {entry['drive']} to {entry['output']} at {size} rms ({many}, {entry['lines']} "
+        f"excited lines from {low} to {high} Hz): {'; '.join(shown)}"
+    )
+
+
+def _times_noise(sizes: Mapping[str, float | None]) -> str:
+    if not sizes["noise"] or sizes["rms"] is None:
+        return "without a noise to compare it with"
+    ratio, p = sizes["rms"] / sizes["noise"], format_p(sizes["p_value"])
+    return f"{ratio:.3g} times the noise" + (f" ({p})" if p else "")

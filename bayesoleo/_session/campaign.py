@@ -406,6 +406,8 @@ def check_text(facts: Mapping[str, Any]) -> str:
             lines += ["at the nominal values:", columns(head, rows)] if rows else []
         elif key == "data_warnings":
             lines += [f"note: {text}" for text in value]
+        elif key == schema.FREQUENCY_RESPONSE:
+            lines += value
         elif key != "format":
             text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
             lines.append(f"{key.replace('_', ' ')}: {text}")

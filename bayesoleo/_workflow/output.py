@@ -20,7 +20,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report.page import write_report
-from bayesoleo._report.sentences import headline
+from bayesoleo._report.sentences import headline, response_entries
 from bayesoleo._report.terminal import write_plain_report
 from bayesoleo._storage.files import (
     SUMS,
@@ -37,6 +37,7 @@ from bayesoleo._storage.resume import digest, keep_state, kept_state, package_di
 from bayesoleo._types import ProgressCallback
 from bayesoleo._workflow.model_files import to_document
 from bayesoleo._workflow.task import Task, silent
+from bayesoleo.data._frequency_response import stored
 from bayesoleo.discovery._curves import CurveFacts
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._loop import ClosedLoop
@@ -383,6 +384,8 @@ def result_tree(
     )
     summary = summarise(loop, samples, {**task.about(), "files": files}, facts)
     summary["notes"] = [*summary["notes"], *task.data_warnings]
+    if task.frequency_response is not None:
+        summary[schema.FREQUENCY_RESPONSE] = response_entries(task.frequency_response)
     summary["proposals"] = [proposals_entry(question, unit) for question in questions]
     summary[schema.UNFINISHED] = list(stages.failed)
     summary["headline"] = headline(summary)
@@ -428,6 +431,8 @@ def finish(
         blocks = groups[schema.CONSTANT_DATA]
         taken = [name for name in blocks.data_vars if name in constant]
         constant = blocks.drop_vars(taken).merge(constant)  # first: az.plot_lm takes the first
+    if task.frequency_response is not None:
+        measured[schema.FREQUENCY_RESPONSE] = stored(task.frequency_response)
     tree = xr.DataTree.from_dict({**measured, **groups, schema.CONSTANT_DATA: constant})
     more: dict[str, Any] = {
         schema.CAMPAIGN: task.campaign.name,

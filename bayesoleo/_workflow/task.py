@@ -14,17 +14,28 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from bayesoleo import _schema as schema
+from bayesoleo._report.sentences import response_entries, response_sentence
 from bayesoleo._units import parse_unit, same_quantity
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
 from bayesoleo.data._disturbances import without_disturbances
+from bayesoleo.data._frequency_response import (
+    EXCITED,
+    FEWEST_LINES,
+    KIND,
+    LEVEL,
+    LINE,
+    frequency_response,
+    has_multisine,
+)
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._fit import first_steps
-from bayesoleo.errors import CampaignError, DataWarning, ModelError
+from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._dimensions import check_dimensions
@@ -286,6 +297,11 @@ class Task:
         """What deserves a look in the records; computed once, though each round's result has it."""
         return data_warnings(self.reduced.records, self.campaign.units)
 
+    @cached_property
+    def frequency_response(self) -> xr.Dataset | None:
+        """What multisine runs show before any model; None without such runs."""
+        return multisine_response(self.reduced, self.assembly.model())
+
     def about(self) -> dict[str, Any]:
         """Top-level keys of the summary."""
         left_out = self.settings.left_out
@@ -470,9 +486,45 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
     return checked(prepare(campaign, model, settings))
 
 
+def multisine_response(reduced: ReducedCampaign, model: Model) -> xr.Dataset | None:
+    """Frequency response and distortion of the runs that have a multisine input.
+
+    The input is what the rig controls or, if that is not declared, the first input of the model
+    that is a multisine.
+
+    Parameters
+    ----------
+    reduced : ReducedCampaign
+    model : Model
+        In the drive in which it is solved.
+
+    Returns
+    -------
+    Dataset or None
+        None where no run is a multisine, or none can be divided between its inputs.
+    """
+    inputs, channels = list(model.inputs), reduced.campaign.channels
+    mine = [name for name in (*inputs, *model.outputs) if name in channels]
+    controlled = reduced.campaign.controlled
+    drives = [controlled] if controlled in mine else [name for name in inputs if name in mine]
+    drive = next((name for name in drives if has_multisine(reduced.records, name)), None)
+    if drive is None:
+        return None
+    # What a controlled output drives are answers, whatever the model takes them for.
+    others = [name for name in inputs if name != drive and name in mine] * (drive in inputs)
+    outputs = [name for name in mine if name != drive and name not in others]
+    try:
+        found = frequency_response(reduced, drive, outputs, others=others)
+    except InputError:
+        return None
+    many = (found[KIND] == EXCITED).sum(LINE).values >= FEWEST_LINES
+    return found.isel({LEVEL: many}) if many.any() else None
+
+
 def checked(task: Task) -> dict[str, Any]:
     """What :func:`check` says of a campaign and a model that were brought together."""
-    settings, driven = task.settings, task.assembly.model()
+    settings, driven, response = task.settings, task.assembly.model(), task.frequency_response
+    told = [] if response is None else list(map(response_sentence, response_entries(response)))
     native = task.assembly.declared or task.assembly.native
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
     steps = settings.steps or first_steps(driven, task.roles.fitted)
@@ -494,5 +546,6 @@ def checked(task: Task) -> dict[str, Any]:
             for effect in settings.searched
         ),
         "start": as_plain(starts),
+        **({schema.FREQUENCY_RESPONSE: told} if told else {}),
         "data_warnings": [*task.data_warnings, *about_start(starts, driven)],
     }

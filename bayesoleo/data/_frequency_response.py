@@ -152,7 +152,8 @@ def frequency_response(
         )
     rows = range(1 + len(others), len(channels))
     levels = [_level(group, rows, excited) for group in _groups(runs)]
-    levels.sort(key=lambda one: (one.fundamental, one.input_rms))
+    # Frequencies that differ by noise alone are one.
+    levels.sort(key=lambda one: (float(f"{one.fundamental:.3g}"), one.input_rms))
     return _dataset(levels, drive, wanted, units, left_out)
 
 
@@ -441,6 +442,9 @@ class _Level:
         Hz.
     input_rms : float
         Of the excited lines, SI.
+    input_share : float
+        Amplitude of the input at detection lines, without its noise, over that at excited lines;
+        rms over lines.
     runs : tuple of str
     realisations, periods : int
         Periods are those of the shortest run.
@@ -452,6 +456,7 @@ class _Level:
 
     fundamental: float
     input_rms: float
+    input_share: float
     runs: tuple[str, ...]
     realisations: int
     periods: int
@@ -481,6 +486,7 @@ def _level(
     return _Level(
         fundamental=float(np.mean([run.record.frequency for run in runs])),
         input_rms=float(np.sqrt(0.5 * np.sum(power[excited]))),
+        input_share=_share(power[: shown + 1], noise[: shown + 1], kinds),
         runs=tuple(run.record.label for run in runs),
         realisations=len(group),
         periods=min(run.record.periods for run in runs),
@@ -488,6 +494,31 @@ def _level(
         by_line=by_line,
         pooled={name: np.array([one[name] for _, one in found]) for name in found[0][1]},
     )
+
+
+def _share(power: Array, noise: Array, kinds: NDArray[np.str_]) -> float:
+    """Amplitude of an input at detection lines over that at excited lines; NaN without such."""
+    lines = np.isin(kinds, PARITIES) & within_band(kinds)
+    if not lines.any():
+        return float("nan")
+    excess = np.mean(power[lines] - np.nan_to_num(noise[lines]))
+    return float(np.sqrt(max(excess, 0.0) / np.mean(power[kinds == EXCITED])))
+
+
+def within_band(kinds: NDArray[np.str_]) -> Flags:
+    """Lines by which a level is judged: of a multisine those from its first to its last excited.
+
+    Only there the part of the input is known and removed.
+
+    Parameters
+    ----------
+    kinds : ndarray of str, shape (L,)
+        Ascending by frequency.
+    """
+    excited, place = np.flatnonzero(kinds == EXCITED), np.arange(kinds.size)
+    if excited.size < FEWEST_LINES:
+        return np.asarray(kinds != "")
+    return np.asarray((place >= excited[0]) & (place <= excited[-1]))
 
 
 @dataclass(frozen=True)
@@ -603,14 +634,8 @@ class _Answer:
         }  # fmt: skip
 
     def _detected(self, power: Array, noise: Array) -> dict[str, Array]:
-        """Distortion at all detection lines of a kind together.
-
-        Of a multisine only those between its excited lines, where the input's part is removed.
-        """
-        place = np.arange(self.kinds.size)
-        inside = np.ones(place.size, dtype=bool)
-        if self.excited.size >= FEWEST_LINES:
-            inside = (place > self.excited[0]) & (place < self.excited[-1])
+        """Distortion at all detection lines of a kind together."""
+        inside = within_band(self.kinds)
         found = np.full((3, len(PARITIES)), np.nan)
         for k, parity in enumerate(PARITIES):
             lines = np.flatnonzero((self.kinds == parity) & inside)
@@ -744,6 +769,12 @@ def _dataset(
         "input_rms": variable(
             (LEVEL,), [one.input_rms for one in levels], "rms of the excited lines", units[drive]
         ),
+        "input_share": variable(
+            (LEVEL,),
+            [one.input_share for one in levels],
+            "amplitude of the input at detection lines over that at excited lines",
+            "1",
+        ),
         "realisations": (LEVEL, [level.realisations for level in levels]),
         schema.PERIODS: (LEVEL, [level.periods for level in levels]),
         schema.RUNS: (LEVEL, [json.dumps(level.runs, ensure_ascii=False) for level in levels]),
@@ -775,3 +806,19 @@ def ratio_unit(output: str, drive: str) -> str:
     if drive in ("", "1"):
         return output
     return f"{output or 1}/({drive})" if re.search(r"\W", drive) else f"{output or 1}/{drive}"
+
+
+def stored(data: xr.Dataset) -> xr.Dataset:
+    """The same with real numbers only, as files of results hold them.
+
+    Parameters
+    ----------
+    data : Dataset
+        Of :func:`frequency_response`.
+    """
+    response = data["response"]
+    parts = np.stack([response.values.real, response.values.imag], axis=-1)
+    dims = (*map(str, response.dims), schema.PART)
+    return data.assign(response=(dims, parts, response.attrs)).assign_coords(
+        {schema.PART: ["real", "imaginary"]}
+    )

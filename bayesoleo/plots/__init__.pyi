@@ -34,6 +34,7 @@ from ._runs import (
     by_run as by_run,
     error as error,
     fit as fit,
+    frequency_response as frequency_response,
     period_search as period_search,
     records as records,
 )

@@ -1,12 +1,14 @@
 """Figures of runs: records with the search of their period and the fit, and the errors of runs.
 
 The search of the period is shown as in figures B.1 and B.2 of Verbeek (1993). Errors are those of
-each run before and after, beside the estimates of single runs.
+each run before and after, beside the estimates of single runs. Broadband runs show noise and
+nonlinear distortion by frequency before there is a model.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Integers
+from bayesoleo.data import _frequency_response as response
 from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._residual_time_shift import PeriodSearch
 from bayesoleo.errors import InputError
@@ -540,3 +543,147 @@ def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
     at = time[: length * most : length]
     pairs = np.column_stack([parts.min(axis=1), parts.max(axis=1)]).ravel()
     return np.repeat(at, 2), pairs
+
+
+#: Kinds of lines with their colours and marks; one figure has few of them.
+_KINDS = {
+    response.EXCITED: (style.INK, "o"),
+    response.EVEN: (style.ENSEMBLES[2], "^"),
+    response.ODD: (style.ENSEMBLES[3], "v"),
+    response.MIXED: (style.ENSEMBLES[5], "d"),
+    response.SUBHARMONIC: (style.ENSEMBLES[6], "x"),
+}
+_TOTAL = style.ENSEMBLES[4]
+RESPONSE_ROW, RESPONSE_GAP, MOST_LEVELS = 2.1, 0.75, 6
+#: Ratio of the highest to the lowest frequency shown from which the axis is logarithmic.
+_WIDE = 30.0
+
+
+def frequency_response(data: xr.Dataset | xr.DataTree, output: str | None = None) -> Figure:
+    """Best linear approximation and distortion of one output of multisine runs, a row each level.
+
+    Parameters
+    ----------
+    data : Dataset or DataTree
+        From :func:`bayesoleo.data.frequency_response`, or the group of a result.
+    output : str, optional
+        By default the first.
+
+    Returns
+    -------
+    Figure
+        Left the amplitude of the response with its standard deviations, by noise and, of two
+        realisations or more, in total; right the amplitude of the output at excited and at
+        detection lines with its noise. Above a row of a multisine is how many times the noise the
+        distortion is, all lines of a kind together.
+    """
+    found = reading.dataset(data)
+    names = [str(name) for name in found[schema.OUTPUT].values]
+    if output is not None and output not in names:
+        raise InputError("no such output", key="output", value=output, hint=", ".join(names))
+    one = found.sel({schema.OUTPUT: output or names[0]})
+    count = one.sizes[response.LEVEL]
+    shown = min(count, MOST_LEVELS)
+    height = 0.9 + shown * RESPONSE_ROW + (shown - 1) * RESPONSE_GAP + 0.55
+    figure, kinds = style.blank(style.WIDTH, height), list[str]()
+    for place in range(shown):
+        level = one.isel({response.LEVEL: place})
+        bottom = height - 0.9 - (place + 1) * RESPONSE_ROW - place * RESPONSE_GAP
+        boxes = (0.8, bottom, 3.75, RESPONSE_ROW), (5.6, bottom, 4.25, RESPONSE_ROW)
+        left, right = (style.add_axes(figure, *box) for box in boxes)
+        lines = np.flatnonzero(response.within_band(level[response.KIND].values))
+        _draw_response(left, level, lines)
+        kinds += _draw_output(right, level, lines)
+        style.name_above(left, _level_name(level))
+        style.name_above(right, right=_distortion_words(level))
+    for axes in (left, right):
+        axes.set_xlabel("frequency in Hz", fontsize=style.TEXT)
+    remark = f"first {shown} of {count} levels" if shown < count else ""
+    style.legend(figure, _line_handles(dict.fromkeys(kinds)), remark)
+    return figure
+
+
+def _draw_response(axes: Axes, level: xr.Dataset, lines: Integers) -> None:
+    """Amplitude of the response with its two standard deviations."""
+    found = level["response"]
+    if schema.PART in found.dims:
+        values = np.hypot(*(found.isel({schema.PART: k}).values for k in (0, 1)))
+    else:
+        values = np.abs(found.values)
+    frequency = level[schema.FREQUENCY].values
+    scale = engineering(_response_unit(level), style.magnitude(values))
+    for name, colour, mark in (
+        ("noise_sd", style.MEASURED, "."),
+        ("total_sd", _TOTAL, "s"),
+    ):
+        sd = scale.factor * level[name].values
+        axes.plot(frequency[lines], sd[lines], mark, ms=3, color=colour)
+    axes.plot(frequency[lines], scale.factor * values[lines], "o", ms=3, color=style.INK)
+    _dress_spectrum(axes, frequency[lines])
+    axes.set_ylabel(style.plain(scale.label("response"), 40), fontsize=style.TEXT)
+
+
+def _draw_output(axes: Axes, level: xr.Dataset, lines: Integers) -> list[str]:
+    """Amplitude of the output by kind of line, with its noise; the kinds that there are."""
+    frequency, kind = level[schema.FREQUENCY].values, level[response.KIND].values
+    amplitude = level["output_amplitude"].values
+    scale = engineering(str(level["output_unit"].values), style.magnitude(amplitude))
+    noise = scale.factor * level["output_noise"].values
+    axes.plot(frequency[lines], noise[lines], ".", ms=3, color=style.MEASURED)
+    scatter = scale.factor * (level["distortion_sd"] * level["input_amplitude"]).values
+    axes.plot(frequency[lines], scatter[lines], "s", ms=3, color=_TOTAL)
+    there = []
+    for name, (colour, mark) in _KINDS.items():
+        own = lines[kind[lines] == name]
+        if own.size:
+            there.append(name)
+            axes.plot(frequency[own], scale.factor * amplitude[own], mark, ms=3, color=colour)
+    _dress_spectrum(axes, frequency[lines])
+    text = scale.label(f"amplitude of {level[schema.OUTPUT].item()}")
+    axes.set_ylabel(style.plain(text, 40), fontsize=style.TEXT)
+    return there + ["total"] * bool(np.isfinite(scatter).any())
+
+
+def _dress_spectrum(axes: Axes, frequency: Array) -> None:
+    style.dress(axes)
+    # Zeros, which noise-free data have, are no point of a logarithmic axis.
+    axes.set_yscale("log", nonpositive="mask")
+    axes.tick_params(labelsize=style.SMALL)
+    if frequency.max() > _WIDE * frequency.min():
+        axes.set_xscale("log")
+
+
+def _response_unit(level: xr.Dataset) -> str:
+    drive = str(level["input_rms"].attrs.get(schema.UNITS, ""))
+    return response.ratio_unit(str(level["output_unit"].values), drive)
+
+
+def _level_name(level: xr.Dataset) -> str:
+    """The rms of the input, and how many runs it was held at."""
+    unit = str(level["input_rms"].attrs.get(schema.UNITS, ""))
+    number, periods = int(level["realisations"]), int(level[schema.PERIODS])
+    size = style.format_value(float(level["input_rms"]), unit)
+    realisations = f"{number} realisation" + ("s" if number > 1 else "")
+    return f"{size} rms, {realisations}, {periods} period" + ("s" if periods > 1 else "")
+
+
+def _distortion_words(level: xr.Dataset) -> str:
+    """Distortion over noise by kind of line, where it is known."""
+    ratios = (level["distortion"] / level["distortion_noise"]).values
+    names = [str(name) for name in level[response.PARITY].values]
+    texts = [f"{name} {ratio:.3g}" for name, ratio in zip(names, ratios, strict=True) if ratio > 0]
+    scatter = float(level["stochastic"] / level["stochastic_noise"])
+    texts += [f"realisations {scatter:.3g}"] if scatter > 0 else []
+    return f"times the noise: {', '.join(texts)}" if texts else ""
+
+
+def _line_handles(kinds: Iterable[str]) -> list[Artist]:
+    """What the marks mean; noise is always shown."""
+    found: list[Artist] = []
+    for kind in kinds:
+        total = kind == "total"
+        colour, mark = (_TOTAL, "s") if total else _KINDS[kind]
+        text = "between realisations" if total else f"{kind} lines"
+        found.append(Line2D([], [], marker=mark, ls="", ms=4, color=colour, label=text))
+    noise = Line2D([], [], marker=".", ls="", ms=5, color=style.MEASURED, label="noise")
+    return [*found, noise]

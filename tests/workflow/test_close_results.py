@@ -100,6 +100,7 @@ CLOSED = set(schema.GROUPS) - {
     schema.ERROR_MODEL,
     schema.PROPOSAL,
     schema.NONPARAMETRIC,
+    schema.FREQUENCY_RESPONSE,
 }
 
 
