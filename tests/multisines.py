@@ -76,13 +76,18 @@ def multisine_campaign(
     realisations: int = 4,
     orders: Sequence[int] = ODD_GRID,
     levels: Sequence[float] = (1.0,),
+    input_noise: float = 1e-4,
     **more: float,
 ) -> ReducedCampaign:
-    """Realisations of levels; ``system`` answers one period of an input."""
+    """Realisations of levels; ``system`` answers one period of an input.
+
+    An input without any noise is none that was measured: its rounding errors have no period.
+    """
     rng = np.random.default_rng(seed)
     made = []
     for level in levels:
         for number in range(realisations):
             u = multisine(orders, rng, level)
-            made.append(run(f"{level:g}-{number}", u, system(u), rng, **more))
+            noise = {"input_noise": input_noise, **more}
+            made.append(run(f"{level:g}-{number}", u, system(u), rng, **noise))
     return reduce_campaign(campaign(made), jobs=1)
