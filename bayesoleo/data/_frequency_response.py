@@ -67,7 +67,7 @@ NOISE_LINES = 20
 #: values (as a part of the rms) and fundamental frequencies; conditions are, to a hundredth.
 ALIKE, SAME_FREQUENCY, SAME_CONDITION = 0.1, 1e-3, 0.01
 #: Correlation of two inputs without noise, shifted in time at will, from which their phases are the
-#: same. Two realisations of five lines come as near by chance once in some ten thousand pairs.
+#: same. Of ten thousand pairs of realisations of five lines, at most three come as near by chance.
 SAME_PHASES = 0.995
 #: Orders are told up to so many times the highest that is excited, and so many beyond it.
 REACH, BEYOND = 3, 24
