@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,8 @@ def multisine(
     """One period with equal amplitudes and random phases."""
     spectrum = np.zeros(samples // 2 + 1, dtype=complex)
     spectrum[list(orders)] = np.exp(2j * np.pi * rng.random(len(orders)))
-    return rms * np.sqrt(0.5 / len(orders)) * samples * np.fft.irfft(spectrum, samples)
+    size = rms * np.sqrt(0.5 / len(orders)) * samples
+    return np.asarray(size * np.fft.irfft(spectrum, samples))
 
 
 def resonance(u: Array) -> Array:
@@ -64,9 +67,7 @@ def campaign(runs: Sequence[Run], controlled: str | None = "force") -> CampaignD
         name: Channel(name=name, column=name, unit=units[name], si_unit=units[name])
         for name in runs[0].samples
     }
-    return CampaignData(
-        "multisine", "", controlled, __import__("pathlib").Path(), channels, tuple(runs), ""
-    )
+    return CampaignData("multisine", "", controlled, Path(), channels, tuple(runs), "")
 
 
 def multisine_campaign(
@@ -77,7 +78,7 @@ def multisine_campaign(
     orders: Sequence[int] = ODD_GRID,
     levels: Sequence[float] = (1.0,),
     input_noise: float = 1e-4,
-    **more: float,
+    **more: Any,
 ) -> ReducedCampaign:
     """Realisations of levels; ``system`` answers one period of an input.
 
@@ -88,6 +89,6 @@ def multisine_campaign(
     for level in levels:
         for number in range(realisations):
             u = multisine(orders, rng, level)
-            noise = {"input_noise": input_noise, **more}
-            made.append(run(f"{level:g}-{number}", u, system(u), rng, **noise))
+            label, noise = f"{level:g}-{number}", {"input_noise": input_noise, **more}
+            made.append(run(label, u, system(u), rng, **noise))
     return reduce_campaign(campaign(made), jobs=1)

@@ -6,6 +6,7 @@ wrong unit shows there.
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,13 +18,13 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._report.sentences import response_entries, response_sentence
 from bayesoleo._units import parse_unit, same_quantity
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
 from bayesoleo.data._disturbances import without_disturbances
 from bayesoleo.data._frequency_response import (
+    A_TRANSIENT,
     EXCITED,
     FEWEST_LINES,
     KIND,
@@ -295,11 +296,16 @@ class Task:
     @cached_property
     def data_warnings(self) -> list[str]:
         """What deserves a look in the records; computed once, though each round's result has it."""
-        return data_warnings(self.reduced.records, self.campaign.units)
+        found = data_warnings(self.reduced.records, self.campaign.units)
+        return [*found, *self._broadband[1]]
 
-    @cached_property
+    @property
     def frequency_response(self) -> xr.Dataset | None:
         """What multisine runs show before any model; None without such runs."""
+        return self._broadband[0]
+
+    @cached_property
+    def _broadband(self) -> tuple[xr.Dataset | None, list[str]]:
         return multisine_response(self.reduced, self.assembly.model())
 
     def about(self) -> dict[str, Any]:
@@ -486,7 +492,9 @@ def check(campaign: Source, model: Model, settings: Settings = Settings()) -> di
     return checked(prepare(campaign, model, settings))
 
 
-def multisine_response(reduced: ReducedCampaign, model: Model) -> xr.Dataset | None:
+def multisine_response(
+    reduced: ReducedCampaign, model: Model
+) -> tuple[xr.Dataset | None, list[str]]:
     """Frequency response and distortion of the runs that have a multisine input.
 
     The input is what the rig controls or, if that is not declared, the first input of the model
@@ -500,8 +508,10 @@ def multisine_response(reduced: ReducedCampaign, model: Model) -> xr.Dataset | N
 
     Returns
     -------
-    Dataset or None
+    data : Dataset or None
         None where no run is a multisine, or none can be divided between its inputs.
+    notes : list of str
+        Sentences about periodic runs that take no part although there are multisines.
     """
     inputs, channels = list(model.inputs), reduced.campaign.channels
     mine = [name for name in (*inputs, *model.outputs) if name in channels]
@@ -509,22 +519,37 @@ def multisine_response(reduced: ReducedCampaign, model: Model) -> xr.Dataset | N
     drives = [controlled] if controlled in mine else [name for name in inputs if name in mine]
     drive = next((name for name in drives if has_multisine(reduced.records, name)), None)
     if drive is None:
-        return None
+        return None, []
     # What a controlled output drives are answers, whatever the model takes them for.
     others = [name for name in inputs if name != drive and name in mine] * (drive in inputs)
     outputs = [name for name in mine if name != drive and name not in others]
     try:
         found = frequency_response(reduced, drive, outputs, others=others)
-    except InputError:
-        return None
+    except InputError as error:
+        return None, [f"multisine runs were not looked at: {error.problem}"]
+    notes = [
+        f"run {label} takes no part in the frequency response: {reason}"
+        for label, reason in json.loads(found.attrs["left_out"]).items()
+        if reason != A_TRANSIENT
+    ]
     many = (found[KIND] == EXCITED).sum(LINE).values >= FEWEST_LINES
-    return found.isel({LEVEL: many}) if many.any() else None
+    return (found.isel({LEVEL: many}), notes) if many.any() else (None, [])
+
+
+def _response_told(response: xr.Dataset | None) -> list[str]:
+    """Sentences about multisine runs; none without such runs."""
+    if response is None:
+        return []
+    # Loads Matplotlib, which checks of other campaigns do without.
+    from bayesoleo._report.sentences import response_entries, response_sentence
+
+    return [response_sentence(entry) for entry in response_entries(response)]
 
 
 def checked(task: Task) -> dict[str, Any]:
     """What :func:`check` says of a campaign and a model that were brought together."""
-    settings, driven, response = task.settings, task.assembly.model(), task.frequency_response
-    told = [] if response is None else list(map(response_sentence, response_entries(response)))
+    settings, driven = task.settings, task.assembly.model()
+    told = _response_told(task.frequency_response)
     native = task.assembly.declared or task.assembly.native
     predictor = Predictor(driven, task.roles.fitted, steps=8, backend="numpy", jobs=1)
     steps = settings.steps or first_steps(driven, task.roles.fitted)

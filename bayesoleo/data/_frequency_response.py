@@ -78,6 +78,8 @@ EXCITED, EVEN, ODD, MIXED, SUBHARMONIC, OTHER = (
 #: Kinds of detection lines. Where even and odd lines are excited, either distortion falls on all.
 PARITIES = (EVEN, ODD, MIXED, SUBHARMONIC)
 Values = NDArray[np.inexact[Any]]
+#: Why a transient is left out.
+A_TRANSIENT = "a transient"
 LEVEL, LINE, KIND, PARITY = "level", "line", "kind", "parity"
 
 
@@ -319,7 +321,7 @@ def _spectra(
     """Spectra of the runs that take part; the others are noted with the reason."""
     for record in records:
         if not record.periodic:
-            left_out[record.label] = "a transient"
+            left_out[record.label] = A_TRANSIENT
             continue
         one = _spectrum(record, channels, others, excited)
         if not one.excited.size:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from multisines import multisine
+from multisines import ODD_GRID, PER_PERIOD, campaign, multisine, run
 from small_campaigns import CUBIC, DAMPER_CHANNELS, DAMPING, STIFFNESS, damper, damper_campaign
 
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._session.campaign import check_text
 from bayesoleo._storage.result_files import read_tree
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.task import prepare
-from bayesoleo.data import SimulatedRun, write_campaign
+from bayesoleo._workflow.task import multisine_response, prepare
+from bayesoleo.data import ReducedCampaign, SimulatedRun, reduce_campaign, write_campaign
+from bayesoleo.model import Model, Output, Parameter
 
 LINES, SAMPLES, PERIODS, RATE = tuple(range(1, 20, 2)), 200, 6, 1.0
 
@@ -73,3 +75,44 @@ def test_sines_with_harmonics_are_no_multisines(tmp_path):
     task = prepare(reduced, damper(), Settings(jobs=1))
     assert task.frequency_response is None
     assert schema.FREQUENCY_RESPONSE not in workflow.check(reduced, damper(), Settings(jobs=1))
+
+
+def two_inputs(second) -> ReducedCampaign:
+    """Two runs with ``force`` and ``second``, of which one has the values that are given."""
+    rng, made = np.random.default_rng(0), []
+    for label, values in (("both", second), ("one", np.zeros(PER_PERIOD))):
+        u = multisine(ODD_GRID, rng)
+        one = run(label, u, u + values, rng, noise=0.01, input_noise=1e-4)
+        more = np.tile(values, 4) + 1e-4 * rng.standard_normal(one.time.size)
+        made.append(replace(one, samples={**one.samples, "second": more}))
+    return reduce_campaign(campaign(made, controlled=None), jobs=1)
+
+
+MODEL = Model(
+    "two inputs",
+    inputs={"force": "N", "second": "N"},
+    parameters={"k": Parameter(1.0, "m/N", sd=1.0)},
+    outputs={"displacement": Output({"spring": "k*(force + second)"}, "m")},
+)
+
+
+def test_a_run_that_two_inputs_share_is_left_out_and_said_so():
+    shared = two_inputs(multisine(ODD_GRID, np.random.default_rng(1)))
+    data, notes = multisine_response(shared, MODEL)
+    assert json.loads(str(data["runs"].values[0])) == ["one"]
+    (note,) = notes
+    assert note.startswith("run both takes no part in the frequency response: force and another")
+    both = replace(shared, records=shared.records[:1])
+    data, (note,) = multisine_response(both, MODEL)
+    assert data is None
+    assert note.startswith("multisine runs were not looked at: ")
+
+
+def test_the_first_input_that_is_a_multisine_is_the_drive():
+    sine = two_inputs(multisine((2,), np.random.default_rng(1)))
+    swapped = replace(MODEL, inputs={"second": "N", "force": "N"})
+    data, notes = multisine_response(sine, swapped)
+    assert data.attrs["drive"] == "force"
+    assert data["output"].values.tolist() == ["displacement"]
+    assert notes == []
+    assert (data["kind"].values == "other input").any()
