@@ -140,7 +140,7 @@ def _structure_prior() -> StructurePrior:
 
 #: Parts of the prior of structures that an option gives; they share one.
 PRIOR_PARTS = ("nothing", "catalogue", "outside")
-_PRIOR_FLAG, _PRIOR_EXAMPLE = "--structure-prior", "write nothing=0.45,catalogue=0.4,outside=0.15"
+_PRIOR_FLAG, _PRIOR_EXAMPLE = "--structure-prior", "write nothing=0.45,catalogue=0.35,outside=0.2"
 
 
 def _read_prior(text: str) -> StructurePrior:

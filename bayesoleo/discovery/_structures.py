@@ -1,7 +1,7 @@
 """Structures: which effects act, alone or together, and whether there is something outside the
 catalogue; their prior and their posterior probabilities.
 
-The prior is stated: 0.45 that nothing is missing, 0.4 for effects of the catalogue, 0.15 for
+The prior is stated: 0.45 that nothing is missing, 0.35 for effects of the catalogue, 0.2 for
 something outside of it: no catalogue has every law. The share of the catalogue is divided equally
 among families, then among the effects of a family, so that near copies do not weigh more. Within a
 family the laws that textbooks begin with weigh more than their refinements.
@@ -65,8 +65,8 @@ class StructurePrior:
     """
 
     nothing: float = 0.45
-    catalogue: float = 0.4
-    outside: float = 0.15
+    catalogue: float = 0.35
+    outside: float = 0.2
     numbers: tuple[float, ...] = (0.75, 0.2, 0.04, 0.01)
     families: Mapping[str, float] = field(default_factory=dict)
     effects: Mapping[str, float] = field(default_factory=dict)

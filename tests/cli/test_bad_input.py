@@ -303,7 +303,7 @@ def test_a_prior_of_structures_that_cannot_be(refused, campaign, model, given, m
 def test_parts_of_the_prior_that_are_left_out_share_the_rest():
     prior = settings(structure_prior="nothing=0.8").structure_prior
     assert (prior.nothing, prior.catalogue, prior.outside) == pytest.approx(
-        (0.8, 0.2 * 8 / 11, 0.2 * 3 / 11)
+        (0.8, 0.2 * 7 / 11, 0.2 * 4 / 11)
     )
     assert settings(structure_prior=None).structure_prior == StructurePrior()
 
