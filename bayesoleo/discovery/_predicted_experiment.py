@@ -337,6 +337,8 @@ def sizes_of(fit: ModelFit, amplitudes: Sequence[str], samples: int) -> tuple[Si
     signal = [run.measured for run in fit.predictor.runs]
     noise = np.sqrt(fit.point.variance)
     norm = np.sqrt(sum(np.sum((s / noise[:, None]) ** 2) for s in seen))
+    if not norm > 0.0:  # it changes no run: whatever its size, nothing is seen of it
+        return (Size(names[k], 1.0, 0.0, 0.0),)
     reach = max(float(np.max(np.std(y, axis=1) / noise)) for y in signal)
     sizes = sizes_between(reach, samples, SIZES) * np.sqrt(samples) / norm
     whole = sizes**2 + error**2

@@ -27,7 +27,24 @@ from bayesoleo.model._derivatives import Derived, derive
 from bayesoleo.model._expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model._model import Model
 
+#: What a base that is never negative, such as ``positive(x)``, is at least in a negative power. The
+#: slope of its root would be infinite at zero, and no number beyond, where it is zero.
+_LEAST_BASE = sp.Float(1e-100)
+
 _CALLS = {name: name for name in ("exp", "log", "sin", "cos", "tan", "tanh")} | {"atan": "arctan"}
+
+
+def _defined(expression: sp.Expr) -> sp.Expr:
+    """An expression whose slopes of roots are numbers where the root has ended."""
+    if not expression.has(sp.Abs, sp.Max):
+        return expression
+    table = {
+        power: sp.Pow(sp.Max(power.base, _LEAST_BASE), power.exp)
+        for power in expression.atoms(sp.Pow)
+        if power.exp.is_negative and not power.exp.is_integer
+        if isinstance(power.base, sp.Abs | sp.Max) and power.base.is_nonnegative
+    }
+    return expression.xreplace(table)
 
 
 class _Printer(PythonCodePrinter):  # type: ignore[misc] # SymPy has no types
@@ -176,7 +193,7 @@ def code(
         One Python expression for each entry of ``expressions``.
     """
     renamed = [
-        expression.xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()})
+        _defined(expression).xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()})
         for expression in expressions
     ]
     fixed = {sp.Symbol(names[item], real=True) for item in constant}
@@ -217,7 +234,7 @@ def statements(
         One Python expression for each entry of ``expressions``.
     """
     printer = _Statements(names)
-    results = [printer._print(sp.sympify(expression)) for expression in expressions]
+    results = [printer._print(_defined(sp.sympify(expression))) for expression in expressions]
     return printer.used, printer.lines, results
 
 

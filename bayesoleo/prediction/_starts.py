@@ -263,7 +263,11 @@ class InitialState:
                 self._evaluate(one, where, only, g, gz)
                 with np.errstate(over="ignore"):  # a step so far off is not taken
                     after = float(np.sum((g[0, rows, 0] / unit) ** 2))
-                if self._admissible(one, where) and (after < before or before < 1e-24):
+                better = after < before or before < 1e-24
+                # Where nothing answers to a dof, such as below the bottom of a tank, no further
+                # step would lead away.
+                felt = np.abs(gz[0][np.ix_(rows, columns)]).max(axis=(0, 2)).all()
+                if better and felt and self._admissible(one, where):
                     break
                 fraction *= 0.5
             else:

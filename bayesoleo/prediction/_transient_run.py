@@ -36,6 +36,9 @@ MOST_INTEGRATED = 5_000
 #: Where steps are chosen by the inputs alone they are halved until the motion changes by less than
 #: this part of its size, and are no more than so many.
 SETTLED, MOST_STEPS = 3e-5, 400_000
+#: Bytes that solving vectors together may take, about; and arrays of the size of the motion, by
+#: parameter where derivatives are asked for, that are held at once.
+MOST_BYTES, ARRAYS = 1e9, 8
 #: Steps of equal length where equations have no explicit form for an integrator to choose by.
 FALLBACK = 512
 
@@ -274,8 +277,19 @@ class TransientRun(RunPredictor):
             first, value = first + order + 1, value + order
         return rows
 
+    def _together(self, derivatives: bool) -> int:
+        """How many vectors are solved together: a long record on a fine mesh fills the memory."""
+        derived = self.kernels.derived
+        size = len(derived.states) * self.points.size * (len(derived.active) if derivatives else 1)
+        return max(int(MOST_BYTES / (8 * ARRAYS * max(size, 1))), 1)
+
     def solve(self, p: Array) -> Solution:
         """Solutions for constants ``p (L, np)``, each started from the anchor alone."""
+        most = self._together(derivatives=False)
+        if p.shape[0] > most:
+            parts = [self.solve(p[k : k + most]) for k in range(0, p.shape[0], most)]
+            rows = zip(*((part.x, part.status, part.iterations) for part in parts), strict=True)
+            return Solution(*map(np.concatenate, rows))
         if self.anchor is None:
             shape = (p.shape[0], self.steps, self.scheme.width)
             failed = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
@@ -294,6 +308,10 @@ class TransientRun(RunPredictor):
         if not self.kernels.derived.dofs:
             status = np.zeros(p.shape[0], dtype=np.int64)
             return self._at_samples(p, None, None, status, derivatives)
+        most = self._together(derivatives)
+        if p.shape[0] > most:
+            pieces = (p[k : k + most] for k in range(0, p.shape[0], most))
+            return _joined([self.predict(piece, derivatives=derivatives) for piece in pieces])
         solution = self.solve(p)
         x_p: Array | None = None
         if derivatives:
@@ -304,6 +322,16 @@ class TransientRun(RunPredictor):
     def _at(self, phase: Array) -> Any:
         """Plan of the collocation for positions."""
         return self.collocation.plan(phase, self.steps, initial=True)
+
+
+def _joined(parts: list[PredictedSamples]) -> PredictedSamples:
+    """Predictions of some vectors after each other."""
+    derivatives = [part.y_p for part in parts if part.y_p is not None]
+    return PredictedSamples(
+        np.concatenate([part.y for part in parts]),
+        np.concatenate(derivatives) if derivatives else None,
+        np.concatenate([part.status for part in parts]),
+    )
 
 
 def _rests(now: Array, before: Array) -> bool:

@@ -107,6 +107,18 @@ def test_a_derivative_at_a_kink_is_the_mean_of_its_two_sides(backend):
     np.testing.assert_array_equal(yp[0, 2:4, 0, 1], [0.5, 0.5])
 
 
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_the_slope_of_a_root_is_a_number_beyond_its_end(backend):
+    """A tank whose level is tried below its bottom, as by a solver on its way, is no failure."""
+    model = model_of("sqrt(positive(a + x))", "positive(a + x)**0.3", "sqrt(abs(a + x)) + 0*b*w")
+    x = np.array([-2.0, -0.5, 3.5])  # beyond, at the end, inside
+    y, yp = evaluated(model, backend, x, np.zeros(3), np.array([[0.5, 1.0]]))
+    assert np.isfinite(yp).all()
+    np.testing.assert_allclose(y[0, :2, 0], 0.0)
+    np.testing.assert_allclose(yp[0, :2, 0, 0], 0.0)
+    np.testing.assert_allclose(yp[0, 0, 0, 2], 0.25)
+
+
 def test_the_fast_arctangent_is_good_to_the_last_bits():
     model = model_of("atan(a*x) + 0*b*w")
     rng = np.random.default_rng(2)
