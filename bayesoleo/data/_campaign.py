@@ -249,12 +249,17 @@ class RegisteredSet:
     hashes: dict[str, str]
 
 
+_CONTINUOUS = (
+    "https://raw.githubusercontent.com/forgi86/sysid-neural-continuous/"
+    "956aa7ecd73061b0321c6f6098d74c9e4a7ce67a/examples/"
+)
 REGISTERED = {
     "silverbox": RegisteredSet(
         "https://raw.githubusercontent.com/antonior92/sysid-neuralnet/"
         "8da23c9810f738aececa6058a53e40e9a621e5bc/data/SilverboxFiles/",
         {
             "Schroeder80mV.mat": "ec5a9740a4789aa20b9d84f387424c0218e843844807b30b367c218778339fb6",
+            "SNLS80mV.mat": "5c7413a52255af0cb4e2f93fb6903beb92b08965ba1e6ad0a6ffedfed8477ed4",
         },
     ),
     "mr_damper": RegisteredSet(
@@ -279,6 +284,48 @@ REGISTERED = {
             ),
         },
     ),
+    "emps": RegisteredSet(
+        f"{_CONTINUOUS}EMPS/data/",
+        {
+            "DATA_EMPS.mat": "6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e",
+            "DATA_EMPS_PULSES.mat": (
+                "0eab75bb1f6b16228ee78791343a88bf9bfd9a51036ac9807d7b5fc11c0e1704"
+            ),
+        },
+    ),
+    "cascaded_tanks": RegisteredSet(
+        f"{_CONTINUOUS}CTS/data/",
+        {
+            "dataBenchmark.csv": "ef2388ed822f3aef4aa80d6b0f2b466dd80b361786b3eafc7a2957c31ea323a7",
+        },
+    ),
+    "brfd": RegisteredSet(
+        "https://raw.githubusercontent.com/ARTS-Laboratory/Dataset-Friction-Damper-with-Backlash/"
+        "0e09aa9d950760277e31c08cd93fd01f39a5af09/data/dataset-2/",
+        {
+            "dataset-2_0.5Hz30lbtension1amplitude.json": (
+                "3d58d0f71296a6221974c14454352fa29a27d536295fd5cb05e6d946a7cf30db"
+            ),
+            "dataset-2_1Hz30lbtension0.5amplitude.json": (
+                "8d8c46dcbed3889ae8dbe6ff3698d67e6453349ab728a8915b22680453c4d277"
+            ),
+            "dataset-2_1Hz30lbtension1.5amplitude.json": (
+                "1a894d5857486ee56f363343c3216d2fb300c2fc8777439cca8ee2d02a7dd35c"
+            ),
+            "dataset-2_1Hz30lbtension1amplitude.json": (
+                "ed02a98a96369937851bed92b4e5e92e34d98ceebd4db81d5bd65d5b77c4bc91"
+            ),
+        },
+    ),
+    "single_pendulum": RegisteredSet(
+        "https://raw.githubusercontent.com/dynamicslab/MultiArm-Pendulum/"
+        "e99a7e13fe2adc8fc647321a156b6cb59a48a698/ParameterEstimation/SinglePendulum/",
+        {
+            "SinglePendulumDataForParameterEstimation.mat": (
+                "f3b8cdda4a6e86405ec37ff32b98be76fd37806a609cba7870628c1e40377a98"
+            ),
+        },
+    ),
 }
 
 
@@ -291,7 +338,7 @@ def dataset_folder(name: str, files: Sequence[str] = ()) -> Path:
     Parameters
     ----------
     name : str
-        ``silverbox``, ``mr_damper``, ``mbari_gas_spring``, ``nist``, or a campaign such as
+        A measured set such as ``silverbox`` or ``emps``, ``nist``, or a campaign such as
         ``shaker-plain``.
     files : sequence of str
         Files wanted; by default all registered ones.
