@@ -31,7 +31,8 @@ import xarray as xr
 
 import bayesoleo as bo
 from bayesoleo._workflow.simulating import model_of
-from bayesoleo.model import driven_by
+from bayesoleo.effects import Scales, find_effect
+from bayesoleo.model import Model
 from bayesoleo.prediction._predictor import Predictor
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,26 +51,41 @@ def rms(tree: xr.DataTree, output: str, *runs: str, stage: str = "after") -> flo
 
 
 def simulated(
-    tree: xr.DataTree, campaign: Path, run: str, drive: str | None = None
+    tree: xr.DataTree, campaign: Path, run: str, model: Model | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A run's measured output and its simulation at the estimate, by the final model.
+    """A run's measured output and its simulation at the estimate, by the final model or another.
 
     A start that the model does not declare is the measured one.
     """
-    model = model_of(tree)
-    if drive is not None:
-        model = driven_by(model, drive)
     record = bo.load_campaign(campaign, progress=False).reduced.record(run)
-    predictor = Predictor(model, [record])
+    predictor = Predictor(model or model_of(tree), [record])
     point = tree["point"].to_dataset()
     known = dict(zip(point["parameter"].values, point["estimate"].values, strict=True))
-    start = zip(predictor.layout.names, predictor.layout.start(model), strict=True)
+    start = zip(predictor.layout.names, predictor.layout.start(predictor.model), strict=True)
     theta = np.array([known.get(name, value) for name, value in start])
     (status,) = predictor.set_anchor(theta)
     if not status.ok:
         raise RuntimeError(f"{campaign.name}, run {run}: {status.message}")
     (name,) = predictor.outputs
     return record.samples[name], predictor.simulate(theta[None], 0).y[0, 0]
+
+
+def in_its_own_drive(tree: xr.DataTree, name: str) -> Model:
+    """A set's model as declared, with the effects that were added, driven by its own inputs.
+
+    Without effects of sensors, which were added to the model as the rig drives it.
+    """
+    model, driven = bo.load_model(STUDIES / name / "model.py"), model_of(tree)
+    summary = json.loads(tree.attrs["summary"])
+    scales = Scales(
+        dict.fromkeys(model.dofs, (0.0, 1.0)), dict.fromkeys(model.dofs, 1.0), {}, 1.0, 1.0
+    )
+    for effect, target in zip(summary["effects"], summary["targets"], strict=True):
+        if not find_effect(effect).on_channels:
+            model = find_effect(effect).extend(model, target, scales).model
+    # Constants, such as a largest velocity, are those of the fit.
+    values = {key: item.value for key, item in driven.parameters.items() if key in model.parameters}
+    return model.with_values(values)
 
 
 def silverbox(tree: xr.DataTree) -> Figures:
@@ -90,12 +106,16 @@ def silverbox(tree: xr.DataTree) -> Figures:
 
 def emps(tree: xr.DataTree) -> Figures:
     """Force by position, and position by force."""
-    measured, predicted = simulated(tree, STUDIES / "emps", "pulses", drive="force")
-    return {
+    found: Figures = {
         "emps_fit_N": rms(tree, "force", "trajectory"),
         "emps_pulses_N": rms(tree, "force", "pulses"),
-        "emps_position_mm": 1e3 * float(np.sqrt(np.mean((measured - predicted) ** 2))),
     }
+    try:
+        own = in_its_own_drive(tree, "emps")
+        measured, predicted = simulated(tree, STUDIES / "emps", "pulses", own)
+    except Exception as error:  # the other figures stand without it
+        return {**found, "emps_failed": f"position: {error}"[:200]}
+    return {**found, "emps_position_mm": 1e3 * float(np.sqrt(np.mean((measured - predicted) ** 2)))}
 
 
 def cascaded_tanks(tree: xr.DataTree) -> Figures:

@@ -1,4 +1,4 @@
-"""End stops and other contacts over part of the stroke, and series compliance.
+"""End stops and other contacts over part of the stroke, overflow, and series compliance.
 
 The point of contact is stated as a depth below the extreme of the estimated motion: a positive
 length for any zero of the position.
@@ -18,9 +18,15 @@ from dataclasses import replace
 import sympy as sp
 
 from bayesoleo.effects._effect import Effect, Names
-from bayesoleo.effects._forces import single_force
+from bayesoleo.effects._forces import HIGHEST, single_force
 from bayesoleo.effects._parts import Amplitude, ShapeParameter, range_grid
-from bayesoleo.effects._places import force_places, resisting_places, substitute
+from bayesoleo.effects._places import (
+    balance_unit,
+    force_places,
+    resisting_places,
+    storing_places,
+    substitute,
+)
 from bayesoleo.model._drive_and_start import MAXIMUM_DERIVATIVE
 from bayesoleo.model._expressions import (
     derivative_symbol,
@@ -104,7 +110,96 @@ PRELOAD = single_force(
     " Trans. ASME 54, 157-164",
 )
 
-CONTACT_EFFECTS = (END_STOP_LOWER, END_STOP_UPPER, HERTZIAN_LOWER, HERTZIAN_UPPER, PLAY, PRELOAD)
+
+def _of_motions(effect: Effect) -> Effect:
+    """A contact where something moves; a tank has none."""
+
+    def places(model: Model) -> Sequence[str]:
+        stores = storing_places(model)
+        return tuple(name for name in effect.places(model) if name not in stores)
+
+    return replace(effect, places=places)
+
+
+def _beyond_the_brim(model: Model, target: str, names: Names) -> sp.Expr:
+    """How far the content of a tank is above its brim."""
+    position = storing_places(model)[target].position
+    return sp.Max(position - names["highest_position"] + names["depth"], 0)
+
+
+def _overflow(model: Model, target: str, names: Names) -> Model:
+    place = storing_places(model)[target]
+    lost = names["overflow"] * _beyond_the_brim(model, target, names)
+    return model.with_term("equation", target, "overflow", place.sign * lost)
+
+
+def _below(model: Model, target: str) -> tuple[str, ...]:
+    """Stores that a store feeds: their balances, in its unit, follow its content."""
+    places, unit = storing_places(model), balance_unit(model, target)
+    position = places[target].position
+    return tuple(
+        name
+        for name, place in places.items()
+        if name != target
+        and model.expand(model.equation(place.target)).has(position)
+        and balance_unit(model, place.target) == unit
+    )
+
+
+def _overflow_below(model: Model, target: str, names: Names) -> Model:
+    places = storing_places(model)
+    beyond = _beyond_the_brim(model, target, names)
+    lost, caught = (names[name] * beyond for name in ("overflow_below", "caught"))
+    (below, *_) = _below(model, target)
+    model = model.with_term("equation", target, "overflow_below", places[target].sign * lost)
+    return model.with_term("equation", below, "overflow_below", -places[below].sign * caught)
+
+
+_BRIM = ShapeParameter(
+    "depth", "position", "h", "how far the content rises above the brim", range_grid(1 / 64, 1 / 2)
+)
+_TANKS = "Schoukens and Noël (2017), IFAC-PapersOnLine 50(1), 446-451"
+
+OVERFLOW = Effect(
+    id="overflow",
+    family="contact",
+    title="Overflow",
+    formula=r"\dot q + \dots + k_o \max(q - q_\mathrm{max} + h, 0)",
+    amplitudes=(Amplitude("overflow", "force/position", "k_o", "rate of loss above the brim", 1),),
+    places=lambda model: tuple(storing_places(model)),
+    change=_overflow,
+    shapes=(_BRIM,),
+    constants=(HIGHEST,),
+    source=_TANKS,
+    applies_to="stores: dofs of first order that are no motion",
+)
+
+OVERFLOW_BELOW = Effect(
+    id="overflow_below",
+    family="contact",
+    title="Overflow that partly falls into the next tank",
+    formula=r"\dot q_1 + \dots + k_o o, \; \dot q_2 + \dots - k_b o, \;"
+    r" o = \max(q_1 - q_\mathrm{max} + h, 0)",
+    amplitudes=(
+        Amplitude("overflow_below", "force/position", "k_o", "rate of loss above the brim", 1),
+        Amplitude("caught", "force/position", "k_b", "the part that the next tank catches", 1),
+    ),
+    places=lambda model: tuple(name for name in storing_places(model) if _below(model, name)),
+    change=_overflow_below,
+    shapes=(_BRIM,),
+    constants=(HIGHEST,),
+    source=_TANKS,
+    applies_to="stores that feed another one",
+)
+
+CONTACT_EFFECTS = (
+    *map(
+        _of_motions,
+        (END_STOP_LOWER, END_STOP_UPPER, HERTZIAN_LOWER, HERTZIAN_UPPER, PLAY, PRELOAD),
+    ),
+    OVERFLOW,
+    OVERFLOW_BELOW,
+)
 
 
 def _places(model: Model) -> Sequence[str]:

@@ -205,10 +205,11 @@ def _largest(model: Model, target: str, scales: Scales) -> float:
     return scales.velocity[coordinate_of(model, target)]
 
 
+HIGHEST = Constant("highest_position", "position", "highest position reached", _highest)
 _MOTION_CONSTANTS = (
     Constant("largest_velocity", "position/s", "reference velocity", _largest),
     Constant("lowest_position", "position", "lowest position reached", _lowest),
-    Constant("highest_position", "position", "highest position reached", _highest),
+    HIGHEST,
 )
 
 

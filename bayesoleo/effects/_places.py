@@ -520,6 +520,25 @@ LOOKED_FOR = frozenset(
 )
 
 
+def storing_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` where something is stored, such as the water of a tank: first
+    order, and what stands before the rate is no damping (a force over a velocity).
+
+    Where units are not declared nobody knows, and the place counts.
+    """
+    found = {}
+    for name, place in force_places(model).items():
+        if place.kind != "equation" or place.velocity is not None:
+            continue
+        powers = dimensions(balance_unit(model, place.target))
+        for base, power in dimensions(model.dofs[place.name].unit).items():
+            powers[base] = powers.get(base, 0) - power
+        damping = powers.get("[mass]", 0) == 1 and powers.get("[time]", 0) == -2
+        if not damping:
+            found[name] = place
+    return found
+
+
 def is_quantity(model: Model, *names: str) -> bool:
     """Whether all names are declared in the model."""
     known = {*model.inputs, *model.dofs, *model.parameters, *model.conditions, *model.definitions}

@@ -13,6 +13,7 @@ ALONE = {
     "direction_dependent_damping", "compression_damping", "pressure_dependent_friction",
     "gas_solubility", "heat_exchange", "input_dependent_term",
     "first_order_lag",  # in tests/benchmarks/structure_cases.py
+    "overflow", "overflow_below",  # in test_overflow.py
 }  # fmt: skip
 
 

@@ -66,10 +66,22 @@ def controlled_damper() -> Model:
     )
 
 
+def two_tanks() -> Model:
+    """Two stores, the one above the other."""
+    return Model(
+        "two tanks",
+        inputs={"pump": "V"},
+        dofs={"x": "V", "y": "V"},
+        parameters={"a": Parameter(1.0, "1/s", sd=1.0), "b": Parameter(1.0, "1/s", sd=1.0)},
+        equations={"x": "dot(x) + a*x - b*pump", "y": "dot(y) + b*y - a*x"},
+        outputs={"level": Output("y", "V")},
+    )
+
+
 def test_every_effect_applies_to_some_system(offered):
     names = ("f16n1d2", "f16n2d2", "viscous_damper", "duffing")
     used = {c.effect for name in names for c in offered(system(name))}
-    used |= {c.effect for c in offered(controlled_damper())}
+    used |= {c.effect for model in (controlled_damper(), two_tanks()) for c in offered(model)}
     assert used == {effect.id for effect in catalogue()}
 
 
