@@ -19,9 +19,15 @@ from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._records import Harmonics
 from bayesoleo.prediction._simulate import RunPlan
-from bayesoleo.solvers._branches import Branch, BranchPoint, follow
+from bayesoleo.solvers._branches import (
+    Branch,
+    BranchPoint,
+    LimitCycle,
+    follow,
+    solve_limit_cycle,
+    with_error,
+)
 from bayesoleo.solvers._collocation import Collocation
-from bayesoleo.solvers._limit_cycles import LimitCycle, solve_limit_cycle, with_error
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, solve_from_guess
 from bayesoleo.solvers._schemes import DEFAULT_SCHEME, scheme

@@ -7,6 +7,7 @@ from ._branches import (
     BorderedSolution as BorderedSolution,
     Branch as Branch,
     BranchPoint as BranchPoint,
+    LimitCycle as LimitCycle,
     SpecialPoint as SpecialPoint,
 )
 from ._collocation import (
@@ -16,9 +17,6 @@ from ._collocation import (
 from ._initial_value import (
     DenseTrajectory as DenseTrajectory,
     Dynamics as Dynamics,
-)
-from ._limit_cycles import (
-    LimitCycle as LimitCycle,
 )
 from ._mesh import (
     Mesh as Mesh,

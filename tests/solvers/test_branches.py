@@ -10,8 +10,7 @@ from periodic_problems import duffing, harmonics, problem, rest
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model._kernels import kernels
-from bayesoleo.solvers._branches import follow
-from bayesoleo.solvers._limit_cycles import solve_limit_cycle
+from bayesoleo.solvers._branches import follow, solve_limit_cycle
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, solve_periodic
 from bayesoleo.solvers._schemes import scheme
