@@ -28,7 +28,7 @@ import numpy as np
 from calibration_figures import MODELS, STORED
 from numpy.typing import NDArray
 
-from bayesoleo._dask import connected, each_done
+from bayesoleo._parallel import connected, each_done
 from bayesoleo._storage.resume import Slots
 from bayesoleo.error_models import error_model
 from bayesoleo.estimation import FunctionProblem

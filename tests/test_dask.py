@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from bayesoleo import _dask as machines, _parallel as parallel
-from bayesoleo._dask import WorkerPool, connected, each_done
+from bayesoleo import _parallel as parallel
+from bayesoleo._parallel import WorkerPool, connected, each_done
 from bayesoleo._storage.resume import Slots
 from bayesoleo.errors import InputError, ResultsError
 
@@ -68,7 +68,7 @@ def test_a_number_of_processes_is_checked(scheduler):
 
 
 def test_a_scheduler_that_does_not_answer_is_an_error(monkeypatch):
-    monkeypatch.setattr(machines, "PATIENCE", 0.5)
+    monkeypatch.setattr(parallel, "PATIENCE", 0.5)
     with pytest.raises(InputError, match="does not answer"), connected("tcp://127.0.0.1:9"):
         pass
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
-from bayesoleo._dask import connected
+from bayesoleo._parallel import connected
 from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo.data import dataset_folder
 from bayesoleo.data._campaign import VARIABLE

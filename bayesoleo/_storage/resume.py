@@ -31,7 +31,7 @@ import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._dask import connected, each_done
+from bayesoleo._parallel import connected, each_done
 from bayesoleo._storage.files import only_writer, replacing
 from bayesoleo._storage.result_files import PACKAGES, package_version
 from bayesoleo.errors import ResultsError
@@ -341,7 +341,7 @@ class Slots:
         whole : callable, optional
             Whether a stored piece is all of what is wanted.
         scheduler : str, optional
-            See :func:`bayesoleo._dask.connected`.
+            See :func:`bayesoleo._parallel.connected`.
         jobs : int, optional
             Threads, where there is no scheduler.
         done : callable, optional

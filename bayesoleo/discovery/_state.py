@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._dask import connected, each_done
-from bayesoleo._parallel import thread_map
+from bayesoleo._parallel import connected, each_done, thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out

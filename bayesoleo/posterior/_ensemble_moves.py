@@ -22,7 +22,7 @@ import numpy as np
 from emcee.moves import DEMove, MHMove, Move, RedBlueMove
 from emcee.state import State
 
-from bayesoleo._dask import WorkerPool
+from bayesoleo._parallel import WorkerPool
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.posterior._checkpoints import REASONS, Phase, Segment

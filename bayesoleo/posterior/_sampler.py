@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
-from bayesoleo._dask import connected
+from bayesoleo._parallel import connected
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
 from bayesoleo.posterior._checkpoints import Segment, Store, open_store

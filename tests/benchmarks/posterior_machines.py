@@ -12,7 +12,7 @@ import numpy as np
 from posterior_cases import gas_spring_case, oleo_case
 from tqdm import tqdm
 
-from bayesoleo._dask import connected, each_done
+from bayesoleo._parallel import connected, each_done
 from bayesoleo.estimation import sampling_distribution
 from bayesoleo.estimation._parametric_bootstrap import data_source
 from bayesoleo.estimation._sampling_distribution import _Blocks, _ReplicationTask
