@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         load_campaign as load_campaign,
         load_result as load_result,
     )
-    from bayesoleo._workflow import Settings as Settings
+    from bayesoleo._workflow import Settings as Settings, close_each as close_each
     from bayesoleo._workflow.model_files import load_model as load_model
     from bayesoleo.data import write_campaign as write_campaign
     from bayesoleo.model import Model as Model, Output as Output, Parameter as Parameter
@@ -48,7 +48,7 @@ _HOMES = {
         "load_result",
     ),
     "systems": ("system",),
-    "_workflow": ("Settings",),
+    "_workflow": ("Settings", "close_each"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 #: Subpackages that are there without an import of their own, as ``bayesoleo.plots``.

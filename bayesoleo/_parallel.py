@@ -440,7 +440,7 @@ def _await_process(folder: Path, stopped: Callable[[], bool]) -> None:
                     child.wait(LOOK)
         finally:
             child.kill()
-    if child.returncode != 0 or not (folder / _VALUE).is_file():
+    if not (folder / _VALUE).is_file():  # it is whole where it is there, however the process ended
         raise LostError(_last_words(child.returncode, folder / _SAID))
 
 
@@ -468,7 +468,9 @@ def answer(place: str) -> None:
 
 def _end_with_parent() -> None:
     """End this process when the other end of its input is closed."""
-    sys.stdin.buffer.read()
+    # Not by sys.stdin: Python would abort at its end where a thread waits in a buffered read.
+    while os.read(0, 1):
+        pass
     os._exit(1)
 
 

@@ -9,5 +9,6 @@ from __future__ import annotations
 from bayesoleo._schema import LabelledResult
 from bayesoleo._session.display import Result
 from bayesoleo._session.problem import Check
+from bayesoleo._workflow import EachResult, EachTask
 
-__all__ = ["Check", "LabelledResult", "Result"]
+__all__ = ["Check", "EachResult", "EachTask", "LabelledResult", "Result"]

@@ -1,4 +1,4 @@
-"""The commands of the whole loop: ``demo``, ``close``, ``check`` and ``propose``."""
+"""The commands of the whole loop: ``demo``, ``close``, ``each``, ``check`` and ``propose``."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from bayesoleo.errors import InputError, UnfinishedError
 if TYPE_CHECKING:
     import xarray as xr
 
+    from bayesoleo._workflow.each import EachResult
     from bayesoleo._workflow.first_look import Started
     from bayesoleo.model._model import Model
 
@@ -207,13 +208,14 @@ def _tell_start(found: Started, folder: Path) -> None:
     shell.say(f"next      bayesoleo check {folder} --model {folder / 'model.py'}:model")
 
 
+SEEDS_HELP = "How many seeds, from --seed on, each a task of its own."
 DEMO_SYSTEM = "f16n2d2"
 FILES = {"report": "report.html", "result": "results.nc", "summary": "summary.json"}
 
 
 def add_loop(app: typer.Typer) -> None:
     """Add the commands of this module."""
-    shell.add(app, PANEL, demo, init, close, check)
+    shell.add(app, PANEL, demo, init, close, each, check)
 
 
 @options.of_settings("seed", "jobs")
@@ -343,6 +345,127 @@ def _closed(
         _print_loop(error.tree, folder, as_json)
         raise
     _print_loop(tree, folder, as_json)
+
+
+#: Exit status where tasks of ``each`` failed and others did not.
+SOME_FAILED = 1
+
+
+@options.of_settings(
+    "quick", "seed", "effective_size", "max_effects", "effects", "without", *options.SOLVED,
+    "nuisance", "disturbances", "error_model", "between_runs", "structure_prior", "next_run",
+)  # fmt: skip
+def each(
+    campaigns: Annotated[list[Path], options.argument("CAMPAIGN", "Folders with campaign.toml.")],
+    models: Annotated[
+        list[str], options.option("--model -m", "MODEL", f"{options.MODEL_HELP} Repeatable.", None)
+    ],
+    out: Annotated[Path, options.option("--out -o", "DIR", "Folder for all results.")],
+    seeds: Annotated[
+        int, typer.Option(min=1, metavar="N", rich_help_panel=options.RUNNING, help=SEEDS_HELP)
+    ] = 1,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            rich_help_panel=options.RUNNING,
+            show_default="all cores",
+            help="Tasks at a time on this machine, each in a process of one thread.",
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        options.option(
+            "--scheduler",
+            "ADDRESS|local:N",
+            "Instead, the workers of a Dask scheduler. Campaigns are sent to them, results come "
+            "back.",
+            options.RUNNING,
+        ),
+    ] = None,
+    shared: Annotated[
+        bool,
+        typer.Option(
+            "--shared",
+            rich_help_panel=options.RUNNING,
+            help="These workers see campaigns and DIR under the same paths, and use them there.",
+        ),
+    ] = False,
+    retries: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            metavar="N",
+            rich_help_panel=options.RUNNING,
+            help="Try a task again so often whose process or worker was lost.",
+        ),
+    ] = 2,
+    *,
+    chosen: Settings,
+    as_json: options.Json = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Close the loop for each campaign with each model and each seed, here or on a cluster.
+
+    Each combination is a task with a folder of its own, which holds what close writes. A task that
+    fails takes no other with it. The same command goes on where it was stopped or killed: a task
+    that is done is not done again unless its campaign, model or settings have changed.
+
+    \b
+    Written to DIR:
+      manifest.json                   every task, how far it is, and why it failed
+      summary.csv                     a line for each task
+      <campaign>/<model>/seed-<n>/    what close writes
+
+    The exit status is 0 if all tasks are done and 1 if some failed.
+
+    \b
+    Examples:
+      bayesoleo each shaker-* --model f16n2d2 --out all
+      bayesoleo each shaker-* --model f16n2d1 --model mine.py:model --seeds 5 --out all --jobs 8
+      bayesoleo each shaker-* --model f16n2d2 --out all --scheduler tcp://10.0.0.1:8786
+    """
+    from bayesoleo import _workflow as workflow
+
+    try:
+        found = workflow.close_each(
+            campaigns,
+            models,
+            out=out.expanduser(),
+            seeds=seeds,
+            settings=chosen,
+            jobs=jobs,
+            scheduler=scheduler,
+            shared=shared,
+            retries=retries,
+            callback=shell.teller(quiet),
+            progress=shell.progress_shown(quiet),
+        )
+    except KeyboardInterrupt as stop:
+        kept = f"tasks that are done are kept in {out}, and the same command does the others"
+        raise shell.Stopped(f"stopped: {kept}") from stop
+    if as_json:
+        shell.print_json({"folder": str(found.folder), "tasks": found.table()})
+    else:
+        _print_tasks(found)
+    if found.failed:
+        raise typer.Exit(SOME_FAILED)
+
+
+def _print_tasks(found: EachResult) -> None:
+    """The table of all tasks, and what went wrong with which."""
+    head = ["task", "status", "effect", "certainty", "probability", "error before", "after", "s"]
+    keys = ["folder", "status", "effect", "certainty", "probability", "error_before"]
+    keys += ["error_after", "seconds"]
+    rows = [[row[key] for key in keys] for row in found.table()]
+    shell.console().print(shell.table(head, rows, words=4))
+    for task in found.failed:
+        shell.say(f"failed    {task.folder}: {task.reason}")
+    done = len(found.tasks) - len(found.failed)
+    shell.say(f"{done} of {len(found.tasks)} tasks are done")
+    for name in ("manifest.json", "summary.csv"):
+        shell.say(f"written   {found.folder / name}")
 
 
 @options.of_settings(*options.SOLVED, "nuisance", "disturbances", "without")

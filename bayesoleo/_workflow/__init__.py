@@ -1,7 +1,7 @@
 """From a campaign folder and a model to results: the verbs that the command line and scripts call.
 
 In the order in which a user meets them: ``reduce``, ``check``, ``estimate``, ``estimate_each``,
-``sample``, ``trace``, ``close``, ``propose``, ``simulate``.
+``sample``, ``trace``, ``close``, ``close_each``, ``propose``, ``simulate``.
 """
 
 import lazy_loader

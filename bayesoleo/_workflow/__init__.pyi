@@ -3,6 +3,13 @@ from .closing import (
     propose as propose,
     trace as trace,
 )
+from .each import (
+    EachResult as EachResult,
+    close_each as close_each,
+)
+from .each_task import (
+    EachTask as EachTask,
+)
 from .estimating import (
     estimate as estimate,
     estimate_each as estimate_each,

@@ -120,8 +120,7 @@ def load_campaign(path: str | os.PathLike[str], *, progress: bool = False) -> Ca
         If samples are unevenly spaced and were interpolated, or a file states another unit.
     """
     check_path(path, "path", hint='write load_campaign("folder")')
-    given = Path(path)
-    toml = given if given.suffix == ".toml" else given / FILE
+    toml = declared_in(path)
     declaration = read_declaration(toml)
     folder = _data_folder(declaration, toml.parent)
     files = _RunFiles(declaration, folder, progress)
@@ -137,6 +136,62 @@ def load_campaign(path: str | os.PathLike[str], *, progress: bool = False) -> Ca
         sha256=_checksum(toml, [folder / run.file for run in declaration.runs]),
         rig=declaration.rig,
     )
+
+
+def declared_in(path: str | os.PathLike[str]) -> Path:
+    """The ``campaign.toml`` of a campaign that is given by its folder or by that file."""
+    given = Path(path)
+    return given if given.suffix == ".toml" else given / FILE
+
+
+@dataclass(frozen=True)
+class CampaignFiles:
+    """The files of a campaign, unread.
+
+    Parameters
+    ----------
+    toml : Path
+        Its declaration.
+    files : mapping of str to Path
+        Run files, by the names that the declaration gives them.
+    inside : bool
+        Whether all lie in the folder of the declaration, which is then a campaign wherever it is
+        copied to.
+    """
+
+    toml: Path
+    files: Mapping[str, Path]
+    inside: bool
+
+    @property
+    def sha256(self) -> str:
+        """As of :class:`CampaignData`."""
+        return _checksum(self.toml, list(self.files.values()))
+
+
+def campaign_files(path: str | os.PathLike[str]) -> CampaignFiles:
+    """Find the files of a campaign and check its declaration.
+
+    Parameters
+    ----------
+    path : path-like
+        As of :func:`load_campaign`.
+
+    Raises
+    ------
+    CampaignError
+        If the declaration cannot be used, or a file is not there.
+    """
+    toml = declared_in(path)
+    declaration = read_declaration(toml)
+    folder = _data_folder(declaration, toml.parent)
+    files = {run.file: folder / run.file for run in declaration.runs}
+    for name, file in files.items():
+        if not file.is_file():
+            raise CampaignError("no such file", file=name, hint=f"it should be {file}")
+    home = os.path.abspath(toml.parent) + os.sep
+    inside = all(os.path.abspath(file).startswith(home) for file in files.values())
+    return CampaignFiles(toml, files, inside and declaration.dataset is None)
 
 
 def _check_shared(loaded: Sequence[LoadedRun]) -> None:
