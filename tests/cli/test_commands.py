@@ -25,7 +25,7 @@ COMMANDS = tuple(typer.main.get_command(app).commands)
 def test_the_commands_are_these():
     expected = {"demo", "close", "check", "reduce", "estimate", "sample", "trace"}
     expected |= {"simulate", "report", "systems", "effects", "assess", "replicate", "predict"}
-    expected |= {"propose", "init"}
+    expected |= {"propose", "init", "each"}
     assert set(COMMANDS) == expected
 
 
