@@ -16,6 +16,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -24,7 +25,7 @@ from typing import Any
 
 from tqdm.auto import tqdm
 
-from bayesoleo._parallel import LostError, TaskPool, loss_of, task_pool
+from bayesoleo._parallel import LostError, Pending, TaskPool, loss_of, task_pool
 from bayesoleo._schema import columns
 from bayesoleo._storage.files import (
     check_free,
@@ -62,6 +63,8 @@ MANIFEST, TABLE, FORMAT = "manifest.json", "summary.csv", 1
 #: Tasks beyond those that run which are sent ahead, as a share of them: a worker that ends one
 #: finds the next one there, and little is held in memory.
 AHEAD = 1 / 8
+#: Results that are fetched and written at a time.
+FETCHED = 4
 #: Seconds between two looks at the scheduler.
 LOOK = 1.0
 
@@ -204,6 +207,7 @@ class Book:
 
     def __init__(self, folder: Path, tasks: dict[tuple[str, str, int], EachTask]) -> None:
         self.folder, self.tasks = folder, tasks
+        self._taken = {task.folder.lower() for task in tasks.values()}
 
     @classmethod
     def of(cls, folder: Path) -> Book:
@@ -245,15 +249,12 @@ class Book:
         """A name that says what it is, and that no other task has."""
         path = Path(task.campaign)
         campaign = _plain(path.parent.name if path.suffix == ".toml" else path.name)
-        file, _, name = task.model.rpartition(":")
-        model = _plain(
-            f"{Path(file).stem}-{name}" if file.endswith(".py") else Path(task.model).stem
-        )
-        taken = {other.folder for other in self.tasks.values()}
+        model = _plain(re.split(r"[/\\]", task.model)[-1].replace(".py:", "-").removesuffix(".py"))
         number = 1
-        while (found := f"{campaign}/{model}/seed-{task.seed}") in taken:
+        while (found := f"{campaign}/{model}/seed-{task.seed}").lower() in self._taken:
             number += 1
             campaign = f"{campaign.rsplit('~', 1)[0]}~{number}"
+        self._taken.add(found.lower())
         return found
 
     def save(self) -> None:
@@ -304,12 +305,16 @@ class Course:
     by_path: bool
     callback: ProgressCallback
     bar: Any
-    running: dict[int, tuple[Wanted, Any]] = field(default_factory=dict)
-    ended: queue.SimpleQueue[int] = field(default_factory=queue.SimpleQueue)
+    running: dict[int, Wanted] = field(default_factory=dict)
+    ended: queue.SimpleQueue[tuple[int, Outcome | BaseException]] = field(
+        default_factory=queue.SimpleQueue
+    )
     begun: int = 0
+    changed: bool = True
+    unstored: BaseException | None = None
 
     def run(self, todo: Sequence[Wanted]) -> None:
-        """Do tasks, in any order; the manifest is written whenever one has ended.
+        """Do tasks, in any order; the manifest is written whenever some have ended.
 
         Raises
         ------
@@ -318,24 +323,30 @@ class Course:
         """
         waiting = deque(todo)
         try:
-            self.book.save()
-            while waiting or self.running:
-                self._fill(waiting)
-                changed = [self._end(number, waiting) for number in self._ended()]
-                if any(changed):
-                    self.book.save()
-                if not self.pool.alive:
-                    raise self._lost(len(waiting) + len(self.running))
+            with ThreadPoolExecutor(FETCHED) as fetchers:
+                while waiting or self.running:
+                    self._fill(waiting, fetchers)
+                    self._save()
+                    for number, end in self._ended():
+                        self._end(self.running.pop(number), end, waiting)
+                    left = len(waiting) + len(self.running)
+                    if left and not self.pool.alive:
+                        raise self._lost(left)
         finally:
-            # Tasks that were stopped are waiting in it.
-            self.book.save()
+            self.changed = True  # tasks that were stopped are waiting in it
+            self._save()
             self.book.save_table()
+
+    def _save(self) -> None:
+        if self.changed:
+            self.book.save()
+        self.changed = False
 
     def _lost(self, left: int) -> UnfinishedError:
         reason = f"the scheduler was lost; {left} tasks are left, and the same command does them"
         return UnfinishedError([{"stage": "each", "reason": reason}], None, self.book.folder)
 
-    def _fill(self, waiting: deque[Wanted]) -> None:
+    def _fill(self, waiting: deque[Wanted], fetchers: ThreadPoolExecutor) -> None:
         """Begin as many tasks as are wanted."""
         size = self.pool.size
         while waiting and size and len(self.running) < size + max(1, int(AHEAD * size)):
@@ -343,16 +354,11 @@ class Course:
             work = self._work(one)
             if isinstance(work, Outcome):
                 self._finish(one, work)
-                self.book.save()
-            else:
-                number, self.begun = self.begun, self.begun + 1
-                pending = self.pool.submit(work)
-                self.running[number] = (one, pending)
-                pending.add_done_callback(partial(self._note, number))
-
-    def _note(self, number: int, _pending: Any) -> None:
-        """In any thread: a task has ended."""
-        self.ended.put(number)
+                continue
+            number, self.begun = self.begun, self.begun + 1
+            self.running[number] = one
+            pending = self.pool.submit(work)
+            pending.add_done_callback(partial(self._note, fetchers, number, one))
 
     def _work(self, one: Wanted) -> Work | Outcome:
         """What is to be sent, or how it failed before it was."""
@@ -364,53 +370,76 @@ class Course:
         except (BayesoleoError, OSError) as error:
             return Outcome(said(error))
 
-    def _ended(self) -> list[int]:
-        """Numbers of tasks that have ended, after some waiting for the first."""
-        found: list[int] = []
+    def _note(
+        self, fetchers: ThreadPoolExecutor, number: int, one: Wanted, pending: Pending
+    ) -> None:
+        """In any thread: a task has ended."""
+        with suppress(RuntimeError):  # of an executor that is closed: the call was stopped
+            fetchers.submit(self._fetch, number, one, pending)
+
+    def _fetch(self, number: int, one: Wanted, pending: Pending) -> None:
+        """In a thread: fetch what came of a task, and write its result where that came by value."""
+        end: Outcome | BaseException
+        storing = False
+        try:
+            end = pending.result()
+            if isinstance(end, Outcome) and end.files:
+                storing = True
+                store(self.book.folder / one.task.folder, end)
+                end = replace(end, files={})
+        except BaseException as error:
+            end = error
+            if storing:  # as would that of the next ones
+                self.unstored = error
+        self.ended.put((number, end))
+
+    def _ended(self) -> list[tuple[int, Outcome | BaseException]]:
+        """What came of the tasks that have ended, after some waiting for the first."""
+        found: list[tuple[int, Outcome | BaseException]] = []
         with suppress(queue.Empty):
             if self.running:
                 found.append(self.ended.get(timeout=LOOK))
             while True:
                 found.append(self.ended.get_nowait())
-        if not found and not self.running:  # the scheduler does not answer
+        if self.unstored is not None:
+            raise self.unstored
+        if not found and not self.pool.size:  # the scheduler does not answer
             time.sleep(LOOK)
         return found
 
-    def _end(self, number: int, waiting: deque[Wanted]) -> bool:
-        """See how a task ended; whether its state has changed."""
-        one, pending = self.running.pop(number)
-        try:
-            outcome = pending.result()
-        except Exception as error:
-            loss = loss_of(error)
+    def _end(self, one: Wanted, end: Outcome | BaseException, waiting: deque[Wanted]) -> None:
+        """Note how a task ended; one whose process was lost is tried again."""
+        if isinstance(end, BaseException):
+            loss = loss_of(end)
             if loss is not None:
-                return self._lose(one, loss, waiting)
-            outcome = Outcome(said(error))
+                self._lose(one, loss, waiting)
+                return
+            if not isinstance(end, Exception):
+                raise end
+            end = Outcome(said(end))
         one.task.attempts += 1
-        self._finish(one, outcome)
-        return True
+        self._finish(one, end)
 
-    def _lose(self, one: Wanted, loss: LostError, waiting: deque[Wanted]) -> bool:
+    def _lose(self, one: Wanted, loss: LostError, waiting: deque[Wanted]) -> None:
         """Try a task again, unless that was done often enough."""
         one.task.attempts += loss.times
         if one.task.attempts > self.retries:
             times = f"lost {one.task.attempts} times"
             self._finish(one, Outcome(f"{times}, the last time because {loss.reason}"))
-            return True
+            return
         if loss.times:
             self.callback(f"{one.task.folder} was lost and is tried again: {loss.reason}")
+            self.changed = True
         waiting.appendleft(one)
-        return bool(loss.times)
 
     def _finish(self, one: Wanted, outcome: Outcome) -> None:
-        """Note what became of a task, and write its result where that came by value."""
-        task, folder = one.task, self.book.folder / one.task.folder
-        if outcome.files:
-            store(folder, outcome)
+        """Note what became of a task."""
+        task = one.task
         task.state = FAILED if outcome.reason else DONE
         task.reason = outcome.reason or None
         task.seconds = None if outcome.seconds is None else round(outcome.seconds, 3)
-        task.found = None if outcome.reason else found_in(folder / SUMMARY)
+        task.found = None if outcome.reason else found_in(self.book.folder / task.folder / SUMMARY)
+        self.changed = True
         if outcome.reason:
             self.callback(f"{task.folder} failed: {outcome.reason}")
         self.bar.update()
