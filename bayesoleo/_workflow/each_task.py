@@ -18,9 +18,7 @@ from typing import Any
 
 from bayesoleo import _schema as schema
 from bayesoleo._report.structures import of_added
-from bayesoleo._storage.files import (
-    check_free,
-)
+from bayesoleo._storage.files import check_free
 from bayesoleo._storage.result_files import package_version
 from bayesoleo._storage.resume import digest
 from bayesoleo._workflow.closing import close
@@ -193,8 +191,8 @@ def _paths(campaigns: Any) -> list[str]:
 
 def _models(models: Any) -> dict[str, str | Model]:
     """What was given, by name."""
-    given: list[Any]
-    given = [models] if isinstance(models, str | os.PathLike | Model) else list(models)
+    one_only = isinstance(models, str | os.PathLike | Model)
+    given: list[Any] = [models] if one_only else list(models)
     if not given:
         raise InputError("names none", key="models", hint="give at least one")
     found: dict[str, str | Model] = {}

@@ -155,8 +155,8 @@ class CampaignFiles:
     files : mapping of str to Path
         Run files, by the names that the declaration gives them.
     inside : bool
-        Whether all lie in the folder of the declaration, which is then a campaign wherever it is
-        copied to.
+        Whether all are named from the folder of the declaration down, which is then a campaign
+        wherever it is copied to.
     """
 
     toml: Path
@@ -189,8 +189,8 @@ def campaign_files(path: str | os.PathLike[str]) -> CampaignFiles:
     for name, file in files.items():
         if not file.is_file():
             raise CampaignError("no such file", file=name, hint=f"it should be {file}")
-    home = os.path.abspath(toml.parent) + os.sep
-    inside = all(os.path.abspath(file).startswith(home) for file in files.values())
+    names = [Path(name) for name in files]
+    inside = not any(name.is_absolute() or ".." in name.parts for name in names)
     return CampaignFiles(toml, files, inside and declaration.dataset is None)
 
 
