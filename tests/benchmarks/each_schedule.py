@@ -16,17 +16,17 @@ import json
 import pickle
 import sys
 import tempfile
-import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import best
 
 from bayesoleo import Settings, close_each
-from bayesoleo._workflow.each import AHEAD, FETCHED, MANIFEST, Book
+from bayesoleo._workflow.each import AHEAD, FETCHED, MANIFEST, SAVING, Book
 from bayesoleo._workflow.each_task import EachTask, Outcome, every_task, store
 from bayesoleo._workflow.output import FILES
 
@@ -35,7 +35,6 @@ from small_campaigns import damper, damper_campaign, spring_damper_force, with_f
 
 WORKERS = (16, 128, 1000)
 TASKS_PER_WORKER = 10
-REPETITIONS = 5
 
 
 @dataclass(frozen=True)
@@ -59,16 +58,6 @@ class Costs:
     returned: int
 
 
-def median(work: Callable[[], object]) -> float:
-    """Median wall time of several calls, s."""
-    times = []
-    for _ in range(REPETITIONS):
-        begin = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - begin)
-    return float(np.median(times))
-
-
 def measured_costs(manifest: Path) -> Costs:
     """Costs of the first task of a run that is done, measured anew."""
     tasks = [EachTask(**entry) for entry in json.loads(manifest.read_text())["tasks"]]
@@ -80,9 +69,9 @@ def measured_costs(manifest: Path) -> Costs:
         root = Path(place)
         book = Book(root, {(str(k), "", 0): done for k in range(1000)})
         return Costs(
-            pack=median(lambda: wanted.work(None)),
-            store=median(lambda: store(root / "result", Outcome("", 1.0, files))),
-            save=median(book.save) / len(book.tasks),
+            pack=best(lambda: wanted.work(None)),
+            store=best(lambda: store(root / "result", Outcome("", 1.0, files))),
+            save=best(book.save) / len(book.tasks),
             sent=len(pickle.dumps(wanted.work(None).files)),
             returned=sum(map(len, files.values())),
         )
@@ -127,7 +116,8 @@ def simulate(
     waiting, free = deque(seconds), [0.0] * workers  # when each worker is
     ended: list[float] = []
     fetching = Fetching(costs, bandwidth)
-    now = busy = 0.0
+    now = busy = rest = 0.0
+    saving = costs.save * len(seconds)
     running, most = 0, workers + max(1, int(AHEAD * workers))
     while waiting or running:
         begin = now
@@ -137,7 +127,9 @@ def simulate(
             heapq.heappush(free, end)
             heapq.heappush(ended, end)
             running += 1
-        now += costs.save * len(seconds)
+        if now >= rest:
+            now += saving
+            rest = now + saving / SAVING
         busy += now - begin
         while ended and not (fetching.done and fetching.done[0] <= ended[0]):
             fetching.fetch(heapq.heappop(ended))

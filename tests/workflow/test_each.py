@@ -354,9 +354,12 @@ def test_with_shared_folders_paths_are_sent(loops, remote, campaigns, tmp_path):
     assert {len(work.files) for work in loops.works} == {0}
 
 
-def test_a_campaign_of_files_elsewhere_is_sent_as_it_was_read(loops, remote, campaigns, tmp_path):
+@pytest.mark.parametrize("place", ["elsewhere.csv", "data/one/b.csv"])
+def test_a_campaign_whose_files_have_whole_paths_is_sent_as_it_was_read(
+    loops, remote, campaigns, tmp_path, place
+):
     toml = campaigns[0] / "campaign.toml"
-    moved = tmp_path / "elsewhere.csv"
+    moved = tmp_path / place
     (campaigns[0] / "a.csv").rename(moved)
     text = toml.read_text().replace('file = "a.csv"', f'file = "{moved}"')
     toml.write_text("outside_files = true\n" + text)
