@@ -2,14 +2,17 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bayesoleo import _parallel as parallel
-from bayesoleo._parallel import WorkerPool, connected, each_done
+from bayesoleo._parallel import LostError, Machines, WorkerPool, connected, each_done, loss_of
 from bayesoleo._storage.resume import Slots
 from bayesoleo.errors import InputError, ResultsError
 
@@ -136,3 +139,120 @@ def test_a_killed_worker_costs_nothing(client, tmp_path):
     assert sorted(told) == list(range(60))
     assert [int(piece["square"][0]) for piece in pieces] == [k**2 for k in range(60)]
     assert len(list(tmp_path.glob("slot-*.npz"))) == 60
+
+
+class Noted:
+    """A call in a process of its own, which leaves its number and waits."""
+
+    def __init__(self, place, name, seconds=0.0):
+        self.place, self.name, self.seconds = place, name, seconds
+
+    def __call__(self, folder):
+        with (self.place / self.name).open("a") as stream:
+            stream.write(f"{os.getpid()} {os.getppid()}\n")
+        time.sleep(self.seconds)
+        return self.name
+
+    def begun(self):
+        """Its process and that of the worker, of each time."""
+        path = self.place / self.name
+        lines = path.read_text().splitlines() if path.is_file() else []
+        return [tuple(map(int, line.split())) for line in lines]
+
+    def wait(self, times=1):
+        """Until it was begun so often."""
+        deadline = time.monotonic() + 300
+        while len(self.begun()) < times:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        return self.begun()[times - 1]
+
+
+def await_end(process):
+    """Until a process is gone."""
+    deadline = time.monotonic() + 300
+    while Path(f"/proc/{process}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_calls_on_a_cluster_have_processes_of_their_own(client, tmp_path):
+    pool = Machines(client)
+    assert (pool.size, pool.alive) == (2, True)
+    calls = [Noted(tmp_path, f"call-{k}") for k in range(3)]
+    assert [one.result() for one in [pool.submit(call) for call in calls]] == [
+        "call-0", "call-1", "call-2",
+    ]  # fmt: skip
+    assert len({call.begun()[0][0] for call in calls}) == 3
+    pool.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="sees processes by /proc")
+def test_a_cancelled_call_ends_its_process(client, tmp_path):
+    call = Noted(tmp_path, "call", 600.0)
+    pool = Machines(client)
+    pending = pool.submit(call)
+    process, _ = call.wait()
+    pool.close()
+    with pytest.raises(Exception, match="cancel") as caught:
+        pending.result()
+    assert loss_of(caught.value).times == 1
+    await_end(process)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="sees processes by /proc")
+def test_a_killed_worker_s_call_is_made_by_another(client, tmp_path):
+    call = Noted(tmp_path, "call", 5.0)
+    pending = Machines(client).submit(call)
+    process, worker = call.wait()
+    os.kill(worker, signal.SIGKILL)
+    await_end(process)
+    assert pending.result() == "call"
+    assert len(call.begun()) == 2
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_on_a_worker_is_lost(client):
+    with pytest.raises(LostError, match="exit status 7"):
+        Machines(client).submit(dying).result()
+
+
+def dying(_folder):
+    os._exit(7)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_killed_is_noticed(monkeypatch, tmp_path):
+    monkeypatch.setattr(parallel, "PATIENCE", 3)
+    port = 8700 + os.getpid() % 1000
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", str(port)]
+    command += ["--host", "127.0.0.1", "--no-dashboard"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL) as scheduler:
+        address = f"tcp://127.0.0.1:{port}"
+        _await_scheduler(address)
+        with connected(address) as client:
+            pool = Machines(client)
+            pending = pool.submit(dying)  # no worker ever comes
+            scheduler.kill()
+            with pytest.raises(Exception, match="lost the connection") as caught:
+                pending.result()
+            assert loss_of(caught.value).times == 0
+            assert pool.size == 0
+            deadline = time.monotonic() + 60
+            while pool.alive:
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            pool.close()
+
+
+def _await_scheduler(address):
+    deadline = time.monotonic() + 300
+    while True:
+        try:
+            with connected(address):
+                return
+        except InputError:
+            assert time.monotonic() < deadline
