@@ -205,7 +205,7 @@ _PRIOR_OPTION = SettingOption(
     _read_prior,
     {
         "metavar": "PART=P,…",
-        "show_default": "nothing=0.5,catalogue=0.4,outside=0.1",
+        "show_default": "nothing=0.45,catalogue=0.35,outside=0.2",
     },
 )
 
