@@ -35,6 +35,8 @@ _READABLE = {
     r"\sum_{k=1}^{3}": "Σ_k",
     r"\varphi": "φ",
     r"\max": "max",
+    r"\dots": "…",
+    r"\;": " ",
     r"\quad": "  ",
     r"\approx": "≈",
     r"\Delta": "Δ",

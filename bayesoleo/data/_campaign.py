@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -477,6 +477,8 @@ def _fetch(name: str, known: RegisteredSet, wanted: Sequence[str]) -> Path:
     except (
         Exception
     ) as error:  # network libraries raise many types; all mean that the file is not here
+        with suppress(OSError):  # an empty folder would look like data that are here
+            folder.rmdir()
         raise CampaignError(
             f"cannot fetch {name}: {str(error)[:120]}",
             key="dataset",

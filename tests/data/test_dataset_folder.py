@@ -21,7 +21,7 @@ def test_changed_file_is_refused(tmp_path, monkeypatch):
     (tmp_path / "measured/silverbox").mkdir(parents=True)
     (tmp_path / "measured/silverbox/Schroeder80mV.mat").write_text("something else")
     with pytest.raises(CampaignError, match=r"Schroeder80mV\.mat: file is not the registered one"):
-        dataset_folder("silverbox")
+        dataset_folder("silverbox", ["Schroeder80mV.mat"])
 
 
 def test_unknown_set_says_what_to_set(monkeypatch):

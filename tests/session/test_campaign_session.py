@@ -45,7 +45,8 @@ def posterior(plain: bo.Fit) -> bo.Posterior:
 def test_the_root_has_few_names() -> None:
     assert sorted({*bo.__all__} - {"__version__"}) == [
         "Campaign", "Explanation", "Fit", "Model", "Output", "Parameter", "Posterior", "Problem",
-        "Settings", "load_campaign", "load_model", "load_result", "system", "write_campaign",
+        "Settings", "close_each", "load_campaign", "load_model", "load_result", "system",
+        "write_campaign",
     ]  # fmt: skip
 
 
