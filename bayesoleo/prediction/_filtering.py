@@ -301,6 +301,9 @@ def _end_by_spectrum(values: Array, step: float, cut: float, noise: float) -> Ar
     power = np.abs(fft.rfft(window * (values - values.mean()))) ** 2
     power *= 2.0 / (size * float(np.sum(window**2)))
     chosen = (omega > 0) & (omega <= 2.0 * np.pi * _PASSED * cut)
+    beyond = power[omega > 2.0 * np.pi * _PASSED * cut]
+    if beyond.size:  # what is cut off is noise here, also where nobody could tell it from signal
+        noise = max(noise, float(np.sqrt(0.5 * size * beyond.mean())))
     omega, power = omega[chosen], power[chosen]
     # Less the noise's own share of each line; what is left is never quite nothing.
     amplitude = np.sqrt(np.maximum(power - 2.0 * noise**2 / size, _LEAST * spread**2 / size))
