@@ -29,9 +29,13 @@ type Terms = Mapping[str, sp.Expr]
 
 
 def _slope(term: sp.Expr, moving: sp.Symbol) -> float:
-    """Change of a term with a motion, at a state that is off every zero; zero if it has none."""
+    """Change of a term with a motion, at a state that is off every zero; zero if it has none, or is
+    not real there."""
     others = {item: 0.5 for item in term.free_symbols if item != moving}
-    low, high = (complex(term.subs(others).subs(moving, value)) for value in (0.25, 0.75))
+    try:
+        low, high = (complex(term.subs(others).subs(moving, value)) for value in (0.25, 0.75))
+    except (TypeError, ValueError):  # the larger of numbers of which one is not real
+        return 0.0
     change = high - low
     return change.real if cmath.isfinite(change) and change.imag == 0 else 0.0
 

@@ -173,3 +173,17 @@ def test_a_spring_alone_says_in_which_sense_a_load_cell_reads():
         outputs={"force": Output("-stiffness*x", "N")},
     )
     assert [place.sign for place in spring.coordinates()] == [-1]
+
+
+def test_a_term_that_is_not_real_everywhere_says_nothing_of_the_sense():
+    """A contact beyond the stroke: the force of a negative compression has no real value."""
+    law = Model(
+        "spring and contact",
+        inputs={"x": "m"},
+        parameters={
+            "stiffness": Parameter(1e3, "N/m", relative_sd=0.5),
+            "contact": Parameter(1e4, "N/m**1.5", relative_sd=0.5),
+        },
+        outputs={"force": Output("-stiffness*x - positive(contact*(x - 2)**1.5 + 0.1)", "N")},
+    )
+    assert [place.sign for place in law.coordinates()] == [-1]
