@@ -263,7 +263,8 @@ class _Judge:
         solved, known = [], []
         for rival in self.rivals:
             known.append(self._known(rival.fit, run))
-            found = predictive_distribution(rival.fit, known[-1], record, self.noise)
+            like = run.like if isinstance(run, Variation) else ""
+            found = predictive_distribution(rival.fit, known[-1], record, self.noise, like)
             if isinstance(found, Status):
                 return found.message
             solved.append(found)

@@ -20,10 +20,11 @@ from bayesoleo.errors import InputError
 from bayesoleo.model._drive_and_start import START
 from bayesoleo.model._expressions import COSINE, SINE, WITHIN
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._predictor import Layout, Predictor
+from bayesoleo.prediction._predictor import Layout, Predictor, RunPrediction
 from bayesoleo.prediction._records import Harmonics, Record
 from bayesoleo.prediction._run_errors import input_columns
 from bayesoleo.prediction._simulate import motion
+from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._orbit import Status
 
 Range = tuple[float, float]
@@ -508,7 +509,11 @@ def blank_record(
 
 
 def predictive_distribution(
-    fit: ModelFit, known: Knowledge, record: Record, noise: Mapping[str, NewRunNoise]
+    fit: ModelFit,
+    known: Knowledge,
+    record: Record,
+    noise: Mapping[str, NewRunNoise],
+    like: str = "",
 ) -> tuple[PredictiveDistribution, Array] | Status:
     """Predictive distribution of a run by one rival.
 
@@ -522,6 +527,8 @@ def predictive_distribution(
         From :func:`blank_record`, or a variation of a run that was measured.
     noise : mapping of str to NewRunNoise
         By output.
+    like : str, optional
+        Label of the transient that it varies, whose motion is where its solution begins.
 
     Returns
     -------
@@ -537,10 +544,7 @@ def predictive_distribution(
     fed_back = fed_back if record.periodic else []
     record = replace(record, harmonics={**record.harmonics, **_nothing(fed_back)})
     for _ in range(PASSES if fed_back else 1):
-        predictor = Predictor(
-            known.model, [record], steps=STEPS, scheme=fit.numerics.scheme, backend="numpy", jobs=1
-        )
-        found = predictor.evaluate(known.theta)[0]
+        predictor, found = _solved(fit, known, record, like)
         if found.status is not Status.CONVERGED:
             return found.status
         record = replace(
@@ -558,6 +562,28 @@ def predictive_distribution(
     if not (np.isfinite(spread).all() and np.isfinite(found.y).all()):
         return Status.INADMISSIBLE
     return PredictiveDistribution(divided(found.y), spread, len(known.root)), found.y
+
+
+def _solved(
+    fit: ModelFit, known: Knowledge, record: Record, like: str
+) -> tuple[Predictor, RunPrediction]:
+    """A run's prediction: from the motion of the run that it varies, or else from its start."""
+    varied = [
+        run
+        for run in fit.predictor.runs
+        if isinstance(run, TransientRun) and run.record.label == like
+    ]
+    for other in (*varied, None):
+        predictor = Predictor(
+            known.model, [record], steps=STEPS, scheme=fit.numerics.scheme, backend="numpy", jobs=1
+        )
+        (run,) = predictor.runs
+        if other is not None and isinstance(run, TransientRun):
+            run.start_like(other)
+        (found,) = predictor.evaluate(known.theta)
+        if found.status is Status.CONVERGED:
+            break
+    return predictor, found
 
 
 def _nothing(fed_back: list[str]) -> dict[str, Harmonics]:

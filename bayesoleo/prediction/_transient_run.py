@@ -105,6 +105,12 @@ class TransientRun(RunPredictor):
         self.motions: dict[str, Motion] = {} if like is None else like.known_motions()
         self._adopt(self.chosen or equidistant(1))
 
+    def start_like(self, other: TransientRun) -> None:
+        """Begin on the mesh of another run with the same dofs, from its motion."""
+        self.chosen, self.motions = other.chosen, other.known_motions()
+        if self.chosen is not None:
+            self._adopt(self.chosen)
+
     def resampled(self, record: Record) -> TransientRun:
         """The same run, anchor and mesh included, looked at at other times of the same span."""
         other = copy(self)

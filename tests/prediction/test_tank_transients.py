@@ -48,3 +48,19 @@ def test_vectors_in_groups_are_the_same_to_the_last_bit(derivatives, monkeypatch
     np.testing.assert_array_equal(apart.status, together.status)
     if derivatives:
         np.testing.assert_array_equal(apart.y_p, together.y_p)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_run_that_begins_like_another_has_the_solution_of_its_own_start(factor):
+    """Also where no integrator is asked for the first motion."""
+    known = predictor(1.0)
+    known.set_anchor(np.ones(1))
+    alone, begun = predictor(factor), predictor(factor)
+    begun.runs[0].start_like(known.runs[0])
+    for made in (alone, begun):
+        (status,) = made.set_anchor(np.ones(1))
+        assert status is Status.CONVERGED
+    assert begun.runs[0].chosen is known.runs[0].chosen
+    own, other = (made.simulate(np.ones((1, 1)), 0).y[0, 0] for made in (alone, begun))
+    # Two meshes: what either leaves of the solution.
+    np.testing.assert_allclose(other, own, rtol=1e-5, atol=1e-5 * np.abs(own).max())
