@@ -336,11 +336,10 @@ def _is_loss(error: BaseException) -> bool:
 
 
 def _call(token: str, payload: bytes, item: Any) -> Any:
-    """On a worker: one task, with as many threads as the worker has."""
+    """On a worker: one task, in one thread; a worker gets as many at a time as it has threads."""
     import cloudpickle
-    from distributed import get_worker
 
-    limit_threads(get_worker().state.nthreads)
+    limit_threads(1)
     if not token:
         return cloudpickle.loads(payload)(item)
     if token not in _kept:

@@ -178,6 +178,7 @@ def await_end(process):
 
 @pytest.mark.slow
 def test_calls_on_a_cluster_have_processes_of_their_own(client, tmp_path):
+    client.wait_for_workers(2, timeout=300)  # one that another test killed comes again
     pool = Machines(client)
     assert (pool.size, pool.alive) == (2, True)
     calls = [Noted(tmp_path, f"call-{k}") for k in range(3)]
