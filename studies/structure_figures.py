@@ -58,14 +58,10 @@ def log_score(row: Mapping[str, Any]) -> float:
     return float(-np.mean(np.log(np.maximum(chances, 1e-6))))
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Reliability of all statements, and how campaigns with something outside are called."""
-    done = [row for row in rows if "failed" not in row]
-    said = np.array([item for row in done for item in statements(row)], dtype=float)
-    table: dict[str, float] = {
-        "structure_campaigns": len(done),
-        "structure_failed": len(rows) - len(done),
-    }
+def _bands(said: np.ndarray) -> dict[str, float]:
+    """By band, how many statements were made, with which mean probability, and how many are true;
+    and the largest difference of both."""
+    table: dict[str, float] = {}
     errors = []
     for low, high in BANDS:
         band = said[(said[:, 0] >= low) & (said[:, 0] < high)]
@@ -74,7 +70,18 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         if len(band):
             table[f"said_{key}"], table[f"true_{key}"] = map(float, band.mean(axis=0))
             errors.append(abs(float(band[:, 0].mean() - band[:, 1].mean())))
-    table["calibration_error"] = max(errors, default=float("nan"))
+    return table | {"calibration_error": max(errors, default=float("nan"))}
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Reliability of all statements, and how campaigns with something outside are called."""
+    done = [row for row in rows if "failed" not in row]
+    said = np.array([item for row in done for item in statements(row)], dtype=float)
+    table: dict[str, float] = {
+        "structure_campaigns": len(done),
+        "structure_failed": len(rows) - len(done),
+    }
+    table |= _bands(said)
     table["sure_and_wrong"] = 1.0 - table.get(f"true_{BANDS[-1][0]:g}_to_1", float("nan"))
     scores = np.array([brier(row) for row in done])
     table["brier"], table["brier_winner"] = map(float, scores.mean(axis=0))
@@ -83,6 +90,10 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     table["log_score"] = float(np.mean([log_score(row) for row in done]))
     strange = [row["outside"] > 0.5 for row in done if row["what"] == OUTSIDE]
     table["outside_called_outside"] = float(np.mean(strange)) if strange else float("nan")
+    by_mix = [item for row in done for item in row.get("by_mix", ())]
+    if by_mix:
+        found = _bands(np.array(by_mix, dtype=float))
+        table |= {f"{key}_by_mix": value for key, value in found.items()}
     table["structure_seconds"] = float(np.mean([row["seconds"] for row in done]))
     return table
 
@@ -121,9 +132,15 @@ def print_figures() -> None:
         return
     found = figures(table["rows"])
     print(f"{table['campaigns']} campaigns, {table['failed']} more could not be simulated")
-    for low, high in BANDS:
-        key = f"{low:g}_to_{min(high, 1.0):g}"
-        count, true = found[f"statements_{key}"], found.get(f"true_{key}", float("nan"))
-        print(f"stated {low:.2f} to {min(high, 1.0):.2f}: {count:4d} statements, {true:.3f} true")
+    for title, end in (("default prior", ""), ("study's own prior", "_by_mix")):
+        if f"calibration_error{end}" not in found:
+            continue
+        print(f"by the {title}")
+        for low, high in BANDS:
+            key = f"{low:g}_to_{min(high, 1.0):g}{end}"
+            count, said, true = (
+                found.get(f"{what}_{key}", float("nan")) for what in ("statements", "said", "true")
+            )
+            print(f"  said {said:.3f} on average: {count:4.0f} statements, {true:.3f} true")
     for key in ("calibration_error", "sure_and_wrong", "brier_ratio", "outside_called_outside"):
         print(f"{key.replace('_', ' '):24} {found[key]:.3f}")

@@ -29,6 +29,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "benchmarks"))
 import truth_effects as truth
 from structure_figures import OUTSIDE, TABLE, figures
+from structure_mix import statements_by_mix
 from truth_systems import KINDS, Extra, Made, Noise, Plan, Sizes, make
 
 from bayesoleo._workflow.settings import Settings
@@ -191,6 +192,7 @@ def store(rows: Sequence[Mapping[str, Any]], campaigns: int) -> None:
         "campaigns": len(kept),
         "failed": len(rows) - len(kept),
     }
+    kept = [row | {"by_mix": statements_by_mix(row)} for row in kept]
     kept = [{key: value for key, value in row.items() if key != "evidence"} for row in kept]
     lines = ",\n".join(json.dumps(_brief(row)) for row in kept)
     text = json.dumps(head)[:-1] + f', "rows": [\n{lines}\n]}}\n'
@@ -231,7 +233,8 @@ def main() -> None:
     found = [row for row in read(given.results) if row["number"] < given.campaigns]
     if given.store:
         store(found, given.campaigns)
-    print(json.dumps(figures(found), indent=1))
+    by_mix = [r | {"by_mix": statements_by_mix(r)} if "evidence" in r else r for r in found]
+    print(json.dumps(figures(by_mix), indent=1))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 
 import numpy as np
 from scipy.special import logsumexp
@@ -48,6 +47,8 @@ CHUNK = 64
 WEAKEST = 1e-4
 #: Noise whose degrees of freedom are more than this is known.
 KNOWN = 1e5
+#: Part of an effect's mean square that is taken to be its own, at least.
+LEAST_SEEN = 1e-4
 #: Squared change of the outputs by an input's error, in units of the noise, that is not counted.
 NEGLIGIBLE_INPUT = 1e-2
 
@@ -269,18 +270,15 @@ class _At:
         parts = self.remainders.parts(self.reduced, [*own, *columns], self.law)
         if not own:
             return [parts]
-        rest = range(len(own), parts.size)
-        return [parts.with_columns(range(len(own)), power, rest) for power in self._powers()]
+        groups = [group.columns for group in self.own]
+        return [parts.with_effects(groups, sizes) for sizes in self._own_sizes()]
 
-    def _powers(self) -> list[Array]:
-        """Variances of the anchor's own columns, over a grid of sizes."""
+    def _own_sizes(self) -> list[tuple[float, ...]]:
+        """Sizes of the anchor's own effects, over a grid."""
         few, number = fewer(self.sizes), len(self.own)
         if number == 2:
-            grid = [(one, other) for one in few for other in few]
-        else:
-            grid = [(size,) * number for size in few]
-        counts = [len(group.columns) for group in self.own]
-        return [np.repeat(np.array(chosen) ** 2 / counts, counts) for chosen in grid]
+            return [(one, other) for one in few for other in few]
+        return [(size,) * number for size in few]
 
 
 def best_alone(evidences: Evidences, count: int) -> list[Added]:
@@ -487,17 +485,34 @@ def _anchored(
     rows = [here.residual[None], unknowns, own * scale, columns.rows[index], columns.law]
     remainders, sizes = grids_of(comparison, data.signal(fit))
     products, logs = remainders.covariances.products(np.concatenate(rows))
-    count = len(own) + len(index)
+    count, effects = len(own) + len(index), own_groups(anchor)
+    reduced = Reduced.of(products, logs, len(unknowns), offset)
+    every = [effects, *groups.values(), *curves.values()]
     return _At(
-        Reduced.of(products, logs, len(unknowns), offset),
+        reduced.scaled(_hidden(reduced, [g for some in every for g in some], data.samples)),
         remainders,
         Likelihood(comparison.variance.size, comparison.freedom),
         sizes,
-        own_groups(anchor),
+        effects,
         groups,
         curves,
         list(range(count, count + len(columns.law))),
     )
+
+
+def _hidden(reduced: Reduced, groups: Sequence[Group], samples: int) -> Array:
+    """Factors ``(k,)`` by which columns of unit size grow, so that what the unknowns of the model
+    cannot do of them has unit size: the smallest size that could be seen is that of this part.
+
+    Under a prior whose sizes begin where a change as a whole could be seen, much of what is called
+    missing could not be, for most of it is a change of the model's own parameters.
+    """
+    seen, factors = np.diagonal(reduced.gram[0]), np.ones(reduced.size)
+    for group in groups:
+        index = list(group.columns)
+        part = float(np.sum(seen[index])) / (samples * len(index))
+        factors[index] = min(max(part, LEAST_SEEN), 1.0) ** -0.5
+    return factors
 
 
 def own_groups(anchor: EstimatedModel) -> tuple[Group, ...]:
@@ -516,15 +531,14 @@ def _pairs(at: _At, best: Sequence[Added]) -> Evidences:
     columns, groups = _local(at, able)
     found: Evidences = {}
     (parts,), few = at.parts(columns), fewer(at.sizes)
-    for first, second in combinations(able, 2):
+    for place, first in enumerate(able[:-1], 1):
+        flat = [(second, group) for second in able[place:] for group in groups[second]]
+        others = [group for _, group in flat]
         logs = np.stack(
-            [
-                pair_evidence(parts, at.likelihood, one, other, few)
-                for one in groups[first]
-                for other in groups[second]
-            ],
-            axis=1,
-        )
+            [pair_evidence(parts, at.likelihood, one, others, few) for one in groups[first]], axis=1
+        )  # (remainders, groups of the first, groups of others, sizes, sizes)
         for outside, value in zip((False, True), at.remainders.split(logs), strict=True):
-            found[frozenset({first, second}), outside] = mean_of(value)
+            for second in able[place:]:
+                index = [k for k, (key, _) in enumerate(flat) if key == second]
+                found[frozenset({first, second}), outside] = mean_of(value[:, index])
     return found

@@ -7,26 +7,31 @@ estimate the residual of all runs is
 
 with the sensitivities :math:`J` of the present unknowns, whose priors are those of the model; the
 changes :math:`C_k` of the outputs by each effect that acts, scaled to unit root mean square in
-units of the noise, with :math:`b_k \sim N(0, \tau^2)`; and what lies outside the catalogue: a law
-that resembles many effects a little, :math:`\beta_k \sim N(0, a^2 w_k)`, and a smooth function of
-phase :math:`g` of each run. Sizes :math:`\tau`, :math:`a` and that of :math:`g` are integrated over
-a grid, with equal weight by decade from the smallest change that could be seen to the size of the
-signal itself. The measured noise is itself uncertain, which makes the density Student's.
+units of the noise; and what lies outside the catalogue: a law that resembles many effects a
+little, :math:`\beta_k \sim N(0, a^2 w_k)`, and a smooth function of phase :math:`g` of each run.
+The amplitude of an effect that acts has a moment density,
+:math:`p(b_k) \propto b_k^2 N(b_k; 0, \tau^2/3)` with root mean square :math:`\tau`: it vanishes at
+zero, for an effect of no size is none. Under a normal density most of what is called missing could
+not be seen in the data, and nothing could ever be said to be missing for sure. Sizes :math:`\tau`,
+:math:`a` and that of :math:`g` are integrated over a grid, with equal weight by decade from the
+smallest change that could be seen to the size of the signal itself. The measured noise is itself
+uncertain, which makes the density Student's.
 
 References
 ----------
 Kennedy and O'Hagan (2001), *J. R. Statist. Soc.* B 63, section 4; Kass and Raftery (1995), *JASA*
-90, 773-795, for marginal likelihoods; Rasmussen and Williams (2006), *Gaussian Processes for
+90, 773-795, for marginal likelihoods; Johnson and Rossell (2010), *J. R. Statist. Soc.* B 72,
+143-170, eqs. 4 and 11, for moment densities; Rasmussen and Williams (2006), *Gaussian Processes for
 Machine Learning*, eqs. A.9-A.10 for the lemma by which unknowns are integrated out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import erfcx, log_ndtr, logsumexp
 
 from bayesoleo._types import Array, Integers
 
@@ -38,6 +43,10 @@ VISIBLE = 4.0
 #: Difference of a law from the effect that it resembles, as a part of the effect's size, and the
 #: spread of its logarithm.
 DIFFERENCE, DIFFERENCE_SPREAD = 0.25, 1.2
+#: Standard deviations beyond which the other side of zero has less than 1e-15 of a normal density.
+NEAR = 8.0
+#: Standard deviations beyond which a tail is its first asymptotic term, to 5e-4 of it.
+FAR = 100.0
 _LOG_2 = float(np.log(2.0))
 
 
@@ -169,6 +178,11 @@ class Reduced:
         """Number of columns."""
         return int(self.slope.shape[1])
 
+    def scaled(self, factors: Array) -> Reduced:
+        """The same with each column times a factor."""
+        gram = self.gram * factors[:, None] * factors
+        return replace(self, gram=gram, slope=self.slope * factors)
+
     def of_some(self, parts: Sequence[int] | Integers, columns: Sequence[int]) -> Reduced:
         """The same for some covariances and columns, in this order."""
         chosen, kept = np.asarray(columns, dtype=int), np.asarray(parts, dtype=int)
@@ -178,6 +192,32 @@ class Reduced:
             self.square[kept],
             self.log_det[kept],
         )
+
+    def with_effects(self, groups: Sequence[Sequence[int]], sizes: Sequence[float]) -> Reduced:
+        """The same with effects that act in the covariance, whose columns come first and are left
+        out.
+
+        Parameters
+        ----------
+        groups : sequence of sequence of int
+            Columns of each effect.
+        sizes : sequence of float
+            Root mean squares of their moment densities. An amplitude's moment is that which the
+            data give it beside the other effects, before any further column is added.
+        """
+        inner = [column for group in groups for column in group]
+        counts = np.array([len(group) for group in groups])
+        power = np.repeat(moment_power(np.array(sizes), counts), counts)
+        root, index = np.sqrt(power), np.array(inner, dtype=int)
+        precision = np.eye(index.size) + root[:, None] * self.gram[:, index[:, None], index] * root
+        covariance = np.linalg.inv(precision)
+        mean = (covariance @ (root * self.slope[:, index])[:, :, None])[:, :, 0]
+        square = mean**2 + np.diagonal(covariance, axis1=1, axis2=2)
+        place = {column: k for k, column in enumerate(inner)}
+        moments = [np.log(square[:, [place[c] for c in group]].mean(axis=1)) for group in groups]
+        rest = [k for k in range(self.size) if k not in place]
+        found = self.with_columns(inner, power, rest)
+        return replace(found, log_det=found.log_det - 2.0 * np.sum(moments, axis=0))
 
     def with_columns(
         self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
@@ -332,6 +372,7 @@ def effect_evidence(
     sizes : ndarray, shape (T,)
         ``tau``, in units of the columns.
     """
+    power = moment_power(sizes, 1)
     found = np.empty((len(parts.square), len(groups), sizes.size))
     single = [k for k, group in enumerate(groups) if len(group.columns) == 1]
     index = np.array([groups[k].columns[0] for k in single], dtype=int)
@@ -339,13 +380,53 @@ def effect_evidence(
     if single:
         positive = np.array([groups[k].positive for k in single])[:, None]
         slope = parts.slope[:, index, None]
-        grown = 1.0 + sizes**2 * np.maximum(parts.gram[:, index, index, None], 0.0)
-        value = likelihood(square - sizes**2 * slope**2 / grown, logs + np.log(grown))
-        found[:, single] = value + by_side(positive, slope * sizes / np.sqrt(grown))
+        grown = 1.0 + power * np.maximum(parts.gram[:, index, index, None], 0.0)
+        value = likelihood(square - power * slope**2 / grown, logs + np.log(grown))
+        distance = slope * np.sqrt(power / grown)
+        found[:, single] = value + log_moment(positive, distance) - np.log(grown)
     for k, group in enumerate(groups):
         if len(group.columns) > 1:
             found[:, k] = _together(parts, likelihood, group, sizes)
     return found
+
+
+def moment_power(sizes: Array, columns: int | Array) -> Array:
+    """Variances of the normal part of a moment density, by its root mean square: the mean square of
+    all of ``n`` amplitudes under ``b' b N(b; 0, v I)`` is ``(n + 2) v``."""
+    return np.asarray(sizes**2 / (columns + 2))
+
+
+def log_moment(positive: Array | float, distance: Array | float) -> Array:
+    """Logarithm of the mean of ``(b / s)^2`` over a normal density of ``b`` with standard deviation
+    ``s``, where a prior is higher on one side of zero, by the distance of its mean from zero in
+    standard deviations."""
+    away = np.asarray(distance, dtype=float)
+    shares = np.broadcast_to(np.asarray(positive, dtype=float), away.shape)
+    # Both parts together, whatever the distance: most effects have no likely side.
+    found = np.array(np.log1p(away**2))
+    uneven = shares != 0.5
+    if uneven.any():
+        found[uneven] = _uneven_moment(shares[uneven], away[uneven])
+    return found
+
+
+def _uneven_moment(positive: Array, distance: Array) -> Array:
+    """The same with a likely side of zero."""
+    size = np.abs(distance)
+    likely = np.where(distance > 0, positive, 1.0 - positive)
+    with np.errstate(divide="ignore"):  # one side may be impossible
+        found = np.log1p(size**2) + np.log(2.0 * likely)
+        # The other side counts where it is near, or is the only one.
+        both = (size < NEAR) | (likely == 0.0)
+        size, likely = size[both], likely[both]
+        near = np.minimum(size, FAR)
+        # Its part is (d^2 + 1) Phi(-d) - d phi(d). Both terms nearly cancel: exp(-d^2 / 2) is taken
+        # out. Beyond, the first term of the series, 2 phi(d) / d^3.
+        scaled = 0.5 * (near**2 + 1.0) * erfcx(near / np.sqrt(2.0)) - near / np.sqrt(2.0 * np.pi)
+        beyond = np.log(scaled) - 0.5 * size**2 - 3.0 * np.log(np.maximum(size, FAR) / FAR)
+        here = np.log1p(size**2 - np.exp(beyond))
+        found[both] = np.logaddexp(np.log(likely) + here, np.log1p(-likely) + beyond) + _LOG_2
+    return np.asarray(found)
 
 
 def by_side(positive: Array | float, distance: Array | float) -> Array:
@@ -362,32 +443,47 @@ def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
     index = np.array(group.columns)
     values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
     turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0] ** 2
-    power = (sizes**2 / index.size)[:, None]
+    power = moment_power(sizes, index.size)[:, None]
     grown = 1.0 + power * np.maximum(values, 0.0)[:, None]
     gain = np.sum(power * turned / grown, axis=2)
     logs = parts.log_det[:, None] + np.log(grown).sum(axis=2)
-    return likelihood(parts.square[:, None] - gain, logs)
+    moment = np.mean(power * turned / grown**2 + 1.0 / grown, axis=2)
+    return np.asarray(likelihood(parts.square[:, None] - gain, logs) + np.log(moment))
 
 
 def pair_evidence(
-    parts: Reduced, likelihood: Likelihood, one: Group, other: Group, sizes: Array
+    parts: Reduced, likelihood: Likelihood, one: Group, others: Sequence[Group], sizes: Array
 ) -> Array:
-    """Log evidence of two effects of one unknown each, shape (P, sizes, sizes)."""
-    (i,), (j,) = one.columns, other.columns
-    # Slopes and products in units of the prior: rows for the sizes of one, columns for the other.
-    first = sizes[:, None] * parts.slope[:, i, None, None]
-    second = sizes * parts.slope[:, j, None, None]
-    own = 1.0 + sizes[:, None] ** 2 * np.maximum(parts.gram[:, i, i], 0.0)[:, None, None]
-    its = 1.0 + sizes**2 * np.maximum(parts.gram[:, j, j], 0.0)[:, None, None]
-    mixed = np.multiply.outer(sizes, sizes) * parts.gram[:, i, j, None, None]
+    """Log evidence of an effect together with each of others, of one unknown each.
+
+    Returns
+    -------
+    ndarray, shape (P, others, sizes, sizes)
+    """
+    (i,), index = one.columns, np.array([group.columns[0] for group in others], dtype=int)
+    root = np.sqrt(moment_power(sizes, 1))
+
+    def wide(values: Array) -> Array:
+        """With axes for the sizes of both."""
+        return np.asarray(values[..., None, None])
+
+    # Slopes and products in units of the prior: rows for the sizes of one, columns for the others.
+    first = root[:, None] * wide(parts.slope[:, i, None])
+    second = root * wide(parts.slope[:, index])
+    own = 1.0 + root[:, None] ** 2 * wide(np.maximum(parts.gram[:, i, i, None], 0.0))
+    its = 1.0 + root**2 * wide(np.maximum(parts.gram[:, index, index], 0.0))
+    mixed = np.multiply.outer(root, root) * wide(parts.gram[:, i, index])
     det = np.maximum(own * its - mixed**2, 1e-12 * own * its)
     gain = (its * first**2 + own * second**2 - 2.0 * mixed * first * second) / det
-    logs = parts.log_det[:, None, None] + np.log(det)
-    found = likelihood(parts.square[:, None, None] - gain, logs)
-    # Each side by itself: the two are nearly independent where both are seen.
+    found = likelihood(
+        wide(parts.square[:, None]) - gain, wide(parts.log_det[:, None]) + np.log(det)
+    )
+    # Each amplitude by itself: the two are nearly independent where both are seen.
     here = (its * first - mixed * second) / np.sqrt(its * det)
     there = (own * second - mixed * first) / np.sqrt(own * det)
-    return np.asarray(found + by_side(one.positive, here) + by_side(other.positive, there))
+    positive = np.array([group.positive for group in others])[:, None, None]
+    moments = log_moment(one.positive, here) + log_moment(positive, there)
+    return np.asarray(found + moments + np.log(own * its / det**2))
 
 
 def mean_of(logs: Array) -> float:

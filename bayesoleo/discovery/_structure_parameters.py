@@ -27,7 +27,7 @@ from bayesoleo.discovery._structure_comparison import (
     grids_of,
     own_groups,
 )
-from bayesoleo.discovery._structure_evidence import Likelihood, fewer
+from bayesoleo.discovery._structure_evidence import Likelihood, fewer, moment_power
 from bayesoleo.discovery._structures import AveragedParameter, Structure
 
 #: Structures less probable than this, and parts of a mixture lighter than this, are left out.
@@ -178,7 +178,8 @@ class _Structure:
         unknowns, _, law = self.counts
         for pattern, power, weight in self.parts:
             for size in self.sizes:
-                precision = np.concatenate([np.ones(unknowns), self.members / size**2])
+                effects = 1.0 / moment_power(size, self.members)
+                precision = np.concatenate([np.ones(unknowns), effects])
                 if power is not None:
                     precision = np.concatenate([precision, np.full(law, 1.0 / power)])
                 log, mean, covariance = self._posterior(pattern, precision)

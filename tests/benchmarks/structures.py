@@ -77,7 +77,7 @@ def probabilities(_: int) -> dict[str, float | str]:
     kept: dict[str, float | str] = {
         key: value
         for key, value in found.items()
-        if key in PROBABILITIES or key.startswith("statements_")
+        if key in PROBABILITIES or key.startswith("statements_") or key.endswith("_by_mix")
     }
     return kept | {
         f"structure_{key}": table[key]

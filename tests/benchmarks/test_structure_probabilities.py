@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import truth_effects
 from truth_effects import NUMERICS, fitted
@@ -17,6 +18,7 @@ from bayesoleo.effects import find_effect
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "studies"))
 import structure_figures
+import structure_mix
 import structure_probabilities
 
 FEW = ("coulomb_friction", "quadratic_stiffness", "cubic_stiffness", "sensor_gain")
@@ -68,6 +70,17 @@ ROW = {
     "seconds": 1.0,
 }
 PLAIN = ROW | {"what": "nothing", "truth": [], "nothing": 0.97, "only_outside": 0.0, "effects": {}}
+
+
+def test_under_the_prior_of_the_study_only_what_it_draws_has_a_probability():
+    """Equal evidence: the shares of what is drawn for the kind remain."""
+    cubic, drag = ["cubic_stiffness", "position"], ["quadratic_damping", "position"]
+    evidence = [[[], False, 3.0], [[], True, 3.0], [[cubic], False, 3.0], [[drag], False, 9.0]]
+    row = ROW | {"kind": "linear", "truth": ["cubic_stiffness @ position"], "evidence": evidence}
+    said = structure_mix.statements_by_mix(row)
+    shares = np.array([0.25 / 6, 0.25 / 5, 0.375 / 12])
+    np.testing.assert_allclose([p for p, _ in said], shares / shares.sum())
+    assert [true for _, true in said] == [False, False, True]
 
 
 def test_figures_of_a_few_statements():

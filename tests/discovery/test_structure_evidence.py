@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import integrate, stats
 from scipy.special import logsumexp
 
+from bayesoleo.discovery._spectral_data import RunLines
 from bayesoleo.discovery._structure_evidence import (
     Covariances,
     Group,
     Likelihood,
     Reduced,
+    Remainders,
     by_side,
     effect_evidence,
+    log_moment,
     mean_of,
     pair_evidence,
 )
@@ -63,15 +68,56 @@ def test_columns_in_the_covariance_are_those_of_the_dense_one(problem):
     np.testing.assert_allclose([part.square[0], part.log_det[0]], expected, rtol=1e-10)
 
 
+def amplitudes(problem, power: dict[int, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Means of effects' amplitudes and their covariance, by the whole covariance of the data."""
+    residual, unknowns, columns, variance, offset = problem
+    rows, prior = columns[list(power)], np.diag(list(power.values()))
+    rest = np.diag(variance) + unknowns.T @ unknowns
+    gain = prior @ rows @ np.linalg.inv(rest + rows.T @ prior @ rows)
+    return gain @ (residual - offset @ unknowns), prior - gain @ rows.T @ prior
+
+
 @pytest.mark.parametrize("freedom", [4.0, 30.0, 1e5])
-def test_evidence_of_an_effect_is_students_density(problem, freedom):
+def test_evidence_of_an_effect_is_students_density_by_the_moment_of_its_amplitudes(
+    problem, freedom
+):
     likelihood = Likelihood(SAMPLES, freedom)
     found = effect_evidence(reduced(problem), likelihood, [Group((1,)), Group((0, 3))], SIZES)
     for t, size in enumerate(SIZES):
         for g, columns in enumerate([(1,), (0, 3)]):
-            square, log_det = dense(problem, {k: size**2 / len(columns) for k in columns})
-            expected = likelihood(np.array(square), np.array(log_det))
+            # The mean square of n amplitudes under b' b N(b; 0, v I) is (n + 2) v.
+            normal = size**2 / (len(columns) + 2)
+            power = dict.fromkeys(columns, normal)
+            square, log_det = dense(problem, power)
+            mean, covariance = amplitudes(problem, power)
+            moment = (mean @ mean + np.trace(covariance)) / (normal * len(columns))
+            expected = likelihood(np.array(square), np.array(log_det)) + np.log(moment)
             np.testing.assert_allclose(found[0, g, t], expected, rtol=1e-10)
+
+
+def test_effects_in_the_covariance_have_their_moments(problem):
+    """The evidence of an anchor's effects is that of the same effects as candidates."""
+    likelihood, part = Likelihood(SAMPLES, 1e6), reduced(problem)
+    groups = [Group((1,)), Group((0, 3))]
+    found = effect_evidence(part, likelihood, groups, SIZES)
+    for t, size in enumerate(SIZES):
+        for g, group in enumerate(groups):
+            own = part.with_effects([group.columns], [size])
+            assert own.size == COLUMNS - len(group.columns)
+            np.testing.assert_allclose(
+                likelihood(own.square, own.log_det)[0], found[0, g, t], rtol=1e-10
+            )
+
+
+def test_nothing_missing_is_favoured_faster_than_under_a_normal_density():
+    """Of an amplitude that is estimated as nothing, the ratio to the evidence of nothing falls with
+    the third power of its size, and with the first one under a normal density."""
+    gram, likelihood = 100.0, Likelihood(1000, 1e9)
+    part = Reduced(np.full((1, 1, 1), gram), np.zeros((1, 1)), np.array([1000.0]), np.zeros(1))
+    nothing = likelihood(part.square, part.log_det)[0]
+    sizes = np.array([1.0, 10.0, 100.0])
+    found = effect_evidence(part, likelihood, [Group((0,))], sizes)[0, 0] - nothing
+    np.testing.assert_allclose(found, -1.5 * np.log1p(gram * sizes**2 / 3.0), rtol=1e-6)
 
 
 def test_students_density_is_that_of_scipy_up_to_a_constant():
@@ -85,14 +131,35 @@ def test_students_density_is_that_of_scipy_up_to_a_constant():
     np.testing.assert_allclose(ours - theirs, (ours - theirs)[0], atol=1e-12)
 
 
-def test_a_pair_is_one_effect_after_the_other(problem):
-    likelihood, part = Likelihood(SAMPLES, 50.0), reduced(problem)
-    found = pair_evidence(part, likelihood, Group((1,)), Group((3,)), SIZES)
-    for t, size in enumerate(SIZES):
-        grown = part.with_columns([1], np.array([size**2]))
-        np.testing.assert_allclose(
-            found[0, t], effect_evidence(grown, likelihood, [Group((3,))], SIZES)[0, 0], rtol=1e-9
-        )
+def moment_density(b, size: float):
+    """Of an amplitude with a root mean square."""
+    normal = size / np.sqrt(3.0)
+    return (b / normal) ** 2 * stats.norm.pdf(b, scale=normal)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_evidence_of_a_pair_is_an_integral_over_both_amplitudes(correlation):
+    gram = np.array([[16.0, 12.0 * correlation], [12.0 * correlation, 9.0]])
+    slope, sizes = np.array([20.0, -13.0]), np.array([0.8, 3.0])
+    part = Reduced(gram[None], slope[None], np.array([500.0]), np.zeros(1))
+    likelihood = Likelihood(500, 1e10)
+    one, other = Group((0,), 0.9), Group((1,), 0.5)
+    found = pair_evidence(part, likelihood, one, [other], sizes)[0, 0]
+    found = found - likelihood(part.square, part.log_det)[0]
+    grid = np.linspace(-12.0, 12.0, 2401)
+    first, second = grid[:, None], grid
+    density = np.exp(
+        slope[0] * first + slope[1] * second
+        - 0.5 * (gram[0, 0] * first**2 + gram[1, 1] * second**2)
+        - gram[0, 1] * first * second
+    )  # fmt: skip
+    side = 2.0 * np.where(first > 0, 0.9, 0.1)
+    for t, size in enumerate(sizes):
+        for k, its in enumerate(sizes):
+            prior = side * moment_density(first, size) * moment_density(second, its)
+            exact = np.log(np.sum(density * prior) * (grid[1] - grid[0]) ** 2)
+            # Amplitudes that are correlated are taken one by one: some per cent of the evidence.
+            assert found[t, k] == pytest.approx(exact, abs=0.25 if correlation else 1e-5)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -104,7 +171,7 @@ def test_a_sign_halves_the_prior(problem, sign):
     slope, gram = part.slope[0, 1], part.gram[0, 1, 1]
 
     def density(b: float) -> float:
-        return 2 * stats.norm.pdf(b, scale=size) * np.exp(slope * b - 0.5 * gram * b**2)
+        return 2 * moment_density(b, size) * np.exp(slope * b - 0.5 * gram * b**2)
 
     side = (0.0, 20.0) if sign > 0 else (-20.0, 0.0)
     at_null = likelihood(part.square, part.log_det)[0]
@@ -165,6 +232,28 @@ def test_a_likely_side_of_zero_has_its_share_of_a_normal_prior(positive):
         assert np.exp(by_side(positive, distance)) == pytest.approx(weight, rel=1e-12)
 
 
+@pytest.mark.parametrize("positive", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_a_moment_by_sides_is_that_of_a_normal_density(positive):
+    for distance in (-8.0, -3.0, -0.5, 0.0, 2.0, 30.0):
+
+        def square(x: float, d: float = distance) -> float:
+            return x * x * stats.norm.pdf(x, loc=d)
+
+        above = integrate.quad(square, 0.0, max(distance, 0.0) + 12.0, epsabs=0.0, limit=200)[0]
+        below = integrate.quad(square, min(distance, 0.0) - 12.0, 0.0, epsabs=0.0, limit=200)[0]
+        expected = 2 * positive * above + 2 * (1 - positive) * below
+        assert np.exp(log_moment(positive, distance)) == pytest.approx(expected, rel=1e-7)
+
+
+def test_moments_far_on_the_wrong_side_are_smooth():
+    """Where the closed form ends its asymptotic series takes over."""
+    distances = -np.array([99.0, 99.9, 100.1, 101.0, 1e4])
+    found = log_moment(1.0, distances)
+    tail = np.log(2) + np.log(2 / np.sqrt(2 * np.pi)) - 0.5 * distances**2
+    np.testing.assert_allclose(found, tail - 3 * np.log(-distances), atol=1e-3)
+    assert log_moment(1.0, np.array([0.0]))[0] == pytest.approx(0.0)
+
+
 def test_posterior_probabilities_are_right_as_often_as_they_say():
     """Data drawn from the prior: the mean probability of what is true is that of being right."""
     rng, draws = np.random.default_rng(12), 1000
@@ -175,7 +264,9 @@ def test_posterior_probabilities_are_right_as_often_as_they_say():
     for _ in range(draws):
         truth, residual = int(rng.integers(4)), rng.standard_normal(25)
         if truth < 3:
-            residual = residual + rng.choice(SIZES) * rng.standard_normal() * columns[truth]
+            # A moment density: the square has three degrees of freedom.
+            size = rng.choice([-1, 1]) * np.sqrt(rng.chisquare(3) / 3)
+            residual = residual + rng.choice(SIZES) * size * columns[truth]
         rows = np.concatenate([residual[None], columns])
         part = Reduced.of((rows @ rows.T)[None], np.zeros(1), 0, np.zeros(0))
         logs = [mean_of(row) for row in effect_evidence(part, likelihood, groups, SIZES)[0]]
@@ -190,3 +281,32 @@ def test_posterior_probabilities_are_right_as_often_as_they_say():
         # Four standard errors of a proportion: once in sixteen thousand.
         error = 4 * np.sqrt(expected * (1 - expected) / band.sum()) + 1e-3
         assert abs(true[band].mean() - expected) < error
+
+
+def test_a_law_like_an_effect_has_a_prior_over_its_difference_that_adds_up():
+    """Where the data say nothing, its evidence is that of the effect, at each of its sizes."""
+    output_of = np.zeros(8, dtype=int)
+    covariances = Covariances.of(
+        np.ones(8), np.linspace(1, 0.1, 8), output_of, np.array([9.0]), 100
+    )
+    remainders = Remainders.of(covariances, np.array([0.5, 2.0]))
+    logs = np.full((len(remainders.weights), 2, SIZES.size), 1.7)
+    np.testing.assert_allclose(remainders.similar(logs, SIZES), 1.7, atol=1e-12)
+
+
+def test_a_set_of_two_effects_comes_about_in_either_order():
+    """Two draws from all effects: pairs, and those that are drawn twice, add up to all."""
+    weights, prior = np.array([0.5, 0.3, 0.2]), StructurePrior()
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    two = prior.numbers[1] / sum(prior.numbers)
+    total = sum(np.exp(prior.log_of_set(weights[list(pair)])) for pair in pairs)
+    assert total + two * np.sum(weights**2) == pytest.approx(two)
+
+
+@pytest.mark.parametrize("size", [24, 25])
+def test_coefficients_on_all_lines_have_the_signal_s_square(size):
+    """Orthonormal, as white noise of one variance on every line supposes."""
+    record = SimpleNamespace(periodic=True, periods=1, kept=None, time=np.arange(size))
+    lines = RunLines(record, np.arange(size // 2 + 1))
+    signal = np.random.default_rng(0).standard_normal(size) + (-1.0) ** np.arange(size)
+    assert np.sum(lines.transformed(signal) ** 2) == pytest.approx(signal @ signal)

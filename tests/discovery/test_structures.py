@@ -232,7 +232,8 @@ def _sampled(comparison: Comparison, anchor) -> float:
         for k, name in enumerate(names):
             if k == amplitude:
                 # At the mean of the grid that the package uses for its own effects.
-                each = stats.norm.logpdf(draw[k], scale=fewer(sizes) * unit)
+                normal = fewer(sizes) * unit / np.sqrt(3.0)
+                each = stats.norm.logpdf(draw[k], scale=normal) + np.log((draw[k] / normal) ** 2)
                 logs[n] += logsumexp(each) - np.log(each.size)
                 logs[n] += np.log(2 * (LIKELY_SIDE if draw[k] > 0 else 1 - LIKELY_SIDE))
             elif name in anchor.shapes:
