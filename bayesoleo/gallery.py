@@ -33,6 +33,8 @@ from bayesoleo.plots._style import engineering, format_number
 __all__ = ["Study", "print_before_after"]
 
 DPI = 100
+#: Of an effect with more parameters than these only their number is printed.
+MOST_NAMES = 6
 
 
 def _where(data: str) -> str:
@@ -208,6 +210,9 @@ def print_before_after(summary: Mapping[str, Any], unit: str, per_si: float) -> 
     print(f"\n{'posterior of what was added':34}{'mean':>10}{'sd':>10}   95 % interval")
     for effect, names in added_parameters(summary):
         print(effect)
+        if len(names) > MOST_NAMES:  # such as the values of a spline
+            print(f"  {len(names)} parameters")
+            continue
         for name in names:
             print(_line(name, summary["parameters"][name]))
 

@@ -7,8 +7,8 @@ used again while neither the package nor the set's campaign and model have chang
     python studies/measured_sets.py --only emps
 
 measures one set; without ``--only`` all of them, with ``--store`` it writes the table
-``studies/tables/measured.json`` that the page of all sets shows. The pages of single sets read
-what is kept: run this first, and then each page with ``BAYESOLEO_STORE_FIGURES=1``. Keys are
+``studies/tables/measured.json``. A page of the gallery for a set reads
+what is kept: run this first, and then the page with ``BAYESOLEO_STORE_FIGURES=1``. Keys are
 explained in ``tests/benchmarks/measured.py``.
 """
 

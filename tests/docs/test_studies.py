@@ -157,3 +157,13 @@ PRIVATE = re.compile(r"bayesoleo(\.\w+)*\._|from bayesoleo[\w.]* import (.*\b)?_
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_page_uses_public_names_only(page: Path) -> None:
     assert not PRIVATE.search(page.read_text(encoding="utf-8").replace("__version__", ""))
+
+
+def test_many_parameters_of_an_effect_are_counted_only(
+    stored: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One for each of eight runs, for instance: they need not be values of a spline."""
+    names = [f"offset[{k}]" for k in range(8)]
+    monkeypatch.setattr(stored, "added_parameters", lambda _: iter([("an offset by run", names)]))
+    stored.print_before_after({"error_after": {}, "error_before": {}}, "N", 1.0)
+    assert capsys.readouterr().out.endswith("an offset by run\n  8 parameters\n")
