@@ -339,8 +339,9 @@ def _repeating(residual: Array, when: RunSamples) -> tuple[Array | None, float]:
     periods = phase.size * step
     if periods < 1.5:
         return None, periods
-    bins = max(int(1.0 / step), 1)
-    place = np.minimum((phase % 1.0 * bins).astype(int), bins - 1)
+    bins = max(int(1.0 / step + 1e-6), 1)
+    # The nearest bin: equal steps of whole periods would stand on its edge, but for rounding.
+    place = np.rint(phase % 1.0 * bins).astype(int) % bins
     number = np.bincount(place, minlength=bins)
     sums = np.bincount(place, residual, minlength=bins)
     return sums[number > 0] / number[number > 0], periods

@@ -4,6 +4,7 @@ Each command that writes is killed at moments spread over all its changes of the
 run once more: the result must be the one of a run that nobody disturbed. Then the disk fills up at
 each of these moments, bytes of stored files are flipped, the clock and the locale are odd, and the
 input is hostile. A fault is answered by the right result, or by one line that says what is wrong.
+Last, the package itself is made faulty: see ``mutants.py``.
 
 Run ``python tests/benchmarks/faults.py --json``; ``--few`` tries a sample. What is tried,
 and what was not answered, is told on standard error.
@@ -105,6 +106,8 @@ class Count:
     faults_answered: int = 0
     silent_changes: int = 0
     segfaults: int = 0
+    mutants: int = 0
+    mutants_killed: int = 0
     remarks: list[str] = field(default_factory=list)
 
     def fault(self, name: str, outcome: Outcome, right: bool) -> None:
@@ -467,6 +470,15 @@ class Bench:
             self.count.fault(name, done, done.status == 0 and kept and right(folder))
             shutil.rmtree(folder)
 
+    def mutants(self) -> None:
+        """Change what numbers mean, which the tests must notice; see ``mutants.py``."""
+        script = Path(__file__).with_name("mutants.py")
+        arguments = [sys.executable, str(script), "--json", *(["--few"] if self.few else [])]
+        # Of its own: mutants are tried in processes that have not imported the package.
+        done = subprocess.run(arguments, stdout=subprocess.PIPE, text=True, check=True)
+        for key, value in json.loads(done.stdout).items():
+            setattr(self.count, key, value)
+
 
 def make_rig(folder: Path) -> None:
     """The small campaign of the tests of the command line, and its model."""
@@ -518,6 +530,7 @@ def steps(bench: Bench, share: float) -> Iterator[tuple[str, Callable[[], None]]
         yield f"kill {verb}", partial(bench.kills, verb, most)
         yield f"fill the disk of {verb}", partial(bench.full_disk, verb, most)
     yield "hostile input", bench.inputs
+    yield "mutants", bench.mutants
     if not bench.few:
         yield "a small disk", bench.real_disk
         yield "flipped bits", partial(bench.flips, max(3, round(share * 51)))

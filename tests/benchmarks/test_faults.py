@@ -59,6 +59,12 @@ def test_estimates_that_are_killed_or_have_no_room(bench):
     check(bench.count, 3, 3)
 
 
+@pytest.mark.slow
+def test_a_sample_of_mutants_is_noticed(bench):
+    bench.mutants()
+    assert bench.count.mutants_killed == bench.count.mutants >= 8
+
+
 NAMES = ("label up, simulated", "label newline, estimated", "100 000 columns", "file /etc")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.data import periodic_average
-from bayesoleo.data._noise import noise_spectrum
+from bayesoleo.data._noise import NoiseSpectrum, noise_spectrum
 
 SAMPLES, PERIODS, STEP = 2000, 4, 0.002
 
@@ -70,3 +70,12 @@ def test_variance_of_a_projection_on_a_periodic_direction(coefficient):
         freedom.append(spectrum.freedom(power))
     assert np.mean(found) == pytest.approx(exact, rel=4 * np.std(found) / exact / 60**0.5 + 0.05)
     assert np.var(found) / np.mean(found) ** 2 == pytest.approx(2 / np.mean(freedom), rel=0.6)
+
+
+@pytest.mark.parametrize("size", [40, 41])
+def test_the_power_of_all_lines_is_that_of_the_signal(size):
+    """Parseval: white noise of unit variance gives a projection the variance of its square."""
+    signal = np.random.default_rng(0).standard_normal(size) + (-1.0) ** np.arange(size)
+    spectrum = NoiseSpectrum(np.ones(size // 2 + 1), 4, size)
+    assert spectrum.power(signal).sum() == pytest.approx(signal @ signal, rel=1e-12)
+    assert spectrum.weights.sum() == size

@@ -12,7 +12,7 @@ from small_campaigns import damper, damper_campaign
 from synthetic_scores import base_of_noise
 
 from bayesoleo.data._noise import noise_spectrum
-from bayesoleo.discovery._score_tests import corrected_p, inflation_of
+from bayesoleo.discovery._score_tests import _between_periods, corrected_p, inflation_of
 
 SEEDS = 30
 
@@ -76,3 +76,30 @@ def test_a_drift_is_not_its_own_noise():
     drifting = replace(base, runs=[run], fit=SimpleNamespace(records=[record]))
     assert inflation_of(drifting, [ramp])[0] < 1.6
     assert inflation_of(drifting, [wave])[0] > 3.0, "to others the drift is noise"
+
+
+def test_scatter_between_few_periods_is_unbiased():
+    """White noise beside an effect that grows: its variance along that is ``d @ d``, on average."""
+    rng, periods = np.random.default_rng(3), 4
+    period = np.repeat(np.arange(periods), 30)
+    direction = np.sin(np.arange(period.size)) * (1.0 + period)
+    found = []
+    for _ in range(3000):
+        residual = direction + rng.standard_normal(period.size)
+        run = SimpleNamespace(period=period, residual=residual)
+        value, degrees = _between_periods([run], [direction])
+        found.append(value)
+        assert degrees == periods - 1
+    error = np.std(found) / np.sqrt(len(found))
+    assert np.mean(found) == pytest.approx(direction @ direction, abs=4 * error)
+
+
+def test_degrees_of_freedom_have_no_unit_and_add_up():
+    """The size of a direction does not matter; another run that knows as much doubles them."""
+    rng = np.random.default_rng(5)
+    base, direction = base_of_noise(rng, shared=False, periods=8)
+    base = replace(base, policy=replace(base.policy, unsteady=1e-9))  # by the spectrum alone
+    _, freedom = inflation_of(base, [direction])
+    assert inflation_of(base, [100 * direction])[1] == freedom > 4
+    twice = replace(base, runs=[*base.runs, *base.runs])
+    assert inflation_of(twice, [direction, direction])[1] == pytest.approx(2 * freedom, abs=1)

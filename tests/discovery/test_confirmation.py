@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fitted_states import NUMERICS, motion
+from scipy import stats
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.discovery import _hold_out_confirmation as confirmation
@@ -21,6 +22,7 @@ from bayesoleo.discovery._hold_out_confirmation import (
     with_error,
 )
 from bayesoleo.discovery._loop import close_loop
+from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import crossed
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
@@ -287,3 +289,110 @@ def test_runs_that_speak_against_an_effect_are_not_outvoted():
 def test_next_to_nothing_confirms_nothing_however_sure():
     assert not Fall(2.5e-4, 1.7e-5, 1e-3).confirms
     assert Fall(100.0, 13.0, 100.0).confirms
+
+
+def on_one_run(change, left, *, ratio, inflation=1.0):
+    """Fall, its mean and its variance in one periodic run with noise of 0.5, by ``_of_run``."""
+    samples = left + change
+    record = SimpleNamespace(
+        label="a", samples={"y": samples}, kept=None, time=np.arange(left.size), periodic=True
+    )
+    entry = SimpleNamespace(
+        average=SimpleNamespace(sigma=0.5), input_scale=1.0, ratio_to_expected=ratio
+    )
+    state = SimpleNamespace(hold_errors=SimpleNamespace(at=lambda *_: entry), at_floor=False)
+    predictor = SimpleNamespace(outputs=("y",), runs=[None], constants=lambda *_: np.zeros((1, 1)))
+    old, new = (
+        SimpleNamespace(predictor=predictor, record=record, vector=np.zeros(1), y=y[None])
+        for y in (np.zeros(left.size), change)
+    )
+    return confirmation._of_run(state, state, old, new, inflation)
+
+
+@pytest.mark.parametrize("inflation", [1.0, 2.5])
+def test_white_noise_scatters_a_fall_by_twice_the_root_of_its_mean(monkeypatch, inflation):
+    """``4 d' w d`` times the inflation, drawn; noise that is expected leaves no remainder."""
+    monkeypatch.setattr(confirmation, "input_columns", lambda *_: np.zeros((1, 0, 60)))
+    rng = np.random.default_rng(4)
+    change = np.sin(2 * np.pi * np.arange(60) / 20)
+    drawn, said = [], []
+    for _ in range(2000):
+        left = 0.5 * np.sqrt(inflation) * rng.standard_normal(60)
+        fall, mean, variance = on_one_run(change, left, ratio=1.0, inflation=inflation)
+        drawn.append(fall - mean)
+        said.append(variance)
+    assert np.ptp(said) == pytest.approx(0.0, abs=1e-9)
+    # A variance from 2000 draws scatters by 3 %.
+    assert said[0] == pytest.approx(np.var(drawn), rel=0.13)
+    # What exceeds the expected error thrice repeats: eight parts more at most.
+    left = 1.5 * np.sqrt(2) * change
+    more = on_one_run(change, left, ratio=3.0, inflation=inflation)[2]
+    assert said[0] < more < 10 * said[0]
+
+
+def test_a_parameter_of_a_run_is_charged_with_the_noise_that_it_absorbs():
+    """By coloured noise of so many times the variance, it lowers the sum by as many on average."""
+
+    def state(of_its_own):
+        unsolved = SimpleNamespace(
+            re_estimated=of_its_own, status=SimpleNamespace(ok=False), record=None
+        )
+        fit = SimpleNamespace(
+            problem=SimpleNamespace(names=()),
+            point=SimpleNamespace(covariance=np.zeros((0, 0))),
+        )
+        return SimpleNamespace(held_out=[unsolved], fit=fit, policy=SearchPolicy())
+
+    assert fall_on_hold_out(state(0), state(2)).value == -2.0
+    assert fall_on_hold_out(state(1), state(2), inflation=3.0).value == -3.0
+
+
+def test_errors_of_the_parameters_move_a_fall_by_twice_their_pull(monkeypatch):
+    """The fall of ``(y - a)^2`` changes by ``2 d' w J`` for each unit of a parameter in ``a``."""
+    status, names = SimpleNamespace(ok=True), ("one", "two")
+    rng = np.random.default_rng(0)
+    sensitivity, change, noise = rng.standard_normal((2, 30)), rng.standard_normal(30), 0.7
+    spread = np.array([[0.04, 0.01], [0.01, 0.09]])
+    pull = sensitivity @ change / noise**2
+
+    def state(known):
+        prediction = SimpleNamespace(re_estimated=0, status=status, y=np.zeros((1, 30)))
+        fit = SimpleNamespace(
+            problem=SimpleNamespace(names=names), point=SimpleNamespace(covariance=known)
+        )
+        return SimpleNamespace(held_out=[prediction], fit=fit, policy=SearchPolicy())
+
+    monkeypatch.setattr(confirmation, "_of_run", lambda *_: (0.0, 1.0, 0.0))
+    monkeypatch.setattr(confirmation, "_pull", lambda *_: pull)
+    found = fall_on_hold_out(state(spread), state(np.zeros((2, 2))))
+    errors = rng.multivariate_normal(np.zeros(2), spread, 20_000)
+    left = rng.standard_normal(30)
+
+    def fall(wrong):
+        before = left + change - wrong @ sensitivity
+        return np.sum(before**2 - (before - change) ** 2) / noise**2
+
+    # The fall is linear in the error here; a deviation from 20 000 draws scatters by 0.5 %.
+    assert found.error == pytest.approx(np.std([fall(wrong) for wrong in errors]), rel=0.025)
+    assert found.scatter == 0.0, "the other model's parameters are known"
+
+
+@pytest.mark.parametrize("scatter", [100.0, 400.0])
+def test_runs_decide_where_a_real_effect_would_seldom_be_missed(scatter):
+    policy = SearchPolicy()
+    for expected in np.linspace(100.0, 2500.0, 25):
+        fall = Fall(0.0, 200.0, expected, scatter)
+        missed = stats.norm.cdf(policy.confirming_errors * fall.error, expected, scatter)
+        assert fall.undecided == (missed > policy.missed_confirmation)
+
+
+@pytest.mark.parametrize("size", [16, 17])
+def test_the_highest_line_of_an_even_number_of_samples_is_alone(size):
+    """Where change and remainder alternate, signs are the only phases: the fall is all or minus."""
+    sign = (-1.0) ** np.arange(size)
+    lines = np.fft.rfft(sign)
+    exact = np.sum(np.abs(np.fft.fft(sign)) ** 4) / size**2  # one term for each of all lines
+    assert surrogate_variance(sign, sign) == pytest.approx(exact, rel=1e-12)
+    if size % 2 == 0:
+        assert np.count_nonzero(np.abs(lines) > 1e-9) == 1
+        assert surrogate_variance(sign, sign) == pytest.approx(float(sign @ sign) ** 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,12 @@ from bayesoleo import _schema as schema
 from bayesoleo.data import periodic_average
 from bayesoleo.data._noise import local_average
 from bayesoleo.discovery._assembly import Assembly, RecordNoise, assign
+from bayesoleo.discovery._expected_error import (
+    _left,
+    _LinearisedRun,
+    _own_response,
+    expected_of_fitted,
+)
 from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     RunError,
@@ -24,6 +31,7 @@ from bayesoleo.discovery._fit_and_hold_out_error import (
     with_same_noise,
 )
 from bayesoleo.discovery._loop import close_loop
+from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import borne_out
 from bayesoleo.model import Model, Output, Parameter
 
@@ -211,3 +219,62 @@ def test_the_noise_of_a_run_that_could_not_be_solved_is_not_known():
     assert least_noise({}, unsolved) == {}
     assert least_noise(unsolved, later) == later
     assert least_noise(later, unsolved) == later
+
+
+def linear_run(rng, samples=60, unknowns=3):
+    """Sensitivities of one run of a linear model, of unequal size."""
+    return rng.standard_normal((unknowns, samples)) * np.array([1.0, 5.0, 0.2])[:, None]
+
+
+def reduced_run(sensitivity, noise, weight):
+    """The same as expected errors see it, with white noise of this standard deviation."""
+    record = SimpleNamespace(kept=None, time=np.arange(sensitivity.shape[1]), periodic=True)
+    entry = noise_entry()
+    entry = replace(entry, average=replace(entry.average, sigma=noise, noise=noise))
+    nothing = np.zeros((1, 0, sensitivity.shape[1]))
+    weights = np.array([weight])
+    return entry, _LinearisedRun.of(record, ([entry], nothing), sensitivity[None], weights)
+
+
+def test_a_fitted_run_leaves_what_its_degrees_of_freedom_say():
+    """White noise, weighted as it is: the residual's square is ``1 - l/n`` of the noise's."""
+    sensitivity, noise = linear_run(np.random.default_rng(0)), 0.7
+    entry, run = reduced_run(sensitivity, noise, noise**-2)
+    response = noise**2 * np.linalg.inv(sensitivity @ sensitivity.T)
+    left = _left(entry, run, 0, response, response, SearchPolicy())
+    assert left.expected_error**2 == pytest.approx(noise**2 * (1 - 3 / 60))
+
+
+def test_estimates_scatter_by_the_noise_that_there_is(monkeypatch):
+    """The estimator took half its standard deviation for it: ``White``'s covariance is right."""
+    sensitivity, noise = linear_run(np.random.default_rng(1)), 0.7
+    entry, _ = reduced_run(sensitivity, noise, 1.0)
+    names = ("a", "b", "c")
+    stated = (noise / 2) ** 2 * np.linalg.inv(sensitivity @ sensitivity.T)
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(names=names),
+        point=SimpleNamespace(covariance=stated, variance=np.array([(noise / 2) ** 2])),
+        predictor=SimpleNamespace(layout=SimpleNamespace(names=names)),
+        predictions=[SimpleNamespace(sensitivity=sensitivity[None])],
+        policy=SearchPolicy(),
+    )
+    record = SimpleNamespace(kept=None, time=np.arange(60), periodic=True, label="a")
+    fitted_run = SimpleNamespace(record=record, status=SimpleNamespace(ok=True))
+    compared = ([entry], np.zeros((1, 0, 60)))
+    _, known = expected_of_fitted(fit, [fitted_run], [compared])
+    np.testing.assert_allclose(known[""].of(names), 4 * stated, rtol=1e-9)
+
+
+def test_a_parameter_of_a_run_makes_up_for_errors_of_shared_ones():
+    """Estimated again on the run, it moves as least squares of the shared ones' change says."""
+    sensitivity = linear_run(np.random.default_rng(2))
+    _, run = reduced_run(sensitivity, 0.7, 0.7**-2)
+    own = np.array([False, True, False])
+    layout = SimpleNamespace(parameters=("a", "b", "c"))
+    parameter = SimpleNamespace(measured=False)
+    model = SimpleNamespace(parameters=dict.fromkeys("abc", parameter))
+    response, moved = _own_response(SimpleNamespace(layout=layout, model=model), run, own)
+    wrong = np.array([0.3, 0.0, -2.0])
+    shift = np.linalg.lstsq(sensitivity[own].T, -wrong @ sensitivity)[0][0]
+    np.testing.assert_allclose(moved @ wrong, [0.3, shift, -2.0], rtol=1e-9)
+    assert response[1, 1] == pytest.approx(0.49 / (sensitivity[1] @ sensitivity[1]))

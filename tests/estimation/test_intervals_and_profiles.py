@@ -9,6 +9,7 @@ from scipy import stats
 from bayesoleo.error_models._independent import output_counts
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import FunctionProblem, estimate, log_posterior
+from bayesoleo.estimation._identifiability import over_variances
 from bayesoleo.estimation._intervals import (
     linearised_covariance,
     linearised_intervals,
@@ -18,7 +19,7 @@ from bayesoleo.estimation._objectives import curvature, prior_precision
 from bayesoleo.estimation._problem import Held
 from bayesoleo.estimation._profile_likelihood import profile
 from bayesoleo.model._correlated_priors import JointNormal
-from bayesoleo.model._priors import LogNormal, Normal, Uniform
+from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal, Uniform
 
 SIZE = 40
 
@@ -218,3 +219,37 @@ def test_bad_requests_are_named(bent):
         linearised_intervals(problem, point, "sandwich")
     with pytest.raises(InputError, match="one of: size, rate"):
         profile(problem, point, ["speed"])
+
+
+@pytest.mark.parametrize("value", [0.6, 1.7, 3.0])
+def test_precision_of_a_prior_that_is_not_normal_is_its_curvature(value):
+    """Log-normal: second derivative by hand; truncated: that of the normal density inside."""
+    away = np.log(value / 2.0)
+    exact = ((1 - away) / 0.3**2 - 1) / value**2
+    priors = [LogNormal(2.0, 0.3), TruncatedNormal(1.0, 0.8, 0.0, 9.0)]
+    found = np.diag(prior_precision(priors, np.array([value, value])))
+    # By second differences over 1e-3 sd; nowhere negative.
+    np.testing.assert_allclose(found, [max(exact, 0.0), 0.8**-2], rtol=1e-4)
+
+
+def test_information_with_the_variances_following_is_the_block_of_the_inverse():
+    rows = np.random.default_rng(3).standard_normal((9, 5))
+    whole = rows.T @ rows
+    alone = np.linalg.inv(np.linalg.inv(whole)[:3, :3])
+    np.testing.assert_allclose(over_variances(whole, 3), alone, rtol=1e-9)
+
+
+def test_curvature_in_the_variances_away_from_their_optimum(line):
+    """``n / (2 v^2)`` holds where ``v = M / n`` only; here by differences of the objective."""
+    problem, _, point = line
+    counts, sums = output_counts(problem.counts), np.array([SIZE * point.variance[0]])
+
+    def objective(v):
+        return log_posterior(sums, np.array([v]), counts, problem.priors, point.theta)
+
+    for v in (0.6 * point.variance[0], 1.7 * point.variance[0]):
+        step = 1e-3 * v
+        second = (objective(v + step) - 2 * objective(v) + objective(v - step)) / step**2
+        found = curvature(problem, point.theta, np.array([v]))[3, 3]
+        # Differences over a thousandth: 1e-6 of the fourth derivative, about 20 here.
+        assert found == pytest.approx(-second, rel=1e-4)

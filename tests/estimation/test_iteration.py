@@ -299,3 +299,26 @@ def test_a_step_is_not_shortened_below_what_is_to_be_resolved():
     assert resolved.theta == pytest.approx(patient.theta)
     assert not resolved.status.ok
     assert resolved.evaluations < patient.evaluations / 2
+
+
+def test_an_unknown_of_value_zero_is_known_by_its_standard_deviation():
+    """Each step leaves an eighth of the error: against the value none would ever be small."""
+    y = np.concatenate([np.full(25, 1.0), np.full(25, -1.0)])
+    problem = FunctionProblem(
+        lambda x, t: t[0] * x, np.ones(50), y, [Normal(0.0, 1e4)], start=[0.5],
+        jacobian=lambda x, _: 9 / 8 * x[:, None],
+    )  # fmt: skip
+    point = estimate(problem, "mbe", tolerance=1e-4)
+    assert point.status is Status.CONVERGED
+    # 3.5 standard deviations, an eighth each, fall to the tolerance in five iterations.
+    assert point.iterations <= 7
+    assert abs(point.theta[0]) < 1e-4
+
+
+@pytest.mark.parametrize("method", ["mbe", "be"])
+def test_a_limit_is_reached_however_loose_the_tolerance(method):
+    """Steps towards it become small because it cuts them, not because the optimum is near."""
+    problem = decay_problem([Normal(1, 1), Uniform(0.0, 1.2)])
+    point = estimate(problem, method, tolerance=0.05)
+    assert point.on_limit == ("rate",)
+    assert point["rate"] == pytest.approx(1.2, abs=1e-8)

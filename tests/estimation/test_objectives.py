@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import minimize
 
+from bayesoleo.error_models._full import GivenErrors, ProfiledFullErrors
+from bayesoleo.error_models._independent import ProfiledIndependentErrors
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import OBJECTIVES, Evaluation, Misfit, estimate
 from bayesoleo.model._priors import Normal
@@ -177,3 +180,47 @@ def test_unweighted_intervals_hold_although_the_weights_are_wrong():
 def test_bad_input_says_what_to_write(problem, options, message):
     with pytest.raises(InputError, match=message):
         estimate(problem, **options)
+
+
+def test_one_variance_for_all_samples_is_the_same_by_sample():
+    """Of two outputs with unlike numbers of samples, or of a covariance between them."""
+    rng, counts = np.random.default_rng(0), np.array([30, 30])
+    variances, residual = (0.5, 3.0), tuple(rng.normal(size=(2, 30)))
+    evaluation = Evaluation(residual, tuple(np.ones((30, 1)) for _ in residual), Status.CONVERGED)
+    by_sample = GivenErrors.of([np.full(30, v) for v in variances], 2)
+    pairs = zip(variances, residual, strict=True)
+    exact = sum(stats.norm(0, v**0.5).logpdf(e).sum() for v, e in pairs)
+    exact += 30 * np.log(2 * np.pi)  # the constant is left out
+    for errors in (by_sample, GivenErrors.of(variances, 2), GivenErrors.of(np.diag(variances), 2)):
+        found = errors.log_likelihood(errors.moments(evaluation), np.zeros(0), counts)
+        assert found == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("errors", [ProfiledFullErrors(), ProfiledIndependentErrors()])
+def test_what_is_eliminated_is_the_difference_of_two_curvatures(errors):
+    """Of the likelihood with its covariance held, and with it following; linear outputs."""
+    rng, counts, n = np.random.default_rng(1), np.array([40, 40]), 40
+    sensitivity, y = tuple(rng.normal(size=(2, n, 3))), rng.normal(size=(2, n)) + 1.0
+    y[1] += 0.8 * y[0]
+
+    def at(theta):
+        residual = tuple(e - j @ theta for e, j in zip(y, sensitivity, strict=True))
+        return Evaluation(residual, sensitivity, Status.CONVERGED)
+
+    def height(theta, held=None):
+        moments = errors.moments(at(theta))
+        covariance = errors.stage(moments, counts, 3, False) if held is None else held
+        return errors.log_likelihood(moments, covariance, counts)
+
+    here, step = np.array([0.1, -0.3, 0.2]), 1e-3
+    staged = errors.stage(errors.moments(at(here)), counts, 3, False)
+    difference = np.empty((3, 3))
+    for i, j in np.ndindex(3, 3):
+        corners = 0.0
+        for p, q in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            theta = here + step * (p * np.eye(3)[i] + q * np.eye(3)[j])
+            corners += p * q * (height(theta) - height(theta, staged))
+        difference[i, j] = corners / (4 * step**2)
+    found = errors.eliminated(at(here), np.ones(3), staged, counts)
+    # Second differences over 1e-3: rounding of heights near 100, and the fourth derivative.
+    np.testing.assert_allclose(found, difference, atol=1e-3 * np.abs(difference).max())

@@ -232,3 +232,32 @@ def test_units_of_any_size_are_compared_alike():
     # the vague run moves the mean of the force by nothing
     three = pooled(y[:3], S[:3], names=["force", "gap"], runs=runs[:3])
     assert view.mean[0] == pytest.approx(three.mean[0], abs=0.05)
+
+
+def test_a_run_given_all_is_known_as_its_normal_posterior_says():
+    """With the spread held, runs and their mean are normal together; the mean's prior is flat."""
+    _, y = drawn(np.random.default_rng(5), 5, ERROR, SPREAD)
+    S = np.repeat(ERROR[None], 5, axis=0) * np.array([0.3, 1.0, 1.0, 2.0, 4.0])[:, None, None]
+    found = pooled(y, S, names=["a", "b"], runs=list("vwxyz"))
+    unit = np.sqrt(np.diag(ERROR))
+    T = np.linalg.inv(found.spread_covariance / np.outer(unit, unit))
+    precision, right = np.zeros((12, 12)), np.zeros(12)
+    for k in range(5):
+        own, rows = np.linalg.inv(S[k] / np.outer(unit, unit)), slice(2 * k, 2 * k + 2)
+        precision[rows, rows] += own + T
+        precision[rows, 10:] -= T
+        precision[10:, rows] -= T
+        precision[10:, 10:] += T
+        right[rows] = own @ (y[k] / unit)
+    covariance = np.linalg.inv(precision)
+    np.testing.assert_allclose(found.shrunken / unit, (covariance @ right)[:10].reshape(5, 2))
+    sd = np.sqrt(np.diag(covariance))[:10].reshape(5, 2)
+    np.testing.assert_allclose(found.shrunken_sd / unit, sd, rtol=1e-6)
+
+
+def test_a_new_run_scatters_by_its_spread_and_by_the_error_of_the_mean():
+    """Without errors of the runs: as a further value of a normal sample."""
+    y = np.array([[1.0], [1.4], [0.7], [1.3]])
+    found = pooled(y, np.full((4, 1, 1), 1e-14), names=["a"], runs=list("wxyz"))
+    expected = np.std(y, ddof=1) * np.sqrt(1 + 1 / 4)
+    assert found.new_run_sd[0] == pytest.approx(expected, rel=1e-5)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bayesoleo.estimation import Evaluation, FunctionProblem, estimate
+from bayesoleo.estimation._least_squares import WhitenedEquations
 from bayesoleo.model._priors import Normal
 from bayesoleo.solvers._orbit import Status
 
@@ -160,3 +161,15 @@ def test_the_shortest_of_many_steps_is_taken(method):
     np.testing.assert_allclose(
         point.theta, [1.0 + (total - 1.5) / 2, 0.5 + (total - 1.5) / 2], rtol=1e-6
     )
+
+
+def test_the_gain_of_a_step_is_that_of_the_quadratic_that_it_solves():
+    """Half the squares before less those after, and what the prior's slope adds."""
+    rng = np.random.default_rng(0)
+    jacobian, residual, slope = rng.normal(size=(9, 3)), rng.normal(size=9), rng.normal(size=3)
+    nowhere = (np.full(3, np.inf), np.full(3, np.inf))
+    equations = WhitenedEquations(jacobian, residual, slope, nowhere, np.eye(3), np.zeros(3))
+    for step in rng.normal(size=(4, 3)):
+        after = residual - jacobian @ step
+        gain = 0.5 * (residual @ residual - after @ after) + slope @ step
+        assert equations.expected_gain(step) == pytest.approx(gain, rel=1e-12)

@@ -12,7 +12,7 @@ from bayesoleo.discovery._inference import error_model_by
 from bayesoleo.discovery._signatures import Lines, colour_of
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures, error_model
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._catalogue_discrepancy import ALONE
+from bayesoleo.error_models._catalogue_discrepancy import ALONE, REMAINDERS
 from bayesoleo.error_models._correlated import covariance
 from bayesoleo.error_models._signatures import (
     POINTS,
@@ -257,3 +257,31 @@ def test_signatures_can_be_left_out():
     np.testing.assert_array_equal(left.single, [0])
     np.testing.assert_array_equal(left.columns[0], given.columns[0][:, [0, 1, 3]])
     assert replace(given, columns=()).without_columns().columns == ()
+
+
+def test_evidence_of_more_than_noise_is_that_of_dense_covariances():
+    """Unknowns integrated out, the noise's level the most likely one for each size."""
+    campaign = campaign_of(("force", "pressure"), (41, 60), 0.5, (WHITE, WHITE), 0)
+    model, rng, unknowns = error_model("catalogue", campaign), np.random.default_rng(3), 3
+    columns, residual = (
+        [[draw(n) for _ in campaign.outputs] for n in campaign.lengths]
+        for draw in (lambda n: rng.standard_normal((unknowns, n)), rng.standard_normal)
+    )
+    precision, pull = np.diag([0.1, 1.0, 10.0]), np.array([0.5, -1.0, 3.0])
+    found = model.linearised(columns, residual, precision, pull)
+    rows = flat(campaign, columns)
+    e = np.concatenate([part for run in residual for part in run])
+    heights = []
+    for size in (0.0, *REMAINDERS):
+        matrix = np.eye(e.size)
+        if size:
+            matrix = dense(campaign, model, model.coordinates(np.array([[0.0, 0.0, size]]))[0])
+        weighted = np.linalg.solve(matrix, np.vstack([rows, e]).T)
+        information, right = rows @ weighted[:, :-1] + precision, rows @ weighted[:, -1] + pull
+        left = e @ weighted[:, -1] - right @ np.linalg.solve(information, right)
+        logs = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(information)[1]
+        heights.append(-0.5 * (e.size * np.log(left) + logs))
+    odds = logsumexp(heights[1:]) - np.log(len(heights)) - heights[0]
+    assert found.log_odds == pytest.approx(odds, rel=1e-9)
+    centre = np.linalg.solve(rows @ rows.T + precision, rows @ e + pull)
+    np.testing.assert_allclose(found.shift, centre, atol=0.05)

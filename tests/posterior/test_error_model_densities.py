@@ -211,6 +211,19 @@ def test_correlations_are_uniform_over_all_matrices():
     assert weight.mean() == pytest.approx(1.0, abs=5 * weight.std() / 200)
 
 
+def test_the_density_of_correlations_is_the_same_everywhere():
+    """Uniform over matrices: less the stretch of the coordinates, all points are alike."""
+    model, step = error_model("full", Campaign(outputs=("a", "b", "c"))), 1e-5
+    densities = []
+    for z in np.random.default_rng(2).normal(0, 1.0, (6, 3)):
+        eta = np.concatenate([np.zeros(3), z])
+        ends = [model.natural(eta + sign * step * np.eye(6)[3:])[:, 3:] for sign in (1, -1)]
+        stretch = np.linalg.slogdet((ends[0] - ends[1]) / (2 * step))[1]
+        densities.append(model.log_prior(eta[None])[0] - stretch)
+    # The volume of all correlation matrices of three outputs is pi^2 / 2.
+    np.testing.assert_allclose(densities, -np.log(np.pi**2 / 2), atol=1e-6)
+
+
 def test_what_does_not_suit_is_refused():
     with pytest.raises(InputError, match="did you mean correlated"):
         error_model("corelated", Campaign())

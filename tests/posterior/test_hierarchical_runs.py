@@ -180,3 +180,20 @@ def test_a_bounded_parameter_scatters_in_its_logarithm():
 def test_what_cannot_scatter_is_refused(name, runs, match):
     with pytest.raises(InputError, match=match):
         hierarchical(problem_of(0.4, runs=runs), [name])
+
+
+def test_coordinates_are_conditional_means_and_deviations():
+    """Gelman et al. (2013), section 5.4: normal measurements of a run's value, and of the mean."""
+    population = density_of(problem_of(0.4)).unknowns.populations[0]
+    centres, spread = population.conditional_centres(np.array([[1.4]])), np.array([0.7])
+    for k, sd in enumerate(population.sds):
+        middle, width = population.run_given(k, np.array([0.2]), spread, centres)
+        precision = sd**-2 + 0.7**-2
+        assert width[0] == pytest.approx(precision**-0.5)
+        assert middle[0] == pytest.approx((centres[0, k] / sd**2 + 0.2 / 0.7**2) / precision)
+    weight = 1 / (population.sds**2 + 0.7**2)
+    precision = weight.sum() + population.scale**-2
+    middle, width = population.mean_given(spread, centres)
+    assert width[0] == pytest.approx(precision**-0.5)
+    pulled = weight @ centres[0] + population.middle / population.scale**2
+    assert middle[0] == pytest.approx(pulled / precision)

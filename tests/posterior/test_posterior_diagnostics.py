@@ -12,6 +12,7 @@ from bayesoleo.posterior._diagnostics import (
     nested_rhat,
     rhat_limit,
 )
+from bayesoleo.posterior._sampler import Quality, Schedule
 
 
 def autoregressive(coefficient: float, chains: int = 32, draws: int = 2000, seed: int = 0):
@@ -75,3 +76,37 @@ def test_a_point_beside_draws():
     np.testing.assert_allclose(comparison["shift"], [2.0, 0.0], atol=0.05)
     np.testing.assert_allclose(comparison["sd_ratio"][0], [2.0, 2.0], atol=0.05)
     np.testing.assert_allclose(comparison["skewness"], [0.0, 2.0], atol=0.2)
+
+
+def test_walkers_that_never_leave_their_modes_are_worth_one_draw_each():
+    """Their autocovariance is the same at all lags, however few products it is made of."""
+    draws = np.repeat(np.repeat([-1.0, 1.0], 16)[:, None], 200, axis=1)[:, :, None]
+    assert draws.size / autocorrelation_time(draws)[0] == pytest.approx(32, rel=0.01)
+
+
+def test_ensembles_that_agree_pass_the_limit():
+    """R-hat of 20 000 groups of four ensembles, whose means scatter by 100 effective draws each."""
+    means = np.random.default_rng(1).standard_normal((20_000, 4)) / np.sqrt(100)
+    rhat = np.sqrt(1 + np.var(means, axis=1, ddof=1))
+    # The limit is a quantile of 99.9 %: 20 above it, and 4.5 more or less.
+    assert 2 <= np.sum(rhat > rhat_limit(4, 400)) <= 38
+
+
+ONCE = Schedule(1000.0, 10**6, 20, 6, 50, 20.0, 100)
+
+
+@pytest.mark.parametrize(
+    ("times", "sizes", "rhat", "draws", "short"),
+    [
+        ((2.0, 5.0), (1500.0, 1001.0), (1.0, 1.005), 100, ""),
+        ((2.0, 5.1), (1500.0, 1001.0), (1.0, 1.005), 100, "100 draws are fewer"),
+        ((2.0, 5.0), (1500.0, 999.0), (1.0, 1.005), 100, "the effective size is 999"),
+        ((2.0, 5.0), (1500.0, 1001.0), (1.0, 1.2), 100, "the ensembles disagree"),
+        ((2.0, np.nan), (1500.0, 1001.0), (1.0, 1.0), 100, "never moved"),
+    ],
+)
+def test_sampling_goes_on_until_the_worst_quantity_is_known(times, sizes, rhat, draws, short):
+    quality = Quality(np.array(times), np.array(sizes), np.array(rhat), draws)
+    found = quality.shortfalls(ONCE, 4)
+    assert len(found) == bool(short)
+    assert short in " ".join(found)

@@ -8,6 +8,7 @@ from scipy import stats
 from bayesoleo.error_models._fitting import climb, derivatives
 from bayesoleo.errors import InputError
 from bayesoleo.posterior import Mixture, importance_sample
+from bayesoleo.posterior._laplace import Weighted, _weights
 
 TAILS = np.array([0.05, 0.5, 0.95])
 
@@ -127,3 +128,22 @@ def test_the_climb_takes_the_higher_of_two_tops():
 
     found = climb(height, [np.array([1.0, 3.0, 2.0]), np.array([-0.4, -1.0, -2.5])])
     np.testing.assert_allclose(found, -1.5, atol=0.02)
+
+
+def test_a_draw_s_probability_is_the_middle_of_its_step():
+    """Quantiles of a symmetric sample are symmetric, whatever its weights."""
+    draws, weights = np.array([[-2.0], [-1.0], [1.0], [2.0]]), np.array([0.1, 0.4, 0.4, 0.1])
+    found = Weighted(("x",), draws, weights, 3.0, 0.1, 4, True).quantiles([0.2, 0.5, 0.8])
+    assert found[1, 0] == pytest.approx(0.0, abs=1e-12)
+    assert found[0, 0] == pytest.approx(-found[2, 0])
+
+
+def test_draws_of_all_rounds_have_the_mean_of_all_proposals():
+    """The mixture of two far proposals, drawn from both: all draws weigh alike."""
+    rng = np.random.default_rng(0)
+    proposals = [shifted(1, away, 1.0) for away in (-8.0, 8.0)]
+    phi = np.concatenate([one.sample(rng, 400) for one in proposals])
+    height = np.logaddexp(*(one.log_density(phi) for one in proposals))
+    height = height + 1e-6 * rng.standard_normal(800)  # of equal weights a tail has no shape
+    weights, _ = _weights(proposals, phi, height)
+    np.testing.assert_allclose(weights, 1 / 800, rtol=1e-4)

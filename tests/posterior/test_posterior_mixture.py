@@ -8,9 +8,17 @@ from posterior_gas_spring import GasSpring, gas_spring, measured
 from scipy import stats
 
 from bayesoleo.errors import InputError
-from bayesoleo.model._priors import Normal
-from bayesoleo.posterior import LogDensity, Mixture, Mode, find_mode, laplace_mixture
+from bayesoleo.model._priors import LogNormal, Normal, Transforms
+from bayesoleo.posterior import (
+    LogDensity,
+    Mixture,
+    Mode,
+    _laplace as laplace,
+    find_mode,
+    laplace_mixture,
+)
 from bayesoleo.posterior._laplace import gauss_newton_covariance, mixture_of
+from bayesoleo.posterior._log_density import prior_curvature
 from bayesoleo.posterior._mixture import DEGREES_OF_FREEDOM
 from bayesoleo.solvers._orbit import Status
 
@@ -149,3 +157,29 @@ def test_a_mode_a_hundred_standard_deviations_away_is_reached():
     # Newton's method stops at steps of a thousandth of a standard deviation.
     off = (found.centre - near.centre) / np.sqrt(np.diag(near.covariance))
     np.testing.assert_allclose(off, 0.0, atol=2e-3)
+
+
+def test_the_weight_of_a_normal_mode_is_its_integral(monkeypatch):
+    """Laplace's approximation is exact there: of a density times e^3 the integral is e^3."""
+    covariance = np.array([[2.0, 0.3, 0.0], [0.3, 0.5, 0.1], [0.0, 0.1, 0.05]])
+    normal = stats.multivariate_normal([1.0, -2.0, 0.5], covariance)
+    monkeypatch.setattr(laplace, "gauss_newton_covariance", lambda *_: 0.3 * np.eye(3))
+    mode = find_mode(lambda rows: (normal.logpdf(rows) + 3.0, None), np.zeros(3))
+    assert mode.status is Status.CONVERGED
+    np.testing.assert_allclose(mode.covariance, covariance, rtol=1e-6, atol=1e-9)
+    assert mode.log_weight == pytest.approx(3.0, abs=1e-6)
+
+
+def test_modes_three_standard_deviations_apart_are_two():
+    def at(place):
+        return Mode(np.array([place]), np.eye(1), 0.0, Status.CONVERGED)
+
+    assert len(mixture_of([at(0.0), at(3.0)]).centres) == 2
+    assert len(mixture_of([at(0.0), at(0.3)]).centres) == 1
+
+
+def test_the_curvature_of_a_normal_prior_is_its_precision():
+    priors = [Normal(1.0, 2.0), LogNormal(3.0, 0.4)]
+    found = prior_curvature(priors, Transforms.of(priors), np.array([0.3, np.log(2.0)]))
+    # A log-normal prior is normal in the logarithm.
+    np.testing.assert_allclose(found, [1 / 4, 1 / 0.16], rtol=1e-9)

@@ -134,3 +134,44 @@ def test_acceptance_is_counted():
     second_moment(move, 2, 1.0, groups=2, steps=5)
     assert move.proposed == 5 * 24
     assert 0 < move.accepted < move.proposed
+
+
+class Remembered:
+    """A move that keeps what it was given, and stays where it is with a log ratio of ours."""
+
+    nsplits = 2
+
+    def __init__(self, ratio=0.0):
+        self.ratio, self.seen = ratio, []
+
+    def setup(self, coords):
+        pass
+
+    def get_proposal(self, sample, complement, random):
+        self.seen.append((sample, np.concatenate(complement)))
+        return sample + 0.0, np.full(len(sample), self.ratio)
+
+
+def test_a_walker_moves_by_the_others_of_its_ensemble_alone():
+    """Its half and the other one are the ensemble, and share no walker."""
+    move = Remembered()
+    coords = np.arange(32.0)[:, None]
+    halves = np.tile([0, 1], 16)
+    Grouped(move, 2)._proposals(coords, halves, 0, np.random.RandomState(0))
+    for first, (sample, others) in zip((0, 16), move.seen, strict=True):
+        mine = np.arange(first, first + 16)
+        assert sorted(np.concatenate([sample, others])[:, 0]) == list(mine)
+        assert not set(sample[:, 0]) & set(others[:, 0])
+
+
+def test_a_proposal_is_accepted_with_its_ratio():
+    """One that changes no density and has a log ratio of -1: accepted in 1/e of all cases."""
+    each = 2000
+    move = Grouped(Remembered(-1.0), 2)
+    sampler = emcee.EnsembleSampler(
+        2 * each, 1, lambda x: np.zeros(len(x)), moves=move, vectorize=True
+    )
+    start = np.random.RandomState(1).standard_normal((2 * each, 1))
+    sampler.run_mcmc(start, 1, skip_initial_state_check=True)
+    # Of 4000 a share scatters by 0.8 %.
+    assert sampler.acceptance_fraction.mean() == pytest.approx(np.exp(-1), abs=0.03)

@@ -108,3 +108,16 @@ def test_without_effective_numbers_it_says_what_to_write():
     problem = linear_runs([np.zeros((1, 30))] * 2, levels=[0.0] * 2, by_run=False)
     with pytest.raises(InputError, match=r"problem\.effective = effective_samples"):
         LogDensity(problem, errors="power")
+
+
+@pytest.mark.parametrize("periods", [3, 8])
+@pytest.mark.parametrize("per_period", [400, 97])
+def test_a_curve_that_repeats_exactly_is_worth_one_period(periods, per_period):
+    """All of it repeats: each further period tells nothing, whatever its samples resemble."""
+    curve = np.random.default_rng(6).standard_normal(per_period)
+    when = RunSamples(np.arange(per_period * periods) / per_period, 1.0)
+    whole = np.tile(curve, periods)
+    found = effective_samples([whole[None]], [when])[0, 0]
+    own, again = autocorrelation_time([whole]), autocorrelation_time([curve])
+    assert found == pytest.approx(whole.size / (own + (periods - 1) * again), rel=1e-6)
+    assert found <= 1.1 * per_period

@@ -2,14 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from bayesoleo import system
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction._orbits import periodic_orbit
 from bayesoleo.prediction._simulate import RunPlan, motion
-from bayesoleo.solvers import _shooting as shoot
+from bayesoleo.solvers import _error_estimate as errors, _shooting as shoot
+from bayesoleo.solvers._mesh import Mesh, tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import SOLVERS
+from bayesoleo.solvers._switched import Level, PeriodicProblem
 
 OWN = SOLVERS[:-1]
 PHASES = np.arange(4096) / 4096
@@ -200,3 +203,63 @@ def test_pulses_are_seen_in_long_steps_too():
         assert true_error(found, exact) < 1e-7
     else:
         assert found.orbits[0].error > 0.1 * true_error(found, exact)
+
+
+class Rates:
+    """``q' = u``, or ``q'' = u``: what is missed between stages is an error of quadrature."""
+
+    def jacobian(self, z, u, p, lanes, g, gz):
+        for lane in lanes:
+            g[lane, 0] = z[lane, -1] - u[0]
+            gz[lane] = 0.0
+            gz[lane, 0, -1] = 1.0
+
+    def admissible(self, *_):
+        raise AssertionError("there are no conditions")
+
+
+def forcing(phase):
+    return np.stack([np.exp(3.0 * phase)])
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_what_is_missed_between_stages_is_the_error_of_quadrature(order):
+    """Of the rate, and of the position that it leads to: integrals against sums over stages."""
+    method, mesh, period = tableau("radau2"), Mesh(np.array([0.0, 0.4, 1.0])), 2.0
+    problem = PeriodicProblem(Rates(), (order,), period, forcing)
+    boundary = problem.on(method, mesh)
+    rate = forcing(mesh.points(method.c))[0]
+    rows = np.zeros((order + 1, 2 * method.stages))
+    rows[-1] = rate
+    x = boundary.scheme.from_motion(np.zeros((1, order + 1, 2)), rows[None])[0]
+    level = Level(boundary, x, Status.CONVERGED, None, 0)
+    look = errors._look(problem, level, np.zeros(0), 64)
+    for step, (low, high) in enumerate(zip(mesh.edges[:-1], mesh.edges[1:], strict=True)):
+        h = (high - low) * period
+        stages = forcing(low + (high - low) * method.c)[0]
+        exact = quad(lambda s: forcing(s)[0] * period, low, high)[0]
+        missed = exact - h * method.b @ stages
+        assert abs(missed) > 1e-4
+        assert look.jumps[order - 1, step] == pytest.approx(missed, rel=1e-6)
+        if order == 2:
+            ahead = (
+                period**2
+                * quad(lambda s, end: (end - s) * forcing(s)[0], low, high, args=(high,))[0]
+            )
+            twice = method.weights(np.ones(1))[2][0]  # what a stage's rate moves, over h^2
+            assert look.jumps[0, step] == pytest.approx(ahead - h**2 * twice @ stages, rel=1e-6)
+
+
+def test_the_error_holds_what_is_missed_between_stages(monkeypatch):
+    """Where a Newton step changes nothing, a pulse that no stage sees is all of the error."""
+    mesh, method = Mesh(np.array([0.0, 0.5, 1.0])), tableau("radau2")
+    problem = PeriodicProblem(Rates(), (1,), 1.0, forcing)
+    x = np.zeros((2, 3))
+    level = Level(problem.on(method, mesh), x, Status.CONVERGED, None, 0)
+    change = np.zeros((2, 3, 2))
+    change[1, 0, 1] = -0.06  # what the missed pulse makes of the second state
+    monkeypatch.setattr(errors, "linearised_change", lambda *_, **__: (change, np.zeros((0, 2))))
+    look = errors._Look(np.zeros((1, 2)), np.array([0.01]), np.array([2.0]), np.zeros(2))
+    found, missed = errors._estimate(problem, level, np.zeros(0), level.motion, look, False)
+    assert missed == pytest.approx((0.06 + 0.01) / 2.0)
+    assert found.error == pytest.approx(missed)

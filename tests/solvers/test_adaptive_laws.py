@@ -189,3 +189,19 @@ def test_contacts_are_extrapolated_in_geometric_proportion():
     next_ = extrapolate(kinks(0.5, 0.54), kinks(0.5, 0.52), 1.0)
     contact = np.diff(next_.forward(np.array([0.5, 0.52])))[0]
     assert contact == pytest.approx(0.01, rel=0.02)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.25, 0.5, 0.731])
+def test_what_repeats_crosses_zero_as_often_up_as_down(shift):
+    """The end of a period is its beginning, also where a zero stands on it."""
+
+    def values(phase):
+        return np.sin(2 * np.pi * (phase - shift))[None]
+
+    found = find_crossings(values, equidistant(7))
+    expected = sorted([(shift % 1.0, True), ((shift + 0.5) % 1.0, False)])
+    assert sorted(label for group in found.labels for label in group) == [(0, False), (0, True)]
+    gaps = np.abs(np.sort(found.phases) - [phase for phase, _ in expected])
+    assert np.minimum(gaps, 1.0 - gaps).max() < 1e-12
+    place = np.array([0.11, 0.37, 0.62, 0.93])
+    np.testing.assert_array_equal(found.modes(place)[0], values(place)[0] > 0)

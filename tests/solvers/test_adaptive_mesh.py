@@ -1,6 +1,7 @@
 """Adaptive meshes: the error asked for, kinks that cost no order, and ever stiffer end stops."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from bayesoleo.model._kernels import kernels
 from bayesoleo.prediction._orbits import periodic_orbit
 from bayesoleo.prediction._periodic_solver import periodic_problem
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of
-from bayesoleo.solvers._adaptive_mesh import solve_adaptive
+from bayesoleo.solvers import _adaptive_mesh as mesh_module
+from bayesoleo.solvers._adaptive_mesh import compare, solve_adaptive
 from bayesoleo.solvers._mesh import Mesh, equidistant, tableau
 from bayesoleo.solvers._moving_edges import solve_on
 from bayesoleo.solvers._orbit import Status
@@ -126,3 +128,54 @@ def test_kinks_that_are_not_declared_are_found_by_shorter_steps():
     contact = found.mesh.locate(end_stop(100.0).motions[0].solution.level.kinks.phases[[1, 3]])[0]
     lengths = np.diff(found.mesh.edges)
     assert lengths[contact].max() < 0.2 * lengths.max()
+
+
+def level_of(kinks, motion, steps):
+    """A level as its comparison with a finer one sees it: one state and its rate."""
+    scheme = SimpleNamespace(method=tableau("radau2"), orders=(1,))
+
+    def inside(step, position):
+        return motion(step, position) * np.ones((2, step.size))
+
+    return SimpleNamespace(
+        scheme=scheme, mesh=equidistant(steps), kinks=kinks, inside=inside,
+    )  # fmt: skip
+
+
+def test_a_contact_that_comes_later_is_an_error_of_its_time():
+    coarse, fine = (
+        level_of(SimpleNamespace(phases=np.array([0.3, place])), lambda *_: 1.0, steps)
+        for place, steps in ((0.5, 8), (0.51, 16))
+    )
+    assert compare(coarse, fine).largest == pytest.approx(0.01)
+
+
+def test_an_error_that_a_step_has_not_made_is_not_its_own():
+    """All of the sixth step's change is there at its beginning; the third makes its own."""
+    offset = np.zeros(16)
+    offset[10:12] = 0.3  # the halves of the sixth step
+
+    def finer(step, position):
+        half = np.where(step % 2, 0.5, 0.0) + 0.5 * position
+        return 1.0 + offset[step] + np.where(step // 2 == 2, 0.1 * half, 0.0)
+
+    coarse = level_of(None, lambda *_: 1.0, 8)
+    found = compare(coarse, level_of(None, finer, 16))
+    expected = np.zeros(8)
+    expected[2] = 0.1 / 1.3
+    np.testing.assert_allclose(found.own, expected, atol=1e-12)
+    assert found.largest == pytest.approx(0.3 / 1.3)
+
+
+def test_lengths_of_steps_change_no_faster_than_allowed():
+    """Around the period too, and nowhere are steps longer than was wanted."""
+    rng = np.random.default_rng(0)
+    phase = np.sort(rng.uniform(0, 1, 60))
+    wanted = 10.0 ** rng.uniform(-4, 0, 60)
+    graded = mesh_module._graded(phase, wanted)
+    apart = np.abs(phase[:, None] - phase)
+    apart = np.minimum(apart, 1.0 - apart)
+    change = np.abs(graded[:, None] - graded)
+    assert (change <= mesh_module.GROWTH * apart + 1e-12).all()
+    assert (graded <= wanted + 1e-12).all()
+    assert graded.min() == pytest.approx(wanted.min(), rel=1e-9)

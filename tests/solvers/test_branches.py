@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from periodic_problems import duffing, harmonics, problem, rest
 from scipy.integrate import solve_ivp
 
 from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers import _branches as branches
 from bayesoleo.solvers._branches import follow, solve_limit_cycle
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, solve_periodic
@@ -220,3 +222,40 @@ def test_no_cycle_at_rest():
     still = solve_limit_cycle(boundary, np.array([1.0]), np.zeros_like(x), 6.3)
     assert still.orbit.status is Status.SINGULAR
     assert np.isnan(still.period_theta).all()
+
+
+def test_the_slope_of_a_gap_is_its_derivative(monkeypatch):
+    """By central differences; a branch's direction and the period's derivatives rest on it."""
+
+    def gap(family, x, value):
+        return SimpleNamespace(gap=np.array([np.sin(value), value**2])), None
+
+    monkeypatch.setattr(branches, "sweep", gap)
+    slope = branches._gap_by_value(None, None, 1.3)
+    # Differences over 8e-6: their error is the square.
+    np.testing.assert_allclose(slope, [np.cos(1.3), 2.6], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("multipliers", "stable"),
+    [([1.0, 0.3], True), ([1.0 - 1e-9, -0.99], True), ([3.0, 1.0 - 1e-9], False),
+     ([1.0 + 1e-9, -1.2], False), ([1.0, 0.6 + 0.7j, 0.6 - 0.7j], True),
+     ([1.0 - 1e-9, 0.8 + 0.7j, 0.8 - 0.7j], False)],
+)  # fmt: skip
+def test_a_cycle_is_stable_by_the_multipliers_beside_its_own(multipliers, stable):
+    orbit = SimpleNamespace(multipliers=np.array(multipliers), status=Status.CONVERGED)
+    cycle = branches.LimitCycle(None, orbit, np.zeros(0))
+    assert cycle.stable is stable
+    assert abs(cycle.own - 1.0) < 1e-8
+
+
+def test_a_doubling_is_where_a_multiplier_passes_minus_one():
+    """Not where one passes plus one, whatever the other is."""
+
+    def at(*multipliers):
+        point = branches.BranchPoint(0.0, np.zeros((1, 2)), np.array(multipliers), np.zeros(3))
+        return branches.TESTS["doubling"](point)
+
+    assert at(-0.99, 0.4) > 0 > at(-1.01, 0.4)
+    assert at(-1.0, 0.4) == 0.0
+    assert at(0.99, 0.4) * at(1.01, 0.4) > 0

@@ -133,3 +133,18 @@ def test_lanes_do_not_know_each_other(name):
     for lane in range(7):
         alone = periodic.solve_periodic(boundary, many[lane : lane + 1], start[:1])
         np.testing.assert_array_equal(alone.x[0], together.x[lane])
+
+
+def test_a_residual_falls_in_the_larger_of_its_terms():
+    """Squares of two equations, then of their terms: in all, and against what they were made of."""
+    falls = getattr(newton._reduces, "py_func", newton._reduces)
+    before = np.array([1.0, 4.0, 100.0, 400.0])
+    assert falls(before, np.array([0.25, 1.0, 100.0, 400.0]), 2) == (
+        True,
+        pytest.approx(0.005**0.5),
+    )
+    assert not falls(before, np.array([1.1, 4.0, 100.0, 400.0]), 2)[0]
+    assert falls(before, np.array([0.1, 5.0, 100.0, 400.0]), 2)[0], "what one gains, one may lose"
+    # A start at rest fulfils an equation without terms; it may be left all the same.
+    rest = np.array([1.0, 0.0, 1.0, 0.0])
+    assert falls(rest, np.array([0.1, 0.01, 1.0, 1.0]), 2)[0]

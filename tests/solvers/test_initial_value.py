@@ -10,8 +10,10 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import kernels
+from bayesoleo.solvers import _march as loop
 from bayesoleo.solvers._initial_value import Dynamics, solve_initial_value
 from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._radau_step import radau_method
 from bayesoleo.solvers._switching import InputSignal, evaluate, periodic_signal
 from bayesoleo.systems import system
 
@@ -174,3 +176,32 @@ def test_failures_have_names():
         solve_initial_value(field, p, np.zeros(3), np.array([0.0, 1.0]))
     with pytest.raises(InputError, match=r"times must rise"):
         solve_initial_value(field, p, np.zeros(2), np.array([1.0, 0.0]))
+
+
+@pytest.mark.parametrize("stages", [3, 5])
+def test_the_local_error_vanishes_where_both_quadratures_are_exact(stages):
+    """Hairer and Wanner (1996), eq. IV.8.19: for polynomials of a lower degree than the stages."""
+    method = radau_method(stages)
+    for power in range(stages):
+        at_start = method.gamma * (power == 0)
+        assert at_start + method.error @ method.c**power == pytest.approx(0.0, abs=1e-13)
+    assert abs(method.error @ method.c**stages) > 1e-4, "the next power shows"
+
+
+def paced(size, last, h=0.1, last_h=0.1, stages=3):
+    """Length of the next step after one of length ``h`` whose error over tolerance is ``size``."""
+    pace = np.zeros(5)
+    pace[loop.LAST_ERROR], pace[loop.LAST_LENGTH] = last, last_h
+    getattr(loop.next_length, "py_func", loop.next_length)(pace, size, h, stages)
+    return pace[loop.LENGTH] / h
+
+
+def test_the_next_step_has_the_error_asked_for():
+    """An error that goes with the fourth power of the step, its coefficient constant or growing."""
+    for size in (0.2, 0.05, 1e-3):
+        factor = paced(size, size)
+        assert size * factor**4 == pytest.approx(0.9**4, rel=1e-9)
+    # From step to step the coefficient grew threefold, and is foreseen to grow so once more.
+    assert 0.3 * 3.0 * paced(0.3, 0.1) ** 4 == pytest.approx(0.9**4, rel=1e-9)
+    # Where it shrinks the present one is counted with: the step is none too long.
+    assert paced(0.1, 0.3) == pytest.approx(paced(0.1, 0.1), rel=1e-9)

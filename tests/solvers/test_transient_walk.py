@@ -11,7 +11,7 @@ from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._mesh import equidistant, tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary
-from bayesoleo.solvers._transient import newton, solve_transient
+from bayesoleo.solvers._transient import _carried, newton, solve_transient
 
 STEPS, TIME = 1024, 40.0
 
@@ -47,3 +47,15 @@ def test_a_bad_start_leads_to_the_same_motion(problem):
     np.testing.assert_allclose(walked.x, solved.x, atol=1e-8 * np.abs(solved.x).max())
     # What is solved of a piece is kept, and not solved again with the next, shorter one.
     assert walked.iterations[0] < 8 * STEPS
+
+
+def test_without_a_force_a_velocity_moves_on_and_a_state_of_first_order_stays():
+    """Rows of a motion whose highest derivatives are zero: each is the next one's integral."""
+    start = np.array([[[0.3, -1.0], [2.0, 0.5], [7.0, 4.0]]])  # position, velocity, temperature
+    time = np.array([0.0, 0.5, 3.0])
+    position, velocity, force, heat, rate = np.moveaxis(_carried((2, 1), time, start)[0], 0, 0)
+    np.testing.assert_allclose(position, start[0, 0, :, None] + start[0, 1, :, None] * time)
+    np.testing.assert_allclose(velocity, np.repeat(start[0, 1, :, None], 3, axis=1))
+    np.testing.assert_allclose(heat, np.repeat(start[0, 2, :, None], 3, axis=1))
+    assert not force.any()
+    assert not rate.any()
