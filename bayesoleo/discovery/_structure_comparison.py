@@ -25,7 +25,6 @@ from bayesoleo.discovery._structure_evidence import (
     Likelihood,
     Reduced,
     Remainders,
-    by_side,
     effect_evidence,
     fewer,
     log_difference,
@@ -270,8 +269,7 @@ class _At:
         parts = self.remainders.parts(self.reduced, [*own, *columns], self.law)
         if not own:
             return [parts]
-        groups = [group.columns for group in self.own]
-        return [parts.with_effects(groups, sizes) for sizes in self._own_sizes()]
+        return [parts.with_effects(self.own, sizes) for sizes in self._own_sizes()]
 
     def _own_sizes(self) -> list[tuple[float, ...]]:
         """Sizes of the anchor's own effects, over a grid."""
@@ -305,7 +303,9 @@ def evidences_about(
     tried = [key for key in columns.curves if best_curves is None or key in best_curves]
     at = _anchored(anchor, comparison, columns, beside, tried)
     own = frozenset(anchor.effects)
-    totals = np.stack([at.likelihood(p.square, p.log_det) for p in at.parts([])], axis=1)
+    totals = np.stack(
+        [at.likelihood(p.square, p.log_det) + p.log_moment for p in at.parts([])], axis=1
+    )
     found: Evidences = {}
     for outside, value in zip((False, True), at.remainders.split(totals), strict=True):
         found[own, outside] = mean_of(value)
@@ -327,26 +327,7 @@ def evidences_about(
         # tried here explain next to nothing.
         total = logsumexp(list(curves.values())) - np.log(len(columns.curves))
         found[own, True] = float(np.logaddexp(found[own, True], total) - _LOG_2)
-    # Where both signs are possible, an anchor has the one of its estimate.
-    side = _side_of_own(anchor, comparison)
-    return Reached(
-        {key: value + side for key, value in found.items()},
-        curves,
-        {pair: value + side for pair, value in similar.items()},
-    )
-
-
-def _side_of_own(anchor: EstimatedModel, comparison: Comparison) -> float:
-    """What the prior of its effects' signs adds to the evidence of an anchor."""
-    names, point = list(anchor.fit.problem.names), anchor.fit.point
-    total = 0.0
-    for score in (*comparison.scores, *comparison.later):
-        own = anchor.effects.get(score.option.key, ())
-        if len(own) == 1 and own[0] in names:
-            k = names.index(own[0])
-            distance = point.theta[k] / np.sqrt(point.covariance[k, k])
-            total += float(by_side(positive_part(score), distance))
-    return total
+    return Reached(found, curves, similar)
 
 
 def _like_own(at: _At, effects: Sequence[Added], totals: Array) -> Similar:
@@ -485,7 +466,7 @@ def _anchored(
     rows = [here.residual[None], unknowns, own * scale, columns.rows[index], columns.law]
     remainders, sizes = grids_of(comparison, data.signal(fit))
     products, logs = remainders.covariances.products(np.concatenate(rows))
-    count, effects = len(own) + len(index), own_groups(anchor)
+    count, effects = len(own) + len(index), own_groups(anchor, comparison)
     reduced = Reduced.of(products, logs, len(unknowns), offset)
     every = [effects, *groups.values(), *curves.values()]
     return _At(
@@ -515,12 +496,14 @@ def _hidden(reduced: Reduced, groups: Sequence[Group], samples: int) -> Array:
     return factors
 
 
-def own_groups(anchor: EstimatedModel) -> tuple[Group, ...]:
+def own_groups(anchor: EstimatedModel, comparison: Comparison) -> tuple[Group, ...]:
     """Columns of each of an anchor's effects, in the order of :func:`linearised`."""
+    scores = {s.option.key: s for s in (*comparison.scores, *comparison.later)}
     found, start = [], 0
-    for names in anchor.effects.values():
+    for key, names in anchor.effects.items():
         size = sum(name.split("[")[0] in names for name in anchor.fit.problem.names)
-        found.append(Group(tuple(range(start, start + size))))
+        positive = positive_part(scores[key]) if size == 1 and key in scores else 0.5
+        found.append(Group(tuple(range(start, start + size)), positive))
         start += size
     return tuple(found)
 

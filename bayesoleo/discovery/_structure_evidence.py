@@ -29,9 +29,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
-from scipy.special import erfcx, log_ndtr, logsumexp
+from scipy.special import erfcx, logsumexp
 
 from bayesoleo._types import Array, Integers
 
@@ -139,12 +140,15 @@ class Reduced:
         ``C' V^-1 e``.
     square, log_det : ndarray, shape (P,)
         ``e' V^-1 e`` and ``ln det V``.
+    own : Amplitudes, optional
+        Of effects that act in the covariance (:meth:`with_effects`).
     """
 
     gram: Array
     slope: Array
     square: Array
     log_det: Array
+    own: Amplitudes | None = None
 
     @classmethod
     def of(cls, products: Array, log_det: Array, unknowns: int, offset: Array) -> Reduced:
@@ -191,33 +195,38 @@ class Reduced:
             self.slope[np.ix_(kept, chosen)],
             self.square[kept],
             self.log_det[kept],
+            None if self.own is None else self.own.of_some(kept, chosen),
         )
 
-    def with_effects(self, groups: Sequence[Sequence[int]], sizes: Sequence[float]) -> Reduced:
+    def with_effects(self, groups: Sequence[Group], sizes: Sequence[float]) -> Reduced:
         """The same with effects that act in the covariance, whose columns come first and are left
         out.
 
         Parameters
         ----------
-        groups : sequence of sequence of int
-            Columns of each effect.
+        groups : sequence of Group
+            Of each effect.
         sizes : sequence of float
-            Root mean squares of their moment densities. An amplitude's moment is that which the
-            data give it beside the other effects, before any further column is added.
+            Root mean squares of their moment densities.
         """
-        inner = [column for group in groups for column in group]
-        counts = np.array([len(group) for group in groups])
+        inner = [column for group in groups for column in group.columns]
+        counts = np.array([len(group.columns) for group in groups])
         power = np.repeat(moment_power(np.array(sizes), counts), counts)
-        root, index = np.sqrt(power), np.array(inner, dtype=int)
-        precision = np.eye(index.size) + root[:, None] * self.gram[:, index[:, None], index] * root
+        root, index = np.sqrt(power)[:, None], np.array(inner, dtype=int)
+        rest = [k for k in range(self.size) if k not in inner]
+        precision = np.eye(index.size) + root * self.gram[:, index[:, None], index] * root.T
         covariance = np.linalg.inv(precision)
-        mean = (covariance @ (root * self.slope[:, index])[:, :, None])[:, :, 0]
-        square = mean**2 + np.diagonal(covariance, axis1=1, axis2=2)
-        place = {column: k for k, column in enumerate(inner)}
-        moments = [np.log(square[:, [place[c] for c in group]].mean(axis=1)) for group in groups]
-        rest = [k for k in range(self.size) if k not in place]
-        found = self.with_columns(inner, power, rest)
-        return replace(found, log_det=found.log_det - 2.0 * np.sum(moments, axis=0))
+        mean = covariance @ (root * self.slope[:, index, None])
+        gain = covariance @ (root * self.gram[:, index[:, None], rest])
+        own = Amplitudes(tuple(groups), mean[:, :, 0], covariance, gain)
+        return replace(self.with_columns(inner, power, rest), own=own)
+
+    @property
+    def log_moment(self) -> Array:
+        """Logarithm of the moment of effects that act, if nothing else does, shape (P,)."""
+        if self.own is None:
+            return np.zeros(len(self.square))
+        return log_moments(self.own.counts, self.own.positive, self.own.mean, self.own.covariance)
 
     def with_columns(
         self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
@@ -248,6 +257,75 @@ class Reduced:
             self.slope[:, kept] - (turned @ first[:, :, None])[:, :, 0],
             self.square - np.sum(first**2, axis=1),
             self.log_det + 2.0 * logs,
+        )
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """Posterior of amplitudes of effects that act, in units of the normal parts of their priors.
+
+    A further effect changes it: an amplitude that stood in for that effect is then small.
+
+    Parameters
+    ----------
+    groups : tuple of Group
+    mean : ndarray, shape (P, m)
+    covariance : ndarray, shape (P, m, m)
+    gain : ndarray, shape (P, m, k)
+        By how much the mean falls with the amplitude of each further column.
+    """
+
+    groups: tuple[Group, ...]
+    mean: Array
+    covariance: Array
+    gain: Array
+
+    @property
+    def counts(self) -> list[int]:
+        """Columns of each effect."""
+        return [len(group.columns) for group in self.groups]
+
+    @property
+    def positive(self) -> list[Array | float]:
+        """Prior probabilities that their sizes are above zero."""
+        return [group.positive for group in self.groups]
+
+    def of_some(self, parts: Integers, columns: Integers) -> Amplitudes:
+        """The same for some covariances and further columns."""
+        gain = self.gain[parts[:, None], :, columns].transpose(0, 2, 1)
+        return replace(self, mean=self.mean[parts], covariance=self.covariance[parts], gain=gain)
+
+    def log_moment_beside(
+        self, columns: Integers, positive: Array | float, mean: Array, covariance: Array
+    ) -> Array:
+        """Logarithm of the moment of these amplitudes and of those of one more effect.
+
+        Parameters
+        ----------
+        columns : ndarray of int, shape (S, n)
+            Of each of several further effects.
+        positive : float or ndarray
+            Prior probability that its size is above zero.
+        mean : ndarray, shape (P, S, T, n)
+            Of its amplitudes, by size.
+        covariance : ndarray, shape (P, S, T, n, n)
+
+        Returns
+        -------
+        ndarray, shape (P, S, T)
+        """
+        # (P, S, 1, m, n)
+        gain = np.moveaxis(self.gain[:, :, columns], 1, 2)[:, :, None]
+        shared = -gain @ covariance
+        own = self.covariance[:, None, None] - shared @ np.swapaxes(gain, -1, -2)
+        moved = self.mean[:, None, None] - (gain @ mean[..., None])[..., 0]
+        upper = np.concatenate([own, shared], axis=-1)
+        lower = np.concatenate([np.swapaxes(shared, -1, -2), covariance], axis=-1)
+        return log_moments(
+            [*self.counts, columns.shape[1]],
+            [*self.positive, positive],
+            np.concatenate([moved, mean], axis=-1),
+            np.concatenate([upper, lower], axis=-2),
         )
 
 
@@ -372,18 +450,10 @@ def effect_evidence(
     sizes : ndarray, shape (T,)
         ``tau``, in units of the columns.
     """
-    power = moment_power(sizes, 1)
     found = np.empty((len(parts.square), len(groups), sizes.size))
     single = [k for k, group in enumerate(groups) if len(group.columns) == 1]
-    index = np.array([groups[k].columns[0] for k in single], dtype=int)
-    square, logs = parts.square[:, None, None], parts.log_det[:, None, None]
     if single:
-        positive = np.array([groups[k].positive for k in single])[:, None]
-        slope = parts.slope[:, index, None]
-        grown = 1.0 + power * np.maximum(parts.gram[:, index, index, None], 0.0)
-        value = likelihood(square - power * slope**2 / grown, logs + np.log(grown))
-        distance = slope * np.sqrt(power / grown)
-        found[:, single] = value + log_moment(positive, distance) - np.log(grown)
+        found[:, single] = _singly(parts, likelihood, [groups[k] for k in single], sizes)
     for k, group in enumerate(groups):
         if len(group.columns) > 1:
             found[:, k] = _together(parts, likelihood, group, sizes)
@@ -429,26 +499,80 @@ def _uneven_moment(positive: Array, distance: Array) -> Array:
     return np.asarray(found)
 
 
-def by_side(positive: Array | float, distance: Array | float) -> Array:
-    """What a prior adds that is higher on one side of zero, by the distance from zero in standard
-    deviations."""
-    with np.errstate(divide="ignore"):  # one side may be impossible
-        above, below = np.log(positive), np.log1p(-np.asarray(positive))
-    sides = np.logaddexp(above + log_ndtr(distance), below + log_ndtr(-np.asarray(distance)))
-    return np.asarray(_LOG_2 + sides)
+def log_moments(
+    counts: Sequence[int], positive: Sequence[Array | float], mean: Array, covariance: Array
+) -> Array:
+    """Logarithm of the mean of the product of effects' moments, each the mean square of its
+    amplitudes.
+
+    That of two effects is exact where neither has a likely side. Of more effects correlations count
+    by pairs; a likely side is that of each by itself.
+
+    Parameters
+    ----------
+    counts : sequence of int
+        Amplitudes of each effect.
+    positive : sequence of float or ndarray
+        Prior probability that its size is above zero.
+    mean : ndarray, shape (..., n)
+    covariance : ndarray, shape (..., n, n)
+    """
+    ends = np.cumsum(counts)
+    members = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    squares = [(mean[..., k] ** 2 + variance[..., k]).mean(axis=-1) for k in members]
+    total = np.zeros(mean.shape[:-1])
+    for k, count, side, square in zip(members, counts, positive, squares, strict=True):
+        if count == 1:
+            spread = variance[..., k.start]
+            total += np.log(spread) + log_moment(side, mean[..., k.start] / np.sqrt(spread))
+        else:
+            total += np.log(square)
+    for i, j in combinations(range(len(counts)), 2):
+        # E[x^2 y^2] - E[x^2] E[y^2] of normal x and y.
+        between = covariance[..., members[i], members[j]]
+        means = mean[..., members[i], None] * mean[..., None, members[j]]
+        product = np.mean(2.0 * between**2 + 4.0 * means * between, axis=(-2, -1))
+        total += np.log1p(product / (squares[i] * squares[j]))
+    return total
+
+
+def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array) -> Array:
+    """Log evidence of effects with one unknown each, shape (P, groups, sizes)."""
+    index = np.array([group.columns[0] for group in groups], dtype=int)
+    positive = np.array([group.positive for group in groups])[:, None]
+    power = moment_power(sizes, 1)
+    slope = parts.slope[:, index, None]
+    grown = 1.0 + power * np.maximum(parts.gram[:, index, index, None], 0.0)
+    gain = power * slope**2 / grown
+    logs = parts.log_det[:, None, None] + np.log(grown)
+    value = likelihood(parts.square[:, None, None] - gain, logs)
+    mean, variance = power * slope / grown, power / grown
+    if parts.own is None:
+        moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance))
+    else:
+        posterior = mean[..., None], variance[..., None, None]
+        moment = parts.own.log_moment_beside(index[:, None], positive, *posterior)
+    return np.asarray(value + moment - np.log(power))
 
 
 def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array) -> Array:
     """Log evidence of an effect with several unknowns, shape (P, sizes)."""
     index = np.array(group.columns)
     values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
-    turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0] ** 2
+    turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0]
     power = moment_power(sizes, index.size)[:, None]
-    grown = 1.0 + power * np.maximum(values, 0.0)[:, None]
-    gain = np.sum(power * turned / grown, axis=2)
-    logs = parts.log_det[:, None] + np.log(grown).sum(axis=2)
-    moment = np.mean(power * turned / grown**2 + 1.0 / grown, axis=2)
-    return np.asarray(likelihood(parts.square[:, None] - gain, logs) + np.log(moment))
+    spread = power / (1.0 + power * np.maximum(values, 0.0)[:, None])  # (P, sizes, unknowns)
+    gain = np.sum(spread * turned**2, axis=2)
+    logs = parts.log_det[:, None] - np.log(spread / power).sum(axis=2)
+    value = likelihood(parts.square[:, None] - gain, logs) - np.log(power[:, 0])
+    if parts.own is None:
+        return np.asarray(value + np.log(np.mean((spread * turned) ** 2 + spread, axis=2)))
+    wide = vectors[:, None]
+    mean = (wide @ (spread * turned)[..., None])[..., 0]
+    covariance = (wide * spread[:, :, None]) @ np.swapaxes(wide, -1, -2)
+    posterior = mean[:, None], covariance[:, None]
+    return np.asarray(value + parts.own.log_moment_beside(index[None], 0.5, *posterior)[:, 0])
 
 
 def pair_evidence(
@@ -478,11 +602,14 @@ def pair_evidence(
     found = likelihood(
         wide(parts.square[:, None]) - gain, wide(parts.log_det[:, None]) + np.log(det)
     )
-    # Each amplitude by itself: the two are nearly independent where both are seen.
     here = (its * first - mixed * second) / np.sqrt(its * det)
     there = (own * second - mixed * first) / np.sqrt(own * det)
     positive = np.array([group.positive for group in others])[:, None, None]
     moments = log_moment(one.positive, here) + log_moment(positive, there)
+    # What their correlation adds, as in log_moments.
+    between = -mixed / np.sqrt(own * its)
+    product = 2.0 * between**2 + 4.0 * between * here * there
+    moments += np.log1p(product / ((1.0 + here**2) * (1.0 + there**2)))
     return np.asarray(found + moments + np.log(own * its / det**2))
 
 

@@ -135,7 +135,7 @@ class _Structure:
         data, here = comparison.data, linearised(anchor, comparison.data)
         more = [key for key in structure.effects if key not in anchor.effects]
         groups = [_best_group(columns, key, here.residual, comparison.variance) for key in more]
-        members = [len(group.columns) for group in own_groups(anchor)]
+        members = [len(group.columns) for group in own_groups(anchor, comparison)]
         members += [len(group) for group in groups]
         own = here.own * comparison.unit(here.own)[:, None]
         effects = [own, *(columns.rows[list(group)] for group in groups)]

@@ -16,9 +16,9 @@ from bayesoleo.discovery._structure_evidence import (
     Likelihood,
     Reduced,
     Remainders,
-    by_side,
     effect_evidence,
     log_moment,
+    log_moments,
     mean_of,
     pair_evidence,
 )
@@ -102,11 +102,10 @@ def test_effects_in_the_covariance_have_their_moments(problem):
     found = effect_evidence(part, likelihood, groups, SIZES)
     for t, size in enumerate(SIZES):
         for g, group in enumerate(groups):
-            own = part.with_effects([group.columns], [size])
+            own = part.with_effects([group], [size])
             assert own.size == COLUMNS - len(group.columns)
-            np.testing.assert_allclose(
-                likelihood(own.square, own.log_det)[0], found[0, g, t], rtol=1e-10
-            )
+            evidence = likelihood(own.square, own.log_det) + own.log_moment
+            np.testing.assert_allclose(evidence[0], found[0, g, t], rtol=1e-10)
 
 
 def test_nothing_missing_is_favoured_faster_than_under_a_normal_density():
@@ -137,29 +136,77 @@ def moment_density(b, size: float):
     return (b / normal) ** 2 * stats.norm.pdf(b, scale=normal)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.6])
-def test_evidence_of_a_pair_is_an_integral_over_both_amplitudes(correlation):
-    gram = np.array([[16.0, 12.0 * correlation], [12.0 * correlation, 9.0]])
-    slope, sizes = np.array([20.0, -13.0]), np.array([0.8, 3.0])
-    part = Reduced(gram[None], slope[None], np.array([500.0]), np.zeros(1))
-    likelihood = Likelihood(500, 1e10)
-    one, other = Group((0,), 0.9), Group((1,), 0.5)
-    found = pair_evidence(part, likelihood, one, [other], sizes)[0, 0]
-    found = found - likelihood(part.square, part.log_det)[0]
-    grid = np.linspace(-12.0, 12.0, 2401)
+def two_columns(correlation: float, truth: tuple[float, float]) -> Reduced:
+    """Two columns of this correlation in data without noise that have both with these sizes."""
+    gram = np.array([[100.0, 100.0 * correlation], [100.0 * correlation, 100.0]])
+    slope, size = gram @ truth, np.array(truth) @ gram @ truth
+    return Reduced(gram[None], slope[None], np.array([size + 500.0]), np.zeros(1))
+
+
+def pair_integral(part: Reduced, side: float, size: float, its: float) -> float:
+    """Log evidence over that of nothing, the first amplitude with a likely side."""
+    grid = np.linspace(-4.0, 4.0, 3201)
     first, second = grid[:, None], grid
-    density = np.exp(
-        slope[0] * first + slope[1] * second
-        - 0.5 * (gram[0, 0] * first**2 + gram[1, 1] * second**2)
-        - gram[0, 1] * first * second
-    )  # fmt: skip
-    side = 2.0 * np.where(first > 0, 0.9, 0.1)
-    for t, size in enumerate(sizes):
-        for k, its in enumerate(sizes):
-            prior = side * moment_density(first, size) * moment_density(second, its)
-            exact = np.log(np.sum(density * prior) * (grid[1] - grid[0]) ** 2)
-            # Amplitudes that are correlated are taken one by one: some per cent of the evidence.
-            assert found[t, k] == pytest.approx(exact, abs=0.25 if correlation else 1e-5)
+    (slope,), (gram,) = part.slope, part.gram
+    log = slope[0] * first + slope[1] * second - gram[0, 1] * first * second
+    log = log - 0.5 * (gram[0, 0] * first**2 + gram[1, 1] * second**2)
+    sides = 2.0 * np.where(first > 0, side, 1.0 - side)
+    prior = sides * moment_density(first, size) * moment_density(second, its)
+    top = log.max()
+    return top + float(np.log(np.sum(np.exp(log - top) * prior) * (grid[1] - grid[0]) ** 2))
+
+
+@pytest.mark.parametrize("side", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("correlation", [0.0, 0.5, -0.8, 0.95])
+@pytest.mark.parametrize("truth", [(0.0, 1.0), (1.0, 0.0), (0.5, -0.5), (0.1, 0.1)])
+def test_a_pair_has_the_same_evidence_by_every_way(truth, correlation, side):
+    """As two candidates, as one beside the other, and with both in the model: the integral over
+    both amplitudes, also where one of them only stood in for the other."""
+    part, size, its = two_columns(correlation, truth), 0.8, 0.5
+    likelihood = Likelihood(500, 1e10)
+    one, other = Group((0,), side), Group((1,), 0.5)
+    both = part.with_effects([one, other], [size, its])
+    about_one = part.with_effects([one], [size])
+    about_other = part.with_effects([other], [its])
+    next_one, next_other = Group((0,), side), Group((0,), 0.5)
+    found = [
+        pair_evidence(part, likelihood, one, [other], np.array([size, its]))[0, 0, 0, 1],
+        effect_evidence(about_one, likelihood, [next_other], np.array([its]))[0, 0, 0],
+        effect_evidence(about_other, likelihood, [next_one], np.array([size]))[0, 0, 0],
+        (likelihood(both.square, both.log_det) + both.log_moment)[0],
+    ]
+    np.testing.assert_allclose(found, found[0], rtol=1e-6)
+    exact = pair_integral(part, side, size, its)
+    # A likely side is that of an amplitude by itself: the other's moment would know of it, where
+    # the first is not seen well.
+    tolerance = {0.5: 1e-4, 0.9: 0.35, 1.0: 0.9}[side]
+    assert found[0] - likelihood(part.square, part.log_det)[0] == pytest.approx(
+        exact, abs=tolerance
+    )
+
+
+def test_an_effect_of_two_amplitudes_has_the_same_evidence_beside_another(problem):
+    likelihood, part = Likelihood(SAMPLES, 1e6), reduced(problem)
+    one, two = Group((1,)), Group((0, 3))
+    both = part.with_effects([one, two], [0.7, 1.3])
+    expected = (likelihood(both.square, both.log_det) + both.log_moment)[0]
+    beside = part.with_effects([one], [0.7])  # columns 0, 2, 3 are left
+    found = effect_evidence(beside, likelihood, [Group((0, 2))], np.array([1.3]))[0, 0, 0]
+    assert found == pytest.approx(expected, rel=1e-10)
+    beside = part.with_effects([two], [1.3]).of_some([0], [0])
+    found = effect_evidence(beside, likelihood, [Group((0,))], np.array([0.7]))[0, 0, 0]
+    assert found == pytest.approx(expected, rel=1e-10)
+
+
+def test_moments_of_amplitudes_are_those_of_draws():
+    """Of two effects exactly; of three with all pairs."""
+    rng = np.random.default_rng(4)
+    mean, root = np.array([0.5, -1.0, 0.3, 1.5]), rng.standard_normal((4, 4)) * 0.6
+    draws = mean + rng.standard_normal((1_000_000, 4)) @ root.T
+    first, second = draws[:, 0] ** 2, (draws[:, 1:] ** 2).mean(axis=1)
+    found = log_moments([1, 3], [0.5, 0.5], mean, root @ root.T)
+    # The relative standard error of the mean of so many draws is about 0.004.
+    assert np.exp(found) == pytest.approx(np.mean(first * second), rel=0.02)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -221,15 +268,6 @@ def test_common_laws_weigh_more_within_their_family_and_a_user_can_say_otherwise
     told = StructurePrior(effects={"coulomb_friction": 1.0, "lugre_friction": 4.0})
     weights = told.weights(families)
     assert weights["lugre_friction", "x"] == pytest.approx(4 * weights["coulomb_friction", "x"])
-
-
-@pytest.mark.parametrize("positive", [0.0, 0.1, 0.5, 0.9, 1.0])
-def test_a_likely_side_of_zero_has_its_share_of_a_normal_prior(positive):
-    """A normal posterior under the prior that is flat by sides: the integral by hand."""
-    for distance in (-3.0, -0.5, 0.0, 2.0, 8.0):
-        weight = 2 * positive * stats.norm.cdf(distance)
-        weight += 2 * (1 - positive) * stats.norm.cdf(-distance)
-        assert np.exp(by_side(positive, distance)) == pytest.approx(weight, rel=1e-12)
 
 
 @pytest.mark.parametrize("positive", [0.0, 0.1, 0.5, 0.9, 1.0])
