@@ -218,7 +218,8 @@ class Reduced:
         covariance = np.linalg.inv(precision)
         mean = covariance @ (root * self.slope[:, index, None])
         gain = covariance @ (root * self.gram[:, index[:, None], rest])
-        own = Amplitudes(tuple(groups), mean[:, :, 0], covariance, gain)
+        turned = mean[:, :, 0].T, np.moveaxis(covariance, 0, 2), np.moveaxis(gain, 0, 1)
+        own = Amplitudes(tuple(groups), *turned)
         return replace(self.with_columns(inner, power, rest), own=own)
 
     @property
@@ -226,7 +227,9 @@ class Reduced:
         """Logarithm of the moment of effects that act, if nothing else does, shape (P,)."""
         if self.own is None:
             return np.zeros(len(self.square))
-        return log_moments(self.own.counts, self.own.positive, self.own.mean, self.own.covariance)
+        own, rows = self.own, range(len(self.own.mean))
+        upper = [[own.covariance[i, j] for j in rows[i:]] for i in rows]
+        return log_moments(own.counts, own.positive, list(own.mean), upper)
 
     def with_columns(
         self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
@@ -269,9 +272,9 @@ class Amplitudes:
     Parameters
     ----------
     groups : tuple of Group
-    mean : ndarray, shape (P, m)
-    covariance : ndarray, shape (P, m, m)
-    gain : ndarray, shape (P, m, k)
+    mean : ndarray, shape (m, P)
+    covariance : ndarray, shape (m, m, P)
+    gain : ndarray, shape (m, P, k)
         By how much the mean falls with the amplitude of each further column.
     """
 
@@ -292,8 +295,8 @@ class Amplitudes:
 
     def of_some(self, parts: Integers, columns: Integers) -> Amplitudes:
         """The same for some covariances and further columns."""
-        gain = self.gain[parts[:, None], :, columns].transpose(0, 2, 1)
-        return replace(self, mean=self.mean[parts], covariance=self.covariance[parts], gain=gain)
+        gain = self.gain[:, parts[:, None], columns]
+        return Amplitudes(self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain)
 
     def log_moment_beside(
         self, columns: Integers, positive: Array | float, mean: Array, covariance: Array
@@ -306,27 +309,30 @@ class Amplitudes:
             Of each of several further effects.
         positive : float or ndarray
             Prior probability that its size is above zero.
-        mean : ndarray, shape (P, S, T, n)
+        mean : ndarray, shape (n, P, S, T)
             Of its amplitudes, by size.
-        covariance : ndarray, shape (P, S, T, n, n)
+        covariance : ndarray, shape (n, n, P, S, T)
 
         Returns
         -------
         ndarray, shape (P, S, T)
         """
-        # (P, S, 1, m, n)
-        gain = np.moveaxis(self.gain[:, :, columns], 1, 2)[:, :, None]
-        shared = -gain @ covariance
-        own = self.covariance[:, None, None] - shared @ np.swapaxes(gain, -1, -2)
-        moved = self.mean[:, None, None] - (gain @ mean[..., None])[..., 0]
-        upper = np.concatenate([own, shared], axis=-1)
-        lower = np.concatenate([np.swapaxes(shared, -1, -2), covariance], axis=-1)
-        return log_moments(
-            [*self.counts, columns.shape[1]],
-            [*self.positive, positive],
-            np.concatenate([moved, mean], axis=-1),
-            np.concatenate([upper, lower], axis=-2),
-        )
+        own, more = range(len(self.mean)), range(len(mean))
+        gain = self.gain[:, :, columns]  # (m, P, S, n)
+
+        def moved(i: int, values: Sequence[Array] | Array) -> Array:
+            """Of an own amplitude, by one of each further amplitude."""
+            if len(values) == 1:  # of nearly all effects
+                return np.asarray(gain[i] * values[0])
+            return np.asarray(np.einsum("psn,npst->pst", gain[i], np.asarray(values)))
+
+        shared = [[-moved(i, covariance[:, k]) for k in more] for i in own]
+        now = [self.mean[i][:, None, None] - moved(i, mean) for i in own]
+        its = [self.covariance[i][:, :, None, None] for i in own]
+        upper = [[*(its[i][j] - moved(j, shared[i]) for j in own[i:]), *shared[i]] for i in own]
+        upper += [list(covariance[k, k:]) for k in more]
+        counts, sides = [*self.counts, len(more)], [*self.positive, positive]
+        return log_moments(counts, sides, [*now, *mean], upper)
 
 
 @dataclass(frozen=True)
@@ -500,7 +506,10 @@ def _uneven_moment(positive: Array, distance: Array) -> Array:
 
 
 def log_moments(
-    counts: Sequence[int], positive: Sequence[Array | float], mean: Array, covariance: Array
+    counts: Sequence[int],
+    positive: Sequence[Array | float],
+    mean: Sequence[Array],
+    upper: Sequence[Sequence[Array]],
 ) -> Array:
     """Logarithm of the mean of the product of effects' moments, each the mean square of its
     amplitudes.
@@ -514,27 +523,30 @@ def log_moments(
         Amplitudes of each effect.
     positive : sequence of float or ndarray
         Prior probability that its size is above zero.
-    mean : ndarray, shape (..., n)
-    covariance : ndarray, shape (..., n, n)
+    mean : sequence of ndarray
+        Of each amplitude.
+    upper : sequence of sequence of ndarray
+        Rows of their covariance, each from the diagonal on.
     """
     ends = np.cumsum(counts)
-    members = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    squares = [(mean[..., k] ** 2 + variance[..., k]).mean(axis=-1) for k in members]
-    total = np.zeros(mean.shape[:-1])
-    for k, count, side, square in zip(members, counts, positive, squares, strict=True):
-        if count == 1:
-            spread = variance[..., k.start]
-            total += np.log(spread) + log_moment(side, mean[..., k.start] / np.sqrt(spread))
-        else:
-            total += np.log(square)
+    members = [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
+    squares = [sum(mean[c] ** 2 + upper[c][0] for c in k) / len(k) for k in members]
+    product, sided = np.asarray(1.0), np.asarray(0.0)
+    for (first, *more), side, square in zip(members, positive, squares, strict=True):
+        product = product * square
+        if not more and np.any(np.not_equal(side, 0.5)):
+            distance = mean[first] / np.sqrt(upper[first][0])
+            sided = sided + log_moment(side, distance) - np.log1p(distance**2)
     for i, j in combinations(range(len(counts)), 2):
         # E[x^2 y^2] - E[x^2] E[y^2] of normal x and y.
-        between = covariance[..., members[i], members[j]]
-        means = mean[..., members[i], None] * mean[..., None, members[j]]
-        product = np.mean(2.0 * between**2 + 4.0 * means * between, axis=(-2, -1))
-        total += np.log1p(product / (squares[i] * squares[j]))
-    return total
+        between = sum(
+            upper[a][b - a] * (upper[a][b - a] + 2.0 * mean[a] * mean[b])
+            for a in members[i]
+            for b in members[j]
+        )
+        size = 0.5 * counts[i] * counts[j]
+        product = product * (1.0 + between / (size * squares[i] * squares[j]))
+    return np.asarray(np.log(product) + sided)
 
 
 def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array) -> Array:
@@ -551,7 +563,7 @@ def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], siz
     if parts.own is None:
         moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance))
     else:
-        posterior = mean[..., None], variance[..., None, None]
+        posterior = mean[None], variance[None, None]
         moment = parts.own.log_moment_beside(index[:, None], positive, *posterior)
     return np.asarray(value + moment - np.log(power))
 
@@ -568,10 +580,9 @@ def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
     value = likelihood(parts.square[:, None] - gain, logs) - np.log(power[:, 0])
     if parts.own is None:
         return np.asarray(value + np.log(np.mean((spread * turned) ** 2 + spread, axis=2)))
-    wide = vectors[:, None]
-    mean = (wide @ (spread * turned)[..., None])[..., 0]
-    covariance = (wide * spread[:, :, None]) @ np.swapaxes(wide, -1, -2)
-    posterior = mean[:, None], covariance[:, None]
+    mean = np.einsum("pab,ptb->apt", vectors, spread * turned)
+    covariance = np.einsum("pab,ptb,pcb->acpt", vectors, spread, vectors)
+    posterior = mean[:, :, None], covariance[:, :, :, None]
     return np.asarray(value + parts.own.log_moment_beside(index[None], 0.5, *posterior)[:, 0])
 
 

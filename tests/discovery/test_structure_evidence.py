@@ -204,7 +204,9 @@ def test_moments_of_amplitudes_are_those_of_draws():
     mean, root = np.array([0.5, -1.0, 0.3, 1.5]), rng.standard_normal((4, 4)) * 0.6
     draws = mean + rng.standard_normal((1_000_000, 4)) @ root.T
     first, second = draws[:, 0] ** 2, (draws[:, 1:] ** 2).mean(axis=1)
-    found = log_moments([1, 3], [0.5, 0.5], mean, root @ root.T)
+    covariance = root @ root.T
+    upper = [list(row[k:]) for k, row in enumerate(covariance)]
+    found = log_moments([1, 3], [0.5, 0.5], list(mean), upper)
     # The relative standard error of the mean of so many draws is about 0.004.
     assert np.exp(found) == pytest.approx(np.mean(first * second), rel=0.02)
 
