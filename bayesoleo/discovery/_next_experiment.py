@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,11 +39,13 @@ from bayesoleo.discovery._predicted_experiment import (
     blank_record,
     planned_runs,
     predictive_distribution,
+    solved_like,
 )
 from bayesoleo.discovery._spectral_data import PRIOR_LINES
 from bayesoleo.discovery._varied_runs import REACH, Variation, repeated, varied_runs
 from bayesoleo.errors import InputError, ModelError, choose
 from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._orbit import Status
 
 #: A run on the grid of the rig's range, a measured one to be repeated, or a variation of one.
@@ -256,15 +258,16 @@ class _Judge:
     limits: Limits
     noise: Mapping[str, NewRunNoise]
     aim: str
+    solved: dict[tuple[int, str], TransientRun | None] = field(default_factory=dict)
 
     def __call__(self, run: Run) -> ProposedRun | str:
         """The trial, or the reason why there is none."""
         record, outputs = self._blank(run), self.rivals[0].fit.predictor.outputs
         solved, known = [], []
-        for rival in self.rivals:
+        for k, rival in enumerate(self.rivals):
             known.append(self._known(rival.fit, run))
-            like = run.like if isinstance(run, Variation) else ""
-            found = predictive_distribution(rival.fit, known[-1], record, self.noise, like)
+            begin = self._begin(k, run.like) if isinstance(run, Variation) else None
+            found = predictive_distribution(rival.fit, known[-1], record, self.noise, begin)
             if isinstance(found, Status):
                 return found.message
             solved.append(found)
@@ -272,6 +275,15 @@ class _Judge:
         if new and not _inside(self.limits, outputs, [y for _, y in solved]):
             return BEYOND_LIMITS
         return self._described(run, self._told([item for item, _ in solved], known))
+
+    def _begin(self, rival: int, label: str) -> TransientRun | None:
+        """Where a rival's solutions of a transient's variations begin: found once."""
+        key = rival, label
+        if key not in self.solved:
+            fit = self.rivals[rival].fit
+            known = Knowledge.of(fit, label)
+            self.solved[key] = solved_like(fit, known, self.records, label)
+        return self.solved[key]
 
     def _known(self, fit: ModelFit, run: Run) -> Knowledge:
         if isinstance(run, Variation):

@@ -513,7 +513,7 @@ def predictive_distribution(
     known: Knowledge,
     record: Record,
     noise: Mapping[str, NewRunNoise],
-    like: str = "",
+    begin: TransientRun | None = None,
 ) -> tuple[PredictiveDistribution, Array] | Status:
     """Predictive distribution of a run by one rival.
 
@@ -527,8 +527,8 @@ def predictive_distribution(
         From :func:`blank_record`, or a variation of a run that was measured.
     noise : mapping of str to NewRunNoise
         By output.
-    like : str, optional
-        Label of the transient that it varies, whose motion is where its solution begins.
+    begin : TransientRun, optional
+        From :func:`solved_like`; its motion is where the solution begins.
 
     Returns
     -------
@@ -544,7 +544,7 @@ def predictive_distribution(
     fed_back = fed_back if record.periodic else []
     record = replace(record, harmonics={**record.harmonics, **_nothing(fed_back)})
     for _ in range(PASSES if fed_back else 1):
-        predictor, found = _solved(fit, known, record, like)
+        predictor, found = _solved(fit, known, record, begin)
         if found.status is not Status.CONVERGED:
             return found.status
         record = replace(
@@ -564,16 +564,28 @@ def predictive_distribution(
     return PredictiveDistribution(divided(found.y), spread, len(known.root)), found.y
 
 
+def solved_like(
+    fit: ModelFit, known: Knowledge, records: Sequence[Record], like: str
+) -> TransientRun | None:
+    """The motion of a transient by one rival: that of the fit, or for a run that was held out one
+    of its own; none of a periodic run, or without a solution."""
+    for run in fit.predictor.runs:
+        if isinstance(run, TransientRun) and run.record.label == like:
+            return run
+    for record in records:
+        if record.label == like and not record.periodic:
+            predictor, found = _solved(fit, known, record, None)
+            run = predictor.runs[0]
+            if found.status is Status.CONVERGED and isinstance(run, TransientRun):
+                return run
+    return None
+
+
 def _solved(
-    fit: ModelFit, known: Knowledge, record: Record, like: str
+    fit: ModelFit, known: Knowledge, record: Record, begin: TransientRun | None
 ) -> tuple[Predictor, RunPrediction]:
     """A run's prediction: from the motion of the run that it varies, or else from its start."""
-    varied = [
-        run
-        for run in fit.predictor.runs
-        if isinstance(run, TransientRun) and run.record.label == like
-    ]
-    for other in (*varied, None):
+    for other in (begin, None):
         predictor = Predictor(
             known.model, [record], steps=STEPS, scheme=fit.numerics.scheme, backend="numpy", jobs=1
         )
@@ -581,7 +593,7 @@ def _solved(
         if other is not None and isinstance(run, TransientRun):
             run.start_like(other)
         (found,) = predictor.evaluate(known.theta)
-        if found.status is Status.CONVERGED:
+        if found.status is Status.CONVERGED or other is None:
             break
     return predictor, found
 

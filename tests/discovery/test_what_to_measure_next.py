@@ -9,6 +9,7 @@ import pytest
 from fitted_states import NUMERICS, fitted
 from small_campaigns import damper, damper_campaign, oscillator_campaign
 
+from bayesoleo.discovery import _next_experiment
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._next_experiment import expected_noise, propose_runs
@@ -22,6 +23,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.prediction._records import transient_record
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.systems import system
 
 FREE = (-np.inf, np.inf)
@@ -296,8 +298,8 @@ def free_decay(label, start, stiffness=100.0):
     return transient_record(label, time, {"displacement": x + noise})
 
 
-def test_a_transient_is_varied_by_its_start():
-    model = Model(
+def decay_model():
+    return Model(
         "decay",
         dofs={"x": Dof("m")},
         equations={
@@ -310,8 +312,11 @@ def test_a_transient_is_varied_by_its_start():
             "stiffness": Parameter(90.0, "N/m", sd=50.0),
         },
     )
+
+
+def test_a_transient_is_varied_by_its_start():
     records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
-    state = fit_state(Assembly(model), _roles_of(records), NUMERICS)
+    state = fit_state(Assembly(decay_model()), _roles_of(records), NUMERICS)
     rival = Rival("decay", state.fit)
     found = propose_runs([rival], records, state.fit_errors, aim="stiffness", jobs=1)
     best = found.trials[0]
@@ -324,6 +329,32 @@ def test_a_transient_is_varied_by_its_start():
     )
     assert _start_of(best, {"a": 0.1, "bb": 0.2}) <= REACH * 0.2 * 1.05
     assert best.information > found.best_repeat.information
+
+
+def test_variations_of_a_held_out_transient_begin_with_its_motion(monkeypatch):
+    """One integration for the run itself; the same figures as with one for each variation."""
+    records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
+    state = fit_state(Assembly(decay_model()), _roles_of(records[:1]), NUMERICS)
+    integrated, counts, told = TransientRun._integrated, [], []
+
+    def counted(self, *given):
+        counts[-1] += 1
+        return integrated(self, *given)
+
+    monkeypatch.setattr(TransientRun, "_integrated", counted)
+    for begins in (True, False):
+        if not begins:
+            monkeypatch.setattr(_next_experiment, "solved_like", lambda *_: None)
+        counts.append(0)
+        rivals = [Rival("decay", state.fit)]
+        found = propose_runs(rivals, records, state.fit_errors, aim="stiffness", jobs=1)
+        told.append({(t.like, t.change): t.information for t in found.trials})
+    assert any(like == "bb" for like, _ in told[0])
+    assert counts[0] == 1 < counts[1]
+    assert told[0].keys() == told[1].keys()
+    for key, value in told[0].items():
+        # Two meshes: what either leaves of the solution.
+        assert value == pytest.approx(told[1][key], rel=1e-3, abs=1e-6)
 
 
 def _start_of(trial, starts):
