@@ -22,7 +22,7 @@ import numpy as np
 
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as measures
-from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._collocation import Collocation, SamplePlan
 from bayesoleo.solvers._mesh import Mesh
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import LAST_STEP, SMALL_STEP, Boundary, Solution, Trial
@@ -100,7 +100,8 @@ class _State:
     """State of one batched iteration."""
 
     def __init__(self, problem: Boundary, p: Array, x: Array, to_end: bool):
-        self.trial, self.to_end = Trial(problem, p, x), to_end
+        self.trial = Trial(problem, p, x)
+        self.end = _end(problem, x.shape[1]) if to_end else None
         self.status = np.full(x.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(x.shape[0], dtype=np.int64)
 
@@ -120,10 +121,10 @@ class _State:
         # Over the largest value: a piece of a transient may hardly move.
         states, moved = trial.problem.scheme.state_size, np.empty(self.status.size)
         measures.step_size(trial.x, dx, lanes, states, moved, size)
-        if self.to_end:
-            change = np.abs(end_state(trial.problem, dx[..., 0]))
+        if self.end is not None:
+            change = np.abs(end_state(trial.problem, dx[..., 0], self.end))
             largest = np.abs(trial.x[:, :, :states]).max(axis=1)
-            largest = np.maximum(largest, np.abs(end_state(trial.problem, trial.x)))
+            largest = np.maximum(largest, np.abs(end_state(trial.problem, trial.x, self.end)))
             with np.errstate(invalid="ignore"):
                 part = np.where(change > 0.0, change / np.maximum(largest, change), 0.0)
             size[lanes] = np.maximum(size, part.max(axis=1))[lanes]
@@ -230,12 +231,18 @@ def _piece(problem: Boundary, first: int, last: int) -> Boundary:
     )
 
 
-def end_state(problem: Boundary, x: Array) -> Array:
+def end_state(problem: Boundary, x: Array, end: SamplePlan | None = None) -> Array:
     """States at the end of the time, shape (L, D), from unknowns ``(L, n, w)``."""
     scheme, n = problem.scheme, x.shape[1]
     assert isinstance(scheme, Collocation)
-    rows = scheme.sample(x[..., None], scheme.plan(np.ones(1), n, initial=True), problem.step(n))
+    rows = scheme.sample(x[..., None], end or _end(problem, n), problem.step(n))
     return rows[:, state_rows(scheme.orders), 0, 0]
+
+
+def _end(problem: Boundary, n: int) -> SamplePlan:
+    """The place of the end of the time."""
+    assert isinstance(problem.scheme, Collocation)
+    return problem.scheme.plan(np.ones(1), n, initial=True)
 
 
 def state_rows(orders: tuple[int, ...]) -> Integers:
