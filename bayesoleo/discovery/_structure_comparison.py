@@ -304,7 +304,8 @@ def evidences_about(
     at = _anchored(anchor, comparison, columns, beside, tried)
     own = frozenset(anchor.effects)
     totals = np.stack(
-        [at.likelihood(p.square, p.log_det) + p.log_moment for p in at.parts([])], axis=1
+        [at.likelihood(p.square, p.log_det) + p.log_moment(at.likelihood) for p in at.parts([])],
+        axis=1,
     )
     found: Evidences = {}
     for outside, value in zip((False, True), at.remainders.split(totals), strict=True):

@@ -14,8 +14,9 @@ The amplitude of an effect that acts has a moment density,
 zero, for an effect of no size is none. Under a normal density most of what is called missing could
 not be seen in the data, and nothing could ever be said to be missing for sure. Sizes :math:`\tau`,
 :math:`a` and that of :math:`g` are integrated over a grid, with equal weight by decade from the
-smallest change that could be seen to the size of the signal itself. The measured noise is itself
-uncertain, which makes the density Student's.
+smallest change that could be seen to the size of the signal itself. The size of an effect is that
+of the part of its change that the unknowns cannot make. The measured noise is itself uncertain,
+which makes the density Student's; sizes are in units of the noise as the data have it.
 
 References
 ----------
@@ -46,6 +47,8 @@ VISIBLE = 4.0
 DIFFERENCE, DIFFERENCE_SPREAD = 0.25, 1.2
 #: Standard deviations beyond which the other side of zero has less than 1e-15 of a normal density.
 NEAR = 8.0
+#: Standard deviations at which moments of the far side have lost ten digits to cancellation.
+FARTHEST = 30.0
 #: Standard deviations beyond which a tail is its first asymptotic term, to 5e-4 of it.
 FAR = 100.0
 _LOG_2 = float(np.log(2.0))
@@ -184,6 +187,7 @@ class Reduced:
 
     def scaled(self, factors: Array) -> Reduced:
         """The same with each column times a factor."""
+        assert self.own is None
         gram = self.gram * factors[:, None] * factors
         return replace(self, gram=gram, slope=self.slope * factors)
 
@@ -209,6 +213,7 @@ class Reduced:
         sizes : sequence of float
             Root mean squares of their moment densities.
         """
+        assert self.own is None  # those of one model, all together
         inner = [column for group in groups for column in group.columns]
         counts = np.array([len(group.columns) for group in groups])
         power = np.repeat(moment_power(np.array(sizes), counts), counts)
@@ -222,14 +227,14 @@ class Reduced:
         own = Amplitudes(tuple(groups), *turned)
         return replace(self.with_columns(inner, power, rest), own=own)
 
-    @property
-    def log_moment(self) -> Array:
+    def log_moment(self, likelihood: Likelihood) -> Array:
         """Logarithm of the moment of effects that act, if nothing else does, shape (P,)."""
-        if self.own is None:
+        own = self.own
+        if own is None:
             return np.zeros(len(self.square))
-        own, rows = self.own, range(len(self.own.mean))
+        rows, noise = range(len(own.mean)), likelihood.noise(self.square)
         upper = [[own.covariance[i, j] for j in rows[i:]] for i in rows]
-        return log_moments(own.counts, own.positive, list(own.mean), upper)
+        return log_moments(own.counts, own.positive, list(own.mean / np.sqrt(noise)), upper)
 
     def with_columns(
         self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
@@ -299,7 +304,12 @@ class Amplitudes:
         return Amplitudes(self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain)
 
     def log_moment_beside(
-        self, columns: Integers, positive: Array | float, mean: Array, covariance: Array
+        self,
+        columns: Integers,
+        positive: Array | float,
+        mean: Array,
+        covariance: Array,
+        noise: Array,
     ) -> Array:
         """Logarithm of the moment of these amplitudes and of those of one more effect.
 
@@ -312,6 +322,8 @@ class Amplitudes:
         mean : ndarray, shape (n, P, S, T)
             Of its amplitudes, by size.
         covariance : ndarray, shape (n, n, P, S, T)
+        noise : ndarray, shape (P, S, T)
+            Variance of the noise over that measured.
 
         Returns
         -------
@@ -332,7 +344,8 @@ class Amplitudes:
         upper = [[*(its[i][j] - moved(j, shared[i]) for j in own[i:]), *shared[i]] for i in own]
         upper += [list(covariance[k, k:]) for k in more]
         counts, sides = [*self.counts, len(more)], [*self.positive, positive]
-        return log_moments(counts, sides, [*now, *mean], upper)
+        root = np.sqrt(noise)
+        return log_moments(counts, sides, [one / root for one in (*now, *mean)], upper)
 
 
 @dataclass(frozen=True)
@@ -426,6 +439,10 @@ class Likelihood:
         spread = np.maximum(square, 0.0) / self.freedom
         return np.asarray(-0.5 * log_det - exponent * np.log1p(spread))
 
+    def noise(self, square: Array) -> Array:
+        """Variance of the noise over that measured: the harmonic mean of its posterior."""
+        return np.asarray((self.freedom + np.maximum(square, 0.0)) / (self.freedom + self.count))
+
 
 @dataclass(frozen=True)
 class Group:
@@ -514,8 +531,8 @@ def log_moments(
     """Logarithm of the mean of the product of effects' moments, each the mean square of its
     amplitudes.
 
-    That of two effects is exact where neither has a likely side. Of more effects correlations count
-    by pairs; a likely side is that of each by itself.
+    That of two effects is exact where one of them at most has a likely side. Of more effects, and
+    of two likely sides, correlations count by pairs.
 
     Parameters
     ----------
@@ -531,22 +548,95 @@ def log_moments(
     ends = np.cumsum(counts)
     members = [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
     squares = [sum(mean[c] ** 2 + upper[c][0] for c in k) / len(k) for k in members]
+
+    def shared(a: int, b: int) -> Array:
+        return upper[min(a, b)][abs(a - b)]
+
     product, sided = np.asarray(1.0), np.asarray(0.0)
-    for (first, *more), side, square in zip(members, positive, squares, strict=True):
+    distances: dict[int, Array] = {}  # of effects with a likely side
+    for k, (place, side, square) in enumerate(zip(members, positive, squares, strict=True)):
         product = product * square
-        if not more and np.any(np.not_equal(side, 0.5)):
-            distance = mean[first] / np.sqrt(upper[first][0])
-            sided = sided + log_moment(side, distance) - np.log1p(distance**2)
+        if len(place) == 1 and np.any(np.not_equal(side, 0.5)):
+            distances[k] = mean[place[0]] / np.sqrt(upper[place[0]][0])
+            sided = sided + log_moment(side, distances[k]) - np.log1p(distances[k] ** 2)
     for i, j in combinations(range(len(counts)), 2):
-        # E[x^2 y^2] - E[x^2] E[y^2] of normal x and y.
-        between = sum(
-            upper[a][b - a] * (upper[a][b - a] + 2.0 * mean[a] * mean[b])
-            for a in members[i]
-            for b in members[j]
-        )
-        size = 0.5 * counts[i] * counts[j]
-        product = product * (1.0 + between / (size * squares[i] * squares[j]))
+        likely = [(k, other) for k, other in ((i, j), (j, i)) if k in distances]
+        for k, other in likely:
+            (a,) = members[k]
+            root = np.sqrt(upper[a][0])
+            given = [(mean[b], shared(a, b) / root, upper[b][0]) for b in members[other]]
+            ratio = _square_given(positive[k], distances[k], given) / squares[other]
+            sided = sided + np.log(ratio) / len(likely)
+        if not likely:
+            # E[x^2 y^2] - E[x^2] E[y^2] of normal x and y.
+            between = sum(
+                shared(a, b) * (shared(a, b) + 2.0 * mean[a] * mean[b])
+                for a in members[i]
+                for b in members[j]
+            )
+            size = 0.5 * counts[i] * counts[j]
+            product = product * (1.0 + between / (size * squares[i] * squares[j]))
     return np.asarray(np.log(product) + sided)
+
+
+def _square_given(
+    positive: Array | float, distance: Array, given: Sequence[tuple[Array, Array, Array]]
+) -> Array:
+    """Mean square of amplitudes under the moment of another one ``u``, which has a likely side.
+
+    An amplitude is a straight line in ``u`` but for a rest that is independent of it, so that the
+    means of ``u^3`` and ``u^4`` over that of ``u^2`` are all that is needed.
+
+    Parameters
+    ----------
+    positive : float or ndarray
+    distance : ndarray
+        Mean of ``u``, whose standard deviation is one.
+    given : sequence of (mean, slope, variance)
+        Of each amplitude; the slope is its covariance with ``u``.
+    """
+    third, fourth = _higher_moments(positive, distance)
+    total = np.asarray(0.0)
+    for mean, slope, variance in given:
+        start = mean - slope * distance
+        rest = np.maximum(variance - slope**2, 0.0)
+        total = total + start**2 + rest + 2.0 * start * slope * third + slope**2 * fourth
+    return np.asarray(total / len(given))
+
+
+def _higher_moments(positive: Array | float, distance: Array) -> tuple[Array, Array]:
+    """Means of ``u^3`` and ``u^4`` over that of ``u^2``, of a normal ``u`` with unit variance whose
+    sides of zero have different weights."""
+    square = distance**2
+    third = np.array(distance * (square + 3.0) / (square + 1.0))
+    fourth = np.array(((square + 6.0) * square + 3.0) / (square + 1.0))
+    above = np.broadcast_to(np.asarray(positive, dtype=float), distance.shape)
+    # The other side counts where it is near, or is the only one.
+    only = np.where(distance > 0, above, 1.0 - above) == 0.0
+    both = (above != 0.5) & ((np.abs(distance) < NEAR) | only)
+    if both.any():
+        up, down = (_half_moments(sign * distance[both]) for sign in (1.0, -1.0))
+        weight = above[both]
+        second, cube, power = (
+            weight * a + sign * (1.0 - weight) * b
+            for sign, a, b in zip((1.0, -1.0, 1.0), up, down, strict=True)
+        )
+        third[both], fourth[both] = cube / second, power / second
+    return third, fourth
+
+
+def _half_moments(distance: Array) -> tuple[Array, Array, Array]:
+    """Means of ``u^2``, ``u^3`` and ``u^4`` over ``u > 0``, divided by the normal density at the
+    distance of its mean from zero."""
+    # Beyond, the terms of the far side cancel; the ratios hardly depend on the distance there.
+    d = np.clip(distance, -FARTHEST, FARTHEST)
+    tail = np.sqrt(0.5 * np.pi) * erfcx(-d / np.sqrt(2.0))
+    square = d * d
+    return (
+        (square + 1.0) * tail + d,
+        d * (square + 3.0) * tail + square + 2.0,
+        ((square + 6.0) * square + 3.0) * tail + d * (square + 5.0),
+    )
 
 
 def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array) -> Array:
@@ -558,12 +648,13 @@ def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], siz
     grown = 1.0 + power * np.maximum(parts.gram[:, index, index, None], 0.0)
     gain = power * slope**2 / grown
     logs = parts.log_det[:, None, None] + np.log(grown)
-    value = likelihood(parts.square[:, None, None] - gain, logs)
+    square = parts.square[:, None, None] - gain
+    value, noise = likelihood(square, logs), likelihood.noise(square)
     mean, variance = power * slope / grown, power / grown
     if parts.own is None:
-        moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance))
+        moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance * noise))
     else:
-        posterior = mean[None], variance[None, None]
+        posterior = mean[None], variance[None, None], noise
         moment = parts.own.log_moment_beside(index[:, None], positive, *posterior)
     return np.asarray(value + moment - np.log(power))
 
@@ -577,12 +668,14 @@ def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
     spread = power / (1.0 + power * np.maximum(values, 0.0)[:, None])  # (P, sizes, unknowns)
     gain = np.sum(spread * turned**2, axis=2)
     logs = parts.log_det[:, None] - np.log(spread / power).sum(axis=2)
-    value = likelihood(parts.square[:, None] - gain, logs) - np.log(power[:, 0])
+    square = parts.square[:, None] - gain
+    value, noise = likelihood(square, logs) - np.log(power[:, 0]), likelihood.noise(square)
     if parts.own is None:
-        return np.asarray(value + np.log(np.mean((spread * turned) ** 2 + spread, axis=2)))
+        squares = (spread * turned) ** 2 / noise[:, :, None] + spread
+        return np.asarray(value + np.log(squares.mean(axis=2)))
     mean = np.einsum("pab,ptb->apt", vectors, spread * turned)
     covariance = np.einsum("pab,ptb,pcb->acpt", vectors, spread, vectors)
-    posterior = mean[:, :, None], covariance[:, :, :, None]
+    posterior = mean[:, :, None], covariance[:, :, :, None], noise[:, None]
     return np.asarray(value + parts.own.log_moment_beside(index[None], 0.5, *posterior)[:, 0])
 
 
@@ -610,18 +703,14 @@ def pair_evidence(
     mixed = np.multiply.outer(root, root) * wide(parts.gram[:, i, index])
     det = np.maximum(own * its - mixed**2, 1e-12 * own * its)
     gain = (its * first**2 + own * second**2 - 2.0 * mixed * first * second) / det
-    found = likelihood(
-        wide(parts.square[:, None]) - gain, wide(parts.log_det[:, None]) + np.log(det)
-    )
-    here = (its * first - mixed * second) / np.sqrt(its * det)
-    there = (own * second - mixed * first) / np.sqrt(own * det)
+    square = wide(parts.square[:, None]) - gain
+    found = likelihood(square, wide(parts.log_det[:, None]) + np.log(det))
+    noise = np.sqrt(likelihood.noise(square))
+    means = (its * first - mixed * second) / det, (own * second - mixed * first) / det
+    upper = [[its / det, -mixed / det], [own / det]]
     positive = np.array([group.positive for group in others])[:, None, None]
-    moments = log_moment(one.positive, here) + log_moment(positive, there)
-    # What their correlation adds, as in log_moments.
-    between = -mixed / np.sqrt(own * its)
-    product = 2.0 * between**2 + 4.0 * between * here * there
-    moments += np.log1p(product / ((1.0 + here**2) * (1.0 + there**2)))
-    return np.asarray(found + moments + np.log(own * its / det**2))
+    moments = log_moments([1, 1], [one.positive, positive], [m / noise for m in means], upper)
+    return np.asarray(found + moments)
 
 
 def mean_of(logs: Array) -> float:
