@@ -243,7 +243,7 @@ class _At:
     remainders : Remainders
     likelihood : Likelihood
     sizes : ndarray
-        Of an effect.
+        Of an effect: root mean square of the part of its change that can be seen (:func:`visible`).
     own : tuple of Group
         Of the anchor's effects.
     groups : mapping of (effect, target) to list of Group
@@ -471,7 +471,7 @@ def _anchored(
     reduced = Reduced.of(products, logs, len(unknowns), offset)
     every = [effects, *groups.values(), *curves.values()]
     return _At(
-        reduced.scaled(_hidden(reduced, [g for some in every for g in some], data.samples)),
+        reduced.scaled(visible(reduced, [g for some in every for g in some], data.samples)),
         remainders,
         Likelihood(comparison.variance.size, comparison.freedom),
         sizes,
@@ -482,12 +482,13 @@ def _anchored(
     )
 
 
-def _hidden(reduced: Reduced, groups: Sequence[Group], samples: int) -> Array:
+def visible(reduced: Reduced, groups: Sequence[Group], samples: int) -> Array:
     """Factors ``(k,)`` by which columns of unit size grow, so that what the unknowns of the model
     cannot do of them has unit size: the smallest size that could be seen is that of this part.
 
-    Under a prior whose sizes begin where a change as a whole could be seen, much of what is called
-    missing could not be, for most of it is a change of the model's own parameters.
+    Unknowns are those of the model about which structures are compared, with the shapes of its
+    effects. Under a prior whose sizes begin where a change as a whole could be seen, much of what
+    is called missing could not be, for most of it is a change of the model's own parameters.
     """
     seen, factors = np.diagonal(reduced.gram[0]), np.ones(reduced.size)
     for group in groups:

@@ -1,8 +1,10 @@
 """Parameters of the declared model, averaged over structures.
 
-About an estimate a structure gives a normal density of the parameters for each size of its effects
-and each remainder outside the catalogue. Their mixture, weighted by evidence and by the structures'
-probabilities, is the posterior of a parameter given any structure.
+About an estimate a structure gives a normal density of all unknowns for each size of its effects
+and each remainder outside the catalogue, times the square of each effect's amplitude: the moment
+density by which structures are compared. On each side of an amplitude's zero it is replaced by the
+normal density with the same mean and covariance. The mixture of all, weighted by evidence and by
+the structures' probabilities, is the posterior of a parameter given any structure.
 
 References
 ----------
@@ -13,10 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import product
 
 import numpy as np
 from scipy import optimize
-from scipy.special import logsumexp, ndtr
+from scipy.special import logsumexp, ndtr, ndtri
+from scipy.stats import qmc
 
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Added
@@ -26,14 +31,24 @@ from bayesoleo.discovery._structure_comparison import (
     Comparison,
     grids_of,
     own_groups,
+    visible,
 )
-from bayesoleo.discovery._structure_evidence import Likelihood, fewer, moment_power
+from bayesoleo.discovery._structure_evidence import (
+    Group,
+    Likelihood,
+    Reduced,
+    fewer,
+    moment_power,
+)
 from bayesoleo.discovery._structures import AveragedParameter, Structure
 
 #: Structures less probable than this, and parts of a mixture lighter than this, are left out.
 LEAST, LIGHTEST = 0.005, 1e-4
 #: Tail outside a central interval of 90 %, on each side.
 TAIL = 0.05
+#: Nodes of a normal density in one dimension, in each of two, and in all of more; and how many
+#: standard deviations they reach.
+NODES, REACH = (61, 31, 1024), 6.0
 
 
 @dataclass(frozen=True)
@@ -104,10 +119,10 @@ class _Structure:
         Of the residual and all columns, by covariance: unknowns, errors of inputs, effects, law.
     logs : ndarray, shape (P,)
         Log determinants.
-    counts : tuple of int
-        Numbers of unknowns with errors of inputs, of columns of effects, and of the law.
-    members : ndarray, shape (columns of effects,)
-        Number of columns of the effect that each belongs to.
+    effects : tuple of Group
+        Columns of each effect, counted among all columns.
+    law : int
+        Number of columns of the law.
     offset : ndarray
         Centres of the unknowns' priors.
     parts : sequence of (pattern, variance of the law or None, weight)
@@ -120,8 +135,8 @@ class _Structure:
     change: Array
     products: Array
     logs: Array
-    counts: tuple[int, int, int]
-    members: Array
+    effects: tuple[Group, ...]
+    law: int
     offset: Array
     parts: Sequence[tuple[int, float | None, float]]
     sizes: Array
@@ -135,15 +150,19 @@ class _Structure:
         data, here = comparison.data, linearised(anchor, comparison.data)
         more = [key for key in structure.effects if key not in anchor.effects]
         groups = [_best_group(columns, key, here.residual, comparison.variance) for key in more]
-        members = [len(group.columns) for group in own_groups(anchor, comparison)]
-        members += [len(group) for group in groups]
         own = here.own * comparison.unit(here.own)[:, None]
-        effects = [own, *(columns.rows[list(group)] for group in groups)]
+        rows = [own, *(columns.rows[list(group.columns)] for group in groups)]
         law = columns.law if structure.outside else columns.law[:0]
         unknowns = np.concatenate([here.unknowns, comparison.shared])
+        offset = np.concatenate([here.offset, np.zeros(len(comparison.shared))])
         remainders, sizes = grids_of(comparison, data.signal(anchor.fit))
-        rows = np.concatenate([here.residual[None], unknowns, *effects, law])
-        products, logs = remainders.covariances.products(rows)
+        every = np.concatenate([here.residual[None], unknowns, *rows, law])
+        products, logs = remainders.covariances.products(every)
+        effects = _in_a_row([*own_groups(anchor, comparison), *groups], 0)
+        reduced = Reduced.of(products, logs, len(unknowns), offset)
+        factors = np.concatenate(
+            [np.ones(1 + len(unknowns)), visible(reduced, effects, data.samples)]
+        )
         outside = [
             (k, None if j is None else float(remainders.laws[j] ** 2), weight)
             for k, j, weight in remainders.weights[1:]
@@ -152,18 +171,18 @@ class _Structure:
             here.names,
             here.theta,
             here.change,
-            products,
+            products * factors[:, None] * factors,
             logs,
-            (len(unknowns), sum(members), len(law)),
-            np.repeat(members, members).astype(float),
-            np.concatenate([here.offset, np.zeros(len(comparison.shared))]),
+            _in_a_row(effects, len(unknowns)),
+            len(law),
+            offset,
             outside if structure.outside else [(0, None, 1.0)],
-            fewer(sizes) if members else sizes[:1],
+            fewer(sizes),
             Likelihood(comparison.variance.size, comparison.freedom),
         )
 
     def normals(self) -> list[_Normal]:
-        """Normal densities by remainder and size of the effects, with their weights."""
+        """Normal densities by remainder, sizes and sides of the effects, with their weights."""
         found = list(self._each())
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(logs - logsumexp(logs))
@@ -173,23 +192,39 @@ class _Structure:
             if w > LIGHTEST
         ]
 
+    def _grid(self) -> list[tuple[float, ...]]:
+        """Sizes of the effects; of more than two one size for all."""
+        number = len(self.effects)
+        if number <= 2:
+            return list(product(self.sizes, repeat=number))
+        return [(size,) * number for size in self.sizes]
+
     def _each(self) -> Iterator[tuple[float, Array, Array]]:
         """Log weight, means and standard deviations of the parameters."""
-        unknowns, _, law = self.counts
-        for pattern, power, weight in self.parts:
-            for size in self.sizes:
-                effects = 1.0 / moment_power(size, self.members)
-                precision = np.concatenate([np.ones(unknowns), effects])
-                if power is not None:
-                    precision = np.concatenate([precision, np.full(law, 1.0 / power)])
-                log, mean, covariance = self._posterior(pattern, precision)
-                count = len(self.names)
-                change = self.change @ covariance[:count, :count] @ self.change.T
-                moved = self.theta + self.change @ mean[:count]
-                yield log + np.log(weight), moved, np.sqrt(np.diag(change))
+        members = [k for group in self.effects for k in group.columns]
+        count = len(self.names)
+        for (pattern, law, weight), sizes in product(self.parts, self._grid()):
+            counts = [len(group.columns) for group in self.effects]
+            power = moment_power(np.array(sizes), np.array(counts))
+            precision = np.concatenate([
+                np.ones(self.offset.size),
+                np.repeat(1.0 / power, counts),
+                np.full(0 if law is None else self.law, 1.0 if law is None else 1.0 / law),
+            ])  # fmt: skip
+            log, mean, covariance, noise = self._posterior(pattern, precision)
+            inner, root = covariance[np.ix_(members, members)], np.sqrt(noise)
+            follow = self.change @ covariance[:count, members] @ np.linalg.inv(inner)
+            rest = self.change @ covariance[:count, :count] @ self.change.T
+            rest = rest - follow @ inner @ follow.T
+            moved = self.theta + self.change @ mean[:count]
+            for share, shift, spread in _by_side(self.effects, power, mean[members] / root, inner):
+                variance = noise * np.diag(rest + follow @ spread @ follow.T)
+                here = moved + root * follow @ shift
+                yield log + np.log(weight) + share, here, np.sqrt(np.maximum(variance, 0.0))
 
-    def _posterior(self, pattern: int, precision: Array) -> tuple[float, Array, Array]:
-        """Log evidence, means and covariance of the columns' coefficients."""
+    def _posterior(self, pattern: int, precision: Array) -> tuple[float, Array, Array, float]:
+        """Log evidence, means and covariance of the columns' coefficients, the latter in units of
+        the noise, and its variance over that measured."""
         size = 1 + precision.size
         gram = self.products[pattern, :size, :size]
         centre = np.zeros(precision.size)
@@ -199,17 +234,82 @@ class _Structure:
         mean = covariance @ right
         square = np.array(gram[0, 0] + precision @ centre**2 - right @ mean)
         log_det = -np.linalg.slogdet(covariance)[1] - np.log(precision).sum() + self.logs[pattern]
-        likelihood = self.likelihood
-        # Of Student's density whose noise is known to some degrees of freedom.
-        scale = (likelihood.freedom + square) / (likelihood.freedom + likelihood.count)
-        return float(likelihood(square, np.array(log_det))), mean, covariance * float(scale)
+        log = float(self.likelihood(square, np.array(log_det)))
+        return log, mean, covariance, float(self.likelihood.noise(square))
 
 
-def _best_group(columns: Columns, key: Added, residual: Array, variance: Array) -> tuple[int, ...]:
+def _in_a_row(groups: Sequence[Group], start: int) -> tuple[Group, ...]:
+    """Groups with their columns one after the other."""
+    found = []
+    for group in groups:
+        end = start + len(group.columns)
+        found.append(Group(tuple(range(start, end)), group.positive))
+        start = end
+    return tuple(found)
+
+
+def _by_side(
+    effects: Sequence[Group], power: Array, mean: Array, covariance: Array
+) -> Iterator[tuple[float, Array, Array]]:
+    """What the moments of effects make of a normal density of their amplitudes, by sides.
+
+    Parameters
+    ----------
+    effects : sequence of Group
+    power : ndarray, shape (effects,)
+        Variances of the normal parts of their priors.
+    mean : ndarray, shape (m,)
+        In units of the noise.
+    covariance : ndarray, shape (m, m)
+
+    Yields
+    ------
+    log weight : float
+    shift : ndarray, shape (m,)
+        Of the mean.
+    covariance : ndarray, shape (m, m)
+    """
+    if not effects:
+        yield 0.0, mean, covariance
+        return
+    nodes, weights = _normal_nodes(mean.size)
+    moved = nodes @ np.linalg.cholesky(covariance).T
+    amplitudes, side, start = mean + moved, np.zeros(len(nodes), dtype=int), 0
+    weights = weights.copy()
+    for group, variance in zip(effects, power, strict=True):
+        own = amplitudes[:, start : start + len(group.columns)]
+        start += len(group.columns)
+        weights *= np.mean(own**2, axis=1) / variance
+        if len(group.columns) == 1:
+            above = own[:, 0] > 0
+            weights *= 2.0 * np.where(above, group.positive, 1.0 - group.positive)
+            side = 2 * side + above
+    for one in np.unique(side):
+        share = weights * (side == one)
+        total = share.sum()
+        if total > 0.0:
+            shift = share @ moved / total
+            away = moved - shift
+            yield float(np.log(total)), shift, (share[:, None] * away).T @ away / total
+
+
+@cache
+def _normal_nodes(count: int) -> tuple[Array, Array]:
+    """Points and weights of a normal density with unit variances."""
+    if count > 2:
+        points = ndtri(qmc.Sobol(count, seed=0).random(NODES[2]))
+        return points, np.full(NODES[2], 1.0 / NODES[2])
+    line = np.linspace(-REACH, REACH, NODES[count - 1])
+    points = np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
+    weights = np.exp(-0.5 * np.sum(points**2, axis=1))
+    return points, weights / weights.sum()
+
+
+def _best_group(columns: Columns, key: Added, residual: Array, variance: Array) -> Group:
     """Columns of an effect at the shapes at which it explains most."""
 
-    def explained(index: tuple[int, ...]) -> float:
-        rows = columns.rows[list(index)] / np.sqrt(variance)
+    def explained(group: Group) -> float:
+        rows = columns.rows[list(group.columns)] / np.sqrt(variance)
         return float(np.sum((np.linalg.qr(rows.T)[0].T @ (residual / np.sqrt(variance))) ** 2))
 
-    return max((group.columns for group in columns.groups[key]), key=explained)
+    return max(columns.groups[key], key=explained)

@@ -1,0 +1,89 @@
+"""Parameters given a structure, against the integral over its effects' amplitudes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayesoleo.discovery._structure_evidence import Group, Likelihood
+from bayesoleo.discovery._structure_parameters import _Structure, _summary
+
+SAMPLES, SIZE = 400, 0.2
+
+
+def columns(own: float, effects: int, seed: int) -> np.ndarray:
+    """One unknown and effects of which the unknown cannot make this part; unit mean square."""
+    basis = np.linalg.qr(np.random.default_rng(seed).standard_normal((SAMPLES, 1 + effects)))[0].T
+    like, rest = np.sqrt(1.0 - own), np.sqrt(own)
+    rows = [basis[0], *(like * basis[0] + rest * other for other in basis[1:])]
+    return np.sqrt(SAMPLES) * np.array(rows)
+
+
+def of_residual(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]) -> _Structure:
+    """About an estimate of zero, with a prior of unit deviation, under known noise."""
+    every = np.concatenate([residual[None], rows])
+    effects = tuple(Group((1 + k,), side) for k, side in enumerate(sides))
+    return _Structure(
+        ("theta",), np.zeros(1), np.eye(1), (every @ every.T)[None], np.zeros(1), effects, 0,
+        np.zeros(1), [(0, None, 1.0)], np.array([SIZE]), Likelihood(SAMPLES, 1e12),
+    )  # fmt: skip
+
+
+def moment_density(b: np.ndarray) -> np.ndarray:
+    normal = SIZE / np.sqrt(3.0)
+    return (b / normal) ** 2 * stats.norm.pdf(b, scale=normal)
+
+
+def exact(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]) -> tuple[float, ...]:
+    """Mean, deviation, and limits of the interval by a grid over all unknowns."""
+    theta = np.linspace(-1.5, 2.5, 401)
+    b = np.linspace(-1.2, 1.2, 401 if len(sides) == 1 else 81)
+    axes = np.meshgrid(theta, *[b] * len(sides), indexing="ij")
+    gram, slope = rows @ rows.T, rows @ residual
+    log = stats.norm.logpdf(axes[0]) + sum(s * a for s, a in zip(slope, axes, strict=True))
+    log = log - 0.5 * sum(
+        gram[i, j] * axes[i] * axes[j] for i in range(len(axes)) for j in range(len(axes))
+    )
+    density = np.exp(log - log.max())
+    for amplitude, side in zip(axes[1:], sides, strict=True):
+        density *= moment_density(amplitude) * np.where(amplitude > 0, side, 1.0 - side)
+    density = density.reshape(theta.size, -1).sum(axis=1)
+    density /= density.sum()
+    mean = float(density @ theta)
+    below = np.cumsum(density) - 0.5 * density
+    sd = float(np.sqrt(density @ (theta - mean) ** 2))
+    return mean, sd, *(float(np.interp(chance, below, theta)) for chance in (0.05, 0.95))
+
+
+@pytest.mark.parametrize("sides", [(0.5,), (0.9,), (1.0,), (0.5, 0.5), (0.9, 0.5)])
+@pytest.mark.parametrize("own", [0.05, 0.5])
+@pytest.mark.parametrize("size", [0.0, 0.5, 1.5, 4.0])
+def test_a_parameter_given_a_structure_is_that_of_the_integral(size, own, sides):
+    """Effects of some standard deviations of the part that the parameter cannot make."""
+    rows = columns(own, len(sides), 7)
+    amplitudes = np.full(len(sides), size / np.sqrt(SAMPLES * own))
+    noise = np.random.default_rng(3).standard_normal(SAMPLES)
+    residual = 0.05 * rows[0] + amplitudes @ rows[1:] + noise
+    parts = [(n.weight, n.mean[0], n.sd[0]) for n in of_residual(residual, rows, sides).normals()]
+    found = _summary(np.array(parts))
+    mean, sd, low, high = exact(residual, rows, sides)
+    # A normal density on each side of zero instead of one with the moment: a tenth of a deviation.
+    assert found.mean == pytest.approx(mean, abs=0.02 * sd)
+    assert found.sd == pytest.approx(sd, rel=0.02)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.1 * sd)
+
+
+def test_intervals_cover_where_data_say_little_of_the_structure():
+    """Draws from the prior: one effect acts, of which the parameter makes nine tenths."""
+    rng, inside, draws = np.random.default_rng(11), 0, 200
+    rows = columns(0.1, 1, 7)
+    for _ in range(draws):
+        theta = rng.standard_normal()
+        amplitude = SIZE / np.sqrt(3.0) * stats.chi.rvs(3, random_state=rng) * rng.choice([-1, 1])
+        residual = theta * rows[0] + amplitude * rows[1] + rng.standard_normal(SAMPLES)
+        known = of_residual(residual, rows, (0.5,))
+        found = _summary(np.array([(n.weight, n.mean[0], n.sd[0]) for n in known.normals()]))
+        inside += found.low < theta < found.high
+    # Three standard errors of a proportion of 0.9.
+    assert inside / draws == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / draws))
