@@ -1,8 +1,9 @@
 """Probabilities of structures under the prior by which the study draws them.
 
-The default prior gives each of some sixty effects its share, the study draws twelve of them. Where
-its own prior is used, statements are right as often as they say if marginal likelihoods are right:
-the rest of a difference between what is said and what is true is the prior's.
+The default prior gives each of some sixty effects its share, the study draws sixteen effects in
+their places. Where its own prior is used, statements are right as often as they say if marginal
+likelihoods are right: the rest of a difference between what is said and what is true is the
+prior's.
 """
 
 from __future__ import annotations
@@ -56,13 +57,17 @@ def mix(kind: str) -> dict[Acting, float]:
 def statements_by_mix(row: Mapping[str, Any]) -> list[tuple[float, bool]]:
     """Probabilities under the study's prior from the evidence of a row, and whether what they are
     of is true."""
-    logs: dict[Acting, float] = {}
+    ways: dict[Acting, list[float]] = {}
     for effects, outside, log in row["evidence"]:
         if outside and effects:
             continue  # the study does not draw both
         acting = frozenset(_named(*effect) for effect in effects)
+        if len(acting) < len(effects):
+            continue  # one effect under two names
         acting = acting or frozenset({OUTSIDE if outside else NOTHING})
-        logs[acting] = float(np.logaddexp(logs.get(acting, -np.inf), log))
+        ways.setdefault(acting, []).append(log)
+    # Names of one effect are ways to one evidence.
+    logs = {acting: float(logsumexp(each) - np.log(len(each))) for acting, each in ways.items()}
     prior = {acting: share for acting, share in mix(row["kind"]).items() if acting in logs}
     if not prior:
         return []

@@ -250,7 +250,23 @@ def limits_of(records: Sequence[Record], drive: str, outputs: Sequence[str]) -> 
 
 @dataclass(frozen=True)
 class _Judge:
-    """Predicts a planned or an existing run with all rivals, and what it would tell."""
+    """Predicts a planned or an existing run with all rivals, and what it would tell.
+
+    Parameters
+    ----------
+    rivals : tuple of Rival
+    records : tuple of Record
+        The existing runs.
+    drive : str
+        Channel that is planned; empty where existing runs are varied.
+    limits : Limits
+    noise : mapping of str to NewRunNoise
+        By output.
+    aim : str
+        What the run is to tell.
+    begins : dict of (rival, run) to TransientRun or None
+        Where solutions of a transient's variations begin; found when first asked for.
+    """
 
     rivals: tuple[Rival, ...]
     records: tuple[Record, ...]
@@ -258,7 +274,7 @@ class _Judge:
     limits: Limits
     noise: Mapping[str, NewRunNoise]
     aim: str
-    solved: dict[tuple[int, str], TransientRun | None] = field(default_factory=dict)
+    begins: dict[tuple[int, str], TransientRun | None] = field(default_factory=dict)
 
     def __call__(self, run: Run) -> ProposedRun | str:
         """The trial, or the reason why there is none."""
@@ -279,11 +295,11 @@ class _Judge:
     def _begin(self, rival: int, label: str) -> TransientRun | None:
         """Where a rival's solutions of a transient's variations begin: found once."""
         key = rival, label
-        if key not in self.solved:
+        if key not in self.begins:
             fit = self.rivals[rival].fit
             known = Knowledge.of(fit, label)
-            self.solved[key] = solved_like(fit, known, self.records, label)
-        return self.solved[key]
+            self.begins[key] = solved_like(fit, known, self.records, label)
+        return self.begins[key]
 
     def _known(self, fit: ModelFit, run: Run) -> Knowledge:
         if isinstance(run, Variation):

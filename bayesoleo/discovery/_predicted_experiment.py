@@ -585,16 +585,17 @@ def _solved(
     fit: ModelFit, known: Knowledge, record: Record, begin: TransientRun | None
 ) -> tuple[Predictor, RunPrediction]:
     """A run's prediction: from the motion of the run that it varies, or else from its start."""
-    for other in (begin, None):
-        predictor = Predictor(
-            known.model, [record], steps=STEPS, scheme=fit.numerics.scheme, backend="numpy", jobs=1
-        )
-        (run,) = predictor.runs
-        if other is not None and isinstance(run, TransientRun):
-            run.start_like(other)
+    predictor = Predictor(
+        known.model, [record], steps=STEPS, scheme=fit.numerics.scheme, backend="numpy", jobs=1
+    )
+    (run,) = predictor.runs
+    if begin is not None and isinstance(run, TransientRun):
+        run.start_like(begin)
         (found,) = predictor.evaluate(known.theta)
-        if found.status is Status.CONVERGED or other is None:
-            break
+        if found.status is not Status.CONVERGED:
+            return _solved(fit, known, record, None)
+    else:
+        (found,) = predictor.evaluate(known.theta)
     return predictor, found
 
 

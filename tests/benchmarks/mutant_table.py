@@ -20,8 +20,6 @@ class Mutant:
         Text that stands there once, and what takes its place.
     tests : tuple of str
         Files or single tests, under ``tests``.
-    equivalent : str
-        Why no test can notice it; such a mutant is neither run nor counted.
     """
 
     name: str
@@ -29,7 +27,6 @@ class Mutant:
     old: str
     new: str
     tests: tuple[str, ...]
-    equivalent: str = ""
 
 
 #: By file: name, old text, new text, tests.
@@ -466,6 +463,22 @@ DISCOVERY: Rows = {
          "moved[np.ix_(own, ~own)] = inside @",
          "discovery/test_expected_errors.py::test_a_parameter_of_a_run_makes_up_for_errors_of_shared_ones"),
     ],
+    "discovery/_structure_comparison.py": [
+        ("sizes of effects are those of their whole change",
+         "factors[index] = min(max(part, LEAST_SEEN), 1.0) ** -0.5",
+         "factors[index] = 1.0",
+         "discovery/test_structures.py::test_columns_have_unit_size_in_what_the_model_cannot_make"),
+    ],
+    "discovery/_structure_parameters.py": [
+        ("averaged parameters without the moments of amplitudes",
+         "weights *= np.mean(own**2, axis=1) / variance",
+         "weights *= np.ones(len(own)) / variance",
+         "discovery/test_averaged_parameters.py"),
+        ("averaged parameters do not follow an effect's amplitude",
+         "here = moved + root * follow @ shift",
+         "here = moved + 0.0 * follow @ shift",
+         "discovery/test_averaged_parameters.py"),
+    ],
     "discovery/_structure_evidence.py": [
         ("half the volume of what is integrated out",
          "self.log_det + 2.0 * logs,",
@@ -476,11 +489,11 @@ DISCOVERY: Rows = {
          "return np.asarray(sizes**2 / 3)",
          "discovery/test_structure_evidence.py"),
         ("an effect of no size has the evidence of a normal density",
-         "moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance))",
-         "moment = np.log(power) + log_moment(positive, mean / np.sqrt(variance))",
+         "moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance * noise))",
+         "moment = np.log(power) + log_moment(positive, mean / np.sqrt(variance * noise))",
          "discovery/test_structure_evidence.py"),
         ("amplitudes of an anchor without their moments",
-         "return log_moments(own.counts, own.positive, list(own.mean), upper)",
+         "return log_moments(own.counts, own.positive, list(own.mean / np.sqrt(noise)), upper)",
          "return 0.0 * log_moments(own.counts, own.positive, list(own.mean), upper)",
          "discovery/test_structure_evidence.py"),
         ("the far side of zero counts as the near one",
@@ -494,6 +507,14 @@ DISCOVERY: Rows = {
         ("correlated amplitudes are taken one by one",
          "product = product * (1.0 + between / (size * squares[i] * squares[j]))",
          "product = product * (1.0 + 0.0 * between)",
+         "discovery/test_structure_evidence.py"),
+        ("an amplitude beside one with a likely side knows nothing of it",
+         "total = total + start**2 + rest + 2.0 * start * slope * third + slope**2 * fourth",
+         "total = total + mean**2 + variance",
+         "discovery/test_structure_evidence.py"),
+        ("noise is what was measured, whatever the residual",
+         "return np.asarray((self.freedom + np.maximum(square, 0.0)) / (self.freedom + self.count))",
+         "return np.ones_like(square)",
          "discovery/test_structure_evidence.py"),
         ("an effect that stood in for another keeps its size beside it",
          "now = [self.mean[i][:, None, None] - moved(i, mean) for i in own]",
@@ -529,15 +550,12 @@ DISCOVERY: Rows = {
 }
 # fmt: on
 
-#: Why no test can notice a mutant, by its name.
-EQUIVALENT: dict[str, str] = {}
-
 
 def _rows() -> Iterator[Mutant]:
     for rows in (SOLVERS, ESTIMATION, POSTERIOR, ERROR_MODELS, DISCOVERY):
         for file, mutants in rows.items():
             for name, old, new, tests in mutants:
-                yield Mutant(name, file, old, new, tuple(tests.split()), EQUIVALENT.get(name, ""))
+                yield Mutant(name, file, old, new, tuple(tests.split()))
 
 
 MUTANTS = tuple(_rows())

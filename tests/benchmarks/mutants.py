@@ -146,9 +146,11 @@ class Copy:
         if status is None:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            status = -signal.SIGKILL
+            raise RuntimeError(f"the machine is too busy: {tests} have not ended")
         seconds = time.monotonic() - begun
-        if status < 0:
+        if status == -signal.SIGKILL:
+            raise RuntimeError(f"killed from outside, for want of memory perhaps: {tests}")
+        if status < 0:  # too much computing, or a crash
             return Verdict(True, f"ended by {signal.Signals(-status).name}", seconds)
         if status not in (PASSED, *NOTICED):
             raise RuntimeError(f"the tests do not run: {tests}\n{self._last(20)}")
@@ -203,13 +205,15 @@ def chosen(few: bool = False, only: str = "") -> list[Mutant]:
 
     Compiled functions take long to compile again; a sample does without.
     """
-    found = [mutant for mutant in MUTANTS if not mutant.equivalent]
     if only:
-        return [mutant for mutant in found if only in mutant.name]
+        found = [mutant for mutant in MUTANTS if only in mutant.name]
+        if not found:
+            raise ValueError(f"no mutant has {only!r} in its name")
+        return found
     if few:
-        sources = {m.file: (ROOT / "bayesoleo" / m.file).read_text("utf-8") for m in found}
-        return [mutant for mutant in found if not is_compiled(sources[mutant.file])][::SPARSE]
-    return found
+        sources = {m.file: (ROOT / "bayesoleo" / m.file).read_text("utf-8") for m in MUTANTS}
+        return [mutant for mutant in MUTANTS if not is_compiled(sources[mutant.file])][::SPARSE]
+    return list(MUTANTS)
 
 
 def measure(

@@ -83,6 +83,18 @@ def test_under_the_prior_of_the_study_only_what_it_draws_has_a_probability():
     assert [true for _, true in said] == [False, False, True]
 
 
+def test_names_of_one_effect_count_once():
+    """Damping in one direction, and by direction beside that which the model has."""
+    names = ["compression_damping", "extension_damping"]
+    evidence = [[[], False, 3.0], *([[[name, "position"]], False, 3.0] for name in names)]
+    evidence.append([[[name, "position"] for name in names], False, 50.0])
+    row = ROW | {"kind": "linear", "truth": ["compression_damping @ position"]}
+    said = structure_mix.statements_by_mix(row | {"evidence": evidence})
+    shares = np.array([0.25 / 6, 0.375 / 12])
+    np.testing.assert_allclose([p for p, _ in said], shares / shares.sum())
+    assert [true for _, true in said] == [False, True]
+
+
 def test_figures_of_a_few_statements():
     plain = PLAIN | {"best": [[[], False, 0.97]]}
     rows = [ROW, plain, {"failed": "no motion repeats"}]

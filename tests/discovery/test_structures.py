@@ -23,11 +23,13 @@ from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structure_comparison import (
+    LEAST_SEEN,
     LIKELY_SIDE,
     Comparison,
     grids_of,
+    visible,
 )
-from bayesoleo.discovery._structure_evidence import Likelihood, fewer
+from bayesoleo.discovery._structure_evidence import Group, Likelihood, Reduced, fewer
 from bayesoleo.discovery._structure_parameters import _summary
 from bayesoleo.discovery._structure_search import (
     Evidence,
@@ -210,6 +212,11 @@ def _sampled(comparison: Comparison, anchor) -> float:
     columns = data.columns([p.sensitivity for p in fit.predictions])
     amplitude = names.index("coulomb_friction")
     unit = comparison.unit(columns[[amplitude]])[0]
+    # Sizes are those of what the other unknowns cannot make of its change.
+    white = columns / np.sqrt(comparison.variance)
+    others = np.delete(white, amplitude, axis=0)
+    rest = white[amplitude] - others.T @ np.linalg.lstsq(others.T, white[amplitude])[0]
+    unit *= np.linalg.norm(white[amplitude]) / np.linalg.norm(rest)
     # Shapes are positive: they are drawn in their logarithm.
     scale = np.array([theta[k] if n in anchor.shapes else 1.0 for k, n in enumerate(names)])
     root = np.linalg.cholesky(1.44 * fit.point.covariance / np.outer(scale, scale))
@@ -242,6 +249,23 @@ def _sampled(comparison: Comparison, anchor) -> float:
             else:
                 logs[n] += fit.problem.priors[k].log_density(draw[None, k])[0]
     return float(logsumexp(logs - proposal) - np.log(len(draws)))
+
+
+@pytest.mark.parametrize("own", [0.3, 1e-9])
+def test_columns_have_unit_size_in_what_the_model_cannot_make(own):
+    """One column is what an unknown does but for this part; the other shares nothing with it."""
+    samples = 50
+    basis = np.linalg.qr(np.random.default_rng(2).standard_normal((samples, 3)))[0].T
+    like = np.sqrt(1.0 - own) * basis[0] + np.sqrt(own) * basis[1]
+    rows = np.sqrt(samples) * np.array([basis[0], like, basis[2]])
+    unknown = 1e8 * rows[:1]  # hardly any prior
+    every = np.concatenate([np.zeros((1, samples)), unknown, rows[1:]])
+    reduced = Reduced.of((every @ every.T)[None], np.zeros(1), 1, np.zeros(1))
+    factors = visible(reduced, [Group((0,)), Group((1,))], samples)
+    part = max(own, LEAST_SEEN)
+    np.testing.assert_allclose(factors, [part**-0.5, 1.0], rtol=1e-4)
+    seen = np.diagonal(reduced.scaled(factors).gram[0]) / samples
+    np.testing.assert_allclose(seen, [own / part, 1.0], rtol=1e-4, atol=1e-6)
 
 
 def test_where_nothing_is_missing_averages_are_those_of_the_fit(plain):
