@@ -52,6 +52,7 @@ if study.live:
 # The default prior gives some sixty effects their share, of which the study draws sixteen. A part
 # of what effects keep back therefore goes to relatives that are never the cause here, such as
 # LuGre's model beside Dahl's. With the study's own prior in the place of the default one most
-# statements are sure, and as many of them are true as they say: these are the lines "by the study's prior".
+# statements are sure, and as many of them are true as they say: these are the lines "by the
+# study's prior".
 
 figure = study.run(lambda: figures.reliability_figure())
