@@ -240,6 +240,13 @@ def score_all(
     return sorted(scores, key=lambda item: -item.share), failed
 
 
+def _directions_of(columns: Array) -> Array:
+    """Rows as single-precision numbers with a largest one of one: a power of a pressure in pascals
+    is beyond their range."""
+    largest = np.abs(columns).max(axis=1, keepdims=True, initial=0.0)
+    return np.asarray((columns / np.where(largest > 0, largest, 1.0)).astype(np.float32))
+
+
 def _attempt(base: Base, option: Option) -> Score | Status | str:
     """The score, or why there is none."""
     candidate = option.candidate
@@ -257,7 +264,7 @@ def _attempt(base: Base, option: Option) -> Score | Status | str:
             continue
         thinned.append(score.columns)
         if base.data is not None:
-            signatures.append(base.data.columns(block.by_run).astype(np.float32))
+            signatures.append(_directions_of(base.data.columns(block.by_run)))
         if best is None or score.fall > best.fall:
             best, used = score, block
     if best is None:

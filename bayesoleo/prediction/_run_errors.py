@@ -11,7 +11,7 @@ discretisation error is estimated once, at the point estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from typing import cast
 
@@ -29,6 +29,7 @@ from bayesoleo.prediction._inputs import (
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
 from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
 from bayesoleo.solvers._mesh import equidistant, tableau
@@ -36,6 +37,7 @@ from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import DEFAULT_SCHEME
 from bayesoleo.solvers._switched import PeriodicProblem
 from bayesoleo.solvers._switching import evaluate
+from bayesoleo.solvers._transient import moved_from_start
 
 #: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
 DRAWS = 16
@@ -66,7 +68,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     ndarray, shape (ny, k, N)
         Real and imaginary parts of all significant harmonics of all inputs; of a transient the
         lines of the noise that its inputs hold, or where these are too many draws over the root of
-        their number; SI; no columns where the run could not be solved.
+        their number, and the errors of channels that its start is read from; SI; no columns where
+        the run could not be solved.
     """
     derived = run.kernels.derived
     ny, samples = run.measured.shape
@@ -87,6 +90,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     columns = np.einsum("yuN,ukN->ykN", yu[0], at_samples)
     for part, moved in _moved(run, one, x) if derived.dofs else ():
         columns[:, part] += np.einsum("yzN,zkN->ykN", yz[0], moved)
+    by_start = _moved_by_start(run, p, x)
+    columns = np.concatenate([columns, np.einsum("yzN,zkN->ykN", yz[0], by_start)], axis=1)
     return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 
@@ -111,6 +116,53 @@ def _moved(run: RunPredictor, p: Array, x: Array) -> Iterator[tuple[slice, Array
         right = np.einsum("lduN,ukN->ldkN", gu, changes[:, part])
         states = run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
         yield part, run.scheme.sample(states, run.plan, step)[0]
+
+
+def _moved_by_start(run: RunPredictor, p: Array, x: Array) -> Array:
+    """Change of the dofs' rows at the samples, shape (nz, k, N), by errors of a measured start.
+
+    One sample is smoothed with those beside it, and is still not the true state.
+    """
+    d, samples = len(run.scheme.orders), run.record.position.size
+    nz = run.scheme.state_size + d
+    none = np.zeros((nz if run.kernels.derived.dofs else 0, 0, samples))
+    if not isinstance(run, TransientRun) or not run.kernels.derived.dofs:
+        return none
+    errors = _start_errors(run)
+    if not errors.shape[1]:
+        return none
+    boundary, lanes, n = run.boundary, np.zeros(1, dtype=np.int64), run.steps
+    points, step = boundary.inputs.shape[1], boundary.step(n)
+    z, g, gz = np.zeros((1, nz, points)), np.zeros((1, d, points)), np.zeros((1, d, nz, points))
+    run.scheme.rows(x, lanes, step, z)
+    run.kernels.jacobian(z, boundary.inputs, p[None], lanes, g, gz)
+    start = (run.initial.by_measured(p) @ errors)[None]
+    right = np.zeros((1, d, errors.shape[1], points))
+    states, _, _ = moved_from_start(boundary, n, gz, right, start, lanes)
+    return np.asarray(run.scheme.sample(states, run.plan, step)[0])
+
+
+def _start_errors(run: TransientRun) -> Array:
+    """Root ``(m, k)`` of the covariance of what a start is read from."""
+    items, record = run.initial.measured(), run.record
+    blocks: list[Array] = []
+    for channel in dict.fromkeys(channel for channel, _, _ in items):
+        orders = {k: order for k, (name, order, _) in enumerate(items) if name == channel}
+        curve = cast(Smoothed, signal_of(record, channel, max(*orders.values(), 1)))
+        block = np.zeros((len(items), 0))
+        if curve.noise > 0.0:
+            value, *changes = _curve_changes(curve, record, (0, *orders.values()), np.zeros(1))
+            # At the end of a record a smooth curve is also biased, by about the noise of a sample.
+            factor = max(1.0, curve.noise / max(float(np.linalg.norm(value)), 1e-300))
+            block = np.zeros((len(items), value.shape[0]))
+            block[list(orders)] = factor * np.array(changes)[:, :, 0]
+        blocks.append(block)
+    every = np.concatenate(blocks, axis=1) if blocks else np.zeros((0, 0))
+    if every.shape[1] <= len(items):
+        return every
+    # As few columns as there are values.
+    values, vectors = np.linalg.eigh(every @ every.T)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _input_changes(run: RunPredictor, phase: Array) -> Array:
@@ -166,19 +218,28 @@ def _transient_changes(run: RunPredictor, position: Array) -> Array:
         if not orders:
             continue
         curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
-        lines = _noise_lines(curve, record)
-        draws = () if lines is not None else _errors(curve)
-        size = len(draws) if lines is None else lines[0].size
-        block = np.zeros((len(rows), size, position.size))
-        for k, order in orders.items():
-            if lines is not None:
-                omega, sd = lines
-                turn = np.multiply.outer(omega, position * record.span) + order * np.pi / 2
-                block[k] = (sd * omega**order)[:, None] * np.cos(turn)
-            for j, draw in enumerate(draws):
-                block[k, j] = draw.evaluate(position, record.rate, order) / np.sqrt(DRAWS)
+        changes = _curve_changes(curve, record, orders.values(), position)
+        block = np.zeros((len(rows), changes.shape[1], position.size))
+        block[list(orders)] = changes
         blocks.append(block)
     return np.concatenate(blocks, axis=1)
+
+
+def _curve_changes(
+    curve: Smoothed, record: Record, orders: Iterable[int], position: Array
+) -> Array:
+    """Change of some derivatives of a curve by one standard deviation of each of its errors."""
+    lines, found = _noise_lines(curve, record), []
+    draws = () if lines is not None else _errors(curve)
+    for order in orders:
+        if lines is not None:
+            omega, sd = lines
+            turn = np.multiply.outer(omega, position * record.span) + order * np.pi / 2
+            found.append((sd * omega**order)[:, None] * np.cos(turn))
+        else:
+            each = [draw.evaluate(position, record.rate, order) for draw in draws]
+            found.append(np.reshape(each, (len(draws), position.size)) / np.sqrt(DRAWS))
+    return np.stack(found)
 
 
 def _noise_lines(curve: Smoothed, record: Record) -> tuple[Array, Array] | None:

@@ -30,7 +30,7 @@ import sympy as sp
 from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import Derived
-from bayesoleo.model._drive_and_start import EQUILIBRIUM, start_of
+from bayesoleo.model._drive_and_start import EQUILIBRIUM, START, start_of
 from bayesoleo.model._expressions import (
     derivative_symbol,
     parse,
@@ -163,6 +163,7 @@ class InitialState:
 
     def __init__(self, model: Model, kernels: Kernels, record: Record):
         self.kernels, derived = kernels, kernels.derived
+        self.record = record
         self.inputs = input_rows(record, derived.inputs, np.zeros(1))
         starts = [start_of(model, dof) for dof in derived.dofs]
         channels = {*model.inputs, *model.outputs} - {*model.parameters, *model.conditions}
@@ -177,6 +178,8 @@ class InitialState:
             for start, order in zip(starts, derived.orders, strict=True)
             for k in range(order)
         ]
+        self.declared = expressions
+        self.channels = frozenset(channels)
         self._values = _Table([_measured(e, record, channels) for e in expressions], kernels)
         guesses = [_measured(_guess(model, dof), record, channels) for dof in derived.dofs]
         self._guesses = _Table(guesses, kernels)
@@ -195,6 +198,38 @@ class InitialState:
         bad = ~np.isfinite(state).all(axis=1) | ~np.isfinite(state_p).all(axis=(1, 2))
         status[bad & (status == Status.CONVERGED.value)] = Status.NOT_FINITE.value
         return StartStates(state, state_p, status)
+
+    def measured(self) -> list[tuple[str, int, sp.Symbol]]:
+        """Channels that a start is read from, with the order of the derivative, where the start is
+        not estimated."""
+        found: dict[str, tuple[str, int, sp.Symbol]] = {}
+        for expression in self.declared:
+            names = {str(item) for item in expression.free_symbols}
+            if any(name.startswith(START) for name in names):
+                continue  # the estimate corrects what the channel shows
+            for item in expression.free_symbols:
+                channel, order = split_derivative(item)
+                if channel in self.channels:
+                    found[str(item)] = channel, order, item
+        return [found[name] for name in sorted(found)]
+
+    def by_measured(self, p: Array) -> Array:
+        """Derivatives of the initial state by :meth:`measured`, shape (D, m), at constants ``p``
+        of shape (np,)."""
+        rest = np.zeros((1, len(self.resting)))
+        if self.resting.any():
+            rest, _, _ = self._equilibrium(p[None])
+        owner = np.repeat(np.arange(len(self.resting)), self.kernels.derived.orders)
+        constants = dict(zip(self.kernels.derived.constants, p, strict=True))
+        items = self.measured()
+        found = np.zeros((len(self.declared), len(items)))
+        for row, (expression, dof) in enumerate(zip(self.declared, owner, strict=True)):
+            for k, (_, _, item) in enumerate(items):
+                slope = _measured(sp.diff(expression, item), self.record, set(self.channels))
+                values = {symbol(name): constants[name] for name in constants}
+                values[symbol(EQUILIBRIUM)] = rest[0, dof]
+                found[row, k] = float(slope.xreplace(values))
+        return found
 
     def _equilibrium(self, p: Array) -> tuple[Array, Array, Integers]:
         """Rest positions ``(L, d)`` of the dofs that ask for them, by damped Newton steps."""

@@ -289,16 +289,48 @@ def transient_sensitivities(
     scheme.rows(solution.x, lanes, step, z)
     problem.equations.jacobian(z, problem.inputs, p, lanes, g, gz)
     problem.equations.parameters(z, problem.inputs, p, lanes, right)
+    x_theta, transition, ok = moved_from_start(problem, n, gz, right, start_p, lanes)
+    status = solution.status.copy()
+    status[lanes[~ok[lanes]]] = Status.SINGULAR.value
+    return replace(solution, status=status), x_theta, transition
+
+
+def moved_from_start(
+    problem: Boundary, n: int, gz: Array, right: Array, start_p: Array, lanes: Integers
+) -> tuple[Array, Array, Flags]:
+    """Changes of a motion by changes of its initial state and of its equations.
+
+    Parameters
+    ----------
+    problem : Boundary
+        As solved.
+    n : int
+        Steps.
+    gz : ndarray, shape (L, d, nz, N)
+        Partial derivatives of the equations at the points.
+    right : ndarray, shape (L, d, k, N)
+        Changes of the equations; overwritten.
+    start_p : ndarray, shape (L, D, k)
+        Of the initial state.
+    lanes : ndarray of int
+        Which of the L to solve.
+
+    Returns
+    -------
+    x : ndarray, shape (L, n, w, k)
+    transition : ndarray, shape (L, D, D)
+        Derivatives of the last state by the first.
+    ok : ndarray of bool, shape (L,)
+    """
     # A motion that carries the initial derivative on without a force is known; what is left to
     # solve for starts at zero.
     base = _free_motion(problem, n, start_p)
     rows = _free_rows(problem, n, start_p)
-    for k in range(nz):
+    for k in range(gz.shape[2]):
         right += gz[:, :, k, None, :] * rows[:, None, k]
-    x_theta, transition, ok = scheme.linear(gz, right, None, lanes, step, initial=True)
-    status = solution.status.copy()
-    status[lanes[~ok[lanes]]] = Status.SINGULAR.value
-    return replace(solution, status=status), x_theta + base, transition
+    step = problem.step(n)
+    x, transition, ok = problem.scheme.linear(gz, right, None, lanes, step, initial=True)
+    return x + base, transition, ok
 
 
 def _free_motion(problem: Boundary, n: int, start_p: Array) -> Array:
