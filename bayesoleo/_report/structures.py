@@ -206,13 +206,23 @@ def parameters(summary: Mapping[str, Any]) -> Table | None:
     for parameter, one in found["parameters"].items():
         average = one["averaged"]
         scale = engineering(one["unit"], abs(average["mean"]))
-        cells = [_with_sd(one[key], scale) for key in ("declared", "final", "averaged")]
+        cells = [_with_sd(one[key], scale) for key in ("declared", "final")]
+        # A mean may lie outside the interval, where an improbable structure is far off.
+        middle = average.get("median", average["mean"])
+        cells.append(format_number(scale.factor * middle, scale.factor * average["sd"]))
         low, high = (
             format_number(scale.factor * end, scale.factor * average["sd"])
             for end in average["interval"]
         )
         rows.append([parameter, *cells, f"{low} … {high}", scale.unit])
-    head = ["parameter", "declared model", "final model", "averaged", "90 % interval", "unit"]
+    head = [
+        "parameter",
+        "declared model",
+        "final model",
+        "averaged (median)",
+        "90 % interval",
+        "unit",
+    ]
     return Table(head, rows)
 
 
@@ -274,10 +284,14 @@ def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = 
 
 
 def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:
-    """The entry with rivals as they are called."""
+    """The entry with rivals as they are called, without the effects that all of them have."""
+    shared = set.intersection(*(set(one.split(" + ")) for one in entry["rivals"] or [""]))
+    shared = shared if len(entry["rivals"]) > 1 else set()
+    every = [e for e in (entry["rivals"] or [""])[0].split(" + ") if e in shared]
 
     def words(names: Sequence[str]) -> list[str]:
-        return [" with ".join(called(e, titles) for e in one.split(" + ")) for one in names]
+        own = [[e for e in one.split(" + ") if e not in shared] for one in names]
+        return [" with ".join(called(e, titles) for e in one) or "nothing more" for one in own]
 
     def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
         if found is None:
@@ -286,6 +300,7 @@ def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[st
 
     return {
         **entry,
+        "shared": [called(e, titles) for e in every],
         "rivals": words(entry["rivals"]),
         "runs": [run(one) for one in entry["runs"]],
         "repeat": run(entry["repeat"]),
@@ -396,7 +411,10 @@ def _question(entry: Mapping[str, Any]) -> str:
     if entry["question"] == "structures":
         pairs = zip(entry["rivals"], entry.get("probabilities") or [], strict=False)
         known = [f"{name} ({chance:.2f})" for name, chance in pairs]
-        return f"What is missing, by probability: {listed(known or entry['rivals'])}."
+        beside = f" beside {listed(entry['shared'])}" if entry["shared"] else ""
+        among = " among these" if entry["note"] else ""
+        listing = listed(known or entry["rivals"])
+        return f"What is missing{beside}, by probability{among}: {listing}."
     if entry["question"] == "indistinguishable":
         first, *others = entry["rivals"]
         return f"These data cannot tell {first}, which was added, from {listed(others)}."

@@ -351,7 +351,7 @@ def fit_model(
     Verbeek (1993), eqs. 3.17, 3.19 and 3.23.
     """
     callback, policy = progress or (lambda _: None), numerics.policy
-    steps = numerics.steps or first_steps(model, records)
+    steps, begun = numerics.steps or first_steps(model, records), None
     while True:
         problem = _problem(model, records, numerics, steps, share)
         callback(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
@@ -390,8 +390,12 @@ def fit_model(
             shift = error = float("nan")
             if check_mesh:
                 shift, error = _mesh_shift(problem, point, predictions, policy)
+        # The mode begins with the estimate, and that on a finer mesh with the last: what is told
+        # is where all began.
+        begun = mbe.start if begun is None else begun
         fine = not shift > policy.mesh_shift
         if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
+            mbe, point = replace(mbe, start=begun), replace(point, start=begun)
             return ModelFit(model, problem, mbe, point, predictions, steps, numerics, shift, error)
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.

@@ -20,7 +20,7 @@ from scipy import stats
 from bayesoleo import _schema as schema
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
-from bayesoleo.discovery._assembly import Added, AddedEffect, Assembly, Roles
+from bayesoleo.discovery._assembly import Added, Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
@@ -40,6 +40,9 @@ NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
 
 #: Probability that the effect of a certain name has at least, where probabilities were computed.
 SURE = 0.95
+#: Movement of a parameter by a finer mesh, in standard deviations, from which on the residual may
+#: be the error of the solution.
+UNRESOLVED = 1.0
 #: Beginning of the note on probabilities that could not be computed.
 NO_PROBABILITIES = "the probabilities of structures could not be computed"
 #: Beginning of a note that lists parameters.
@@ -90,7 +93,7 @@ def certainty_of(final: State, certain: bool) -> str | None:
         return schema.NO_CAUSE
     if not _as_expected(final):
         return schema.LIKENESS
-    return schema.CERTAIN if certain else schema.PROBABLE
+    return schema.CERTAIN if certain and not final.fit.shift > UNRESOLVED else schema.PROBABLE
 
 
 def _as_expected(final: State) -> bool:
@@ -363,7 +366,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
-        limit = _limit(state.assembly.steps, len(rounds), max_effects)
+        limit = _limit(state, len(rounds), max_effects)
         outcome = examine(
             state,
             roles,
@@ -433,8 +436,7 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += state.too_quiet
     if not state.at_floor:
         notes.append(
-            "intervals include independent noise only: they are too narrow while a repeating error"
-            " remains"
+            "a repeating error remains: intervals under independent errors would be too narrow"
         )
     return ClosedLoop(
         progress.rounds,
@@ -447,8 +449,9 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     )
 
 
-def _limit(steps: Sequence[AddedEffect], rounds: int, max_effects: int) -> str:
+def _limit(state: State, rounds: int, max_effects: int) -> str:
     """Why a round may only rank; empty where it may add an effect."""
+    steps, fit = state.assembly.steps, state.fit
     added = len(steps)
     if max_effects == 0:
         return "effects were to be ranked only, not added"
@@ -458,6 +461,11 @@ def _limit(steps: Sequence[AddedEffect], rounds: int, max_effects: int) -> str:
         return f"the largest allowed number of effects, {max_effects}, has been added"
     if rounds > 2 * max_effects:
         return f"effects were added and removed again for {rounds} rounds"
+    if fit.shift > UNRESOLVED:
+        return (
+            f"the mesh is too coarse: {fit.steps} steps move a parameter by {fit.shift:.2g} of its"
+            " standard deviations, so that the residual may be the error of the solution"
+        )
     return ""
 
 

@@ -106,7 +106,7 @@ def _summary(parts: Array) -> AveragedParameter:
     def at(chance: float) -> float:
         return float(optimize.brentq(lambda x: weight @ ndtr((x - mean) / sd) - chance, low, high))
 
-    return AveragedParameter(centre, spread, at(TAIL), at(1.0 - TAIL))
+    return AveragedParameter(centre, spread, at(TAIL), at(1.0 - TAIL), at(0.5))
 
 
 @dataclass(frozen=True)

@@ -164,15 +164,18 @@ class AveragedParameter:
     Parameters
     ----------
     mean, sd : float
-        SI.
+        SI. A structure that is improbable but far off may draw the mean out of the interval.
     low, high : float
         Ends of the central 90 % interval, SI.
+    median : float
+        SI; always within the interval.
     """
 
     mean: float
     sd: float
     low: float
     high: float
+    median: float
 
 
 @dataclass(frozen=True)

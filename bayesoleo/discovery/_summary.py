@@ -159,6 +159,7 @@ def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
             "mean": one.mean,
             "sd": one.sd,
             "interval": [one.low, one.high],
+            "median": one.median,
         }
     return entries
 

@@ -3,13 +3,14 @@ sd."""
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bayesoleo import system
 from bayesoleo.discovery._fit import FEWEST_STEPS, Numerics, first_steps, fit_model
-from bayesoleo.discovery._loop import _warnings
+from bayesoleo.discovery._loop import UNRESOLVED, _limit, _warnings
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._result_tree import point_group
 from bayesoleo.model import Model, Parameter
@@ -75,6 +76,24 @@ def test_a_mesh_that_did_not_do_is_said_plainly(monkeypatch):
     assert text in _warnings(coarse)
     monkeypatch.setattr("bayesoleo.discovery._fit._halved", lambda *_: None)
     assert "could not be estimated" in fit(1e-2, 1024).doubts[0]
+
+
+def test_no_effect_is_added_to_a_residual_that_may_be_the_solver_s():
+    """Where no finer mesh is allowed, a further effect could explain what the steps leave."""
+    state = SimpleNamespace(assembly=SimpleNamespace(steps=()), fit=fit(1e-5, 64))
+    assert state.fit.shift > UNRESOLVED
+    assert "64 steps move a parameter by" in _limit(state, 1, 8)
+    state.fit = fit(1e-4, 512)
+    assert SearchPolicy().mesh_shift < state.fit.shift < UNRESOLVED
+    assert _limit(state, 1, 8) == ""
+
+
+def test_the_start_told_is_that_of_the_first_mesh():
+    found = fit(1e-4)
+    assert found.steps > FEWEST_STEPS
+    np.testing.assert_array_equal(found.point.start, found.mbe.start)
+    nominal = [MODEL.parameters[name].value for name in found.problem.names]
+    np.testing.assert_allclose(found.mbe.start, nominal)
 
 
 def test_an_error_between_the_points_of_all_steps_is_seen():

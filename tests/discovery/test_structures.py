@@ -285,6 +285,8 @@ def test_an_average_over_two_structures_contains_both():
     found = _summary(np.array([[0.5, -5.0, 1.0], [0.5, 5.0, 1.0]]))
     assert found.mean == pytest.approx(0.0)
     assert found.sd == pytest.approx(np.sqrt(26.0))
+    far = _summary(np.array([[0.97, 0.0, 1.0], [0.03, 1000.0, 1.0]]))
+    assert far.low < far.median < far.high < far.mean
     # Five per cent of the mixture are ten of the lower part, whose quantile is -1.2816.
     assert (found.low, found.high) == pytest.approx((-6.2816, 6.2816), abs=1e-4)
     alone = _summary(np.array([[0.5, 3.0, 2.0]]))

@@ -10,7 +10,7 @@ from bayesoleo import _schema as schema
 from bayesoleo.discovery._loop import certainty_of, explained_by_physics, verdict_of
 
 
-def state(ratio, *families, floor=1.15, quiet=()):
+def state(ratio, *families, floor=1.15, quiet=(), shift=0.05):
     """A model with effects of some families, whose one held-out run has a ratio."""
     steps = [Stub(effect=Stub(id=family, family=family)) for family in families]
     entries = [Stub(ratio_to_expected=ratio)]
@@ -20,6 +20,7 @@ def state(ratio, *families, floor=1.15, quiet=()):
         too_quiet=quiet,
         hold_errors=Stub(entries=entries),
         fit_errors=Stub(entries=[]),
+        fit=Stub(shift=shift),
     )
 
 
@@ -70,6 +71,11 @@ def test_less_error_than_chance_allows_is_no_success():
     assert verdict_of([added("run-to-run", NONE, found)], NONE, found) == schema.UNEXPLAINED
     physics = state(0.16, "friction", quiet=("too little",))
     assert verdict_of([added("friction", NONE, physics)], NONE, physics) == schema.UNEXPLAINED
+
+
+def test_no_name_is_certain_on_a_mesh_that_moves_the_estimate():
+    found = state(1.0, "friction", shift=2.0)
+    assert certainty_of(found, certain=True) == "probable"
 
 
 def test_certainty_of_names():

@@ -63,6 +63,15 @@ def test_probabilities_of_structures_are_told():
     assert question == "What is missing, by probability: a with c (0.60) and nothing (0.40)."
 
 
+def test_effects_that_all_rivals_have_are_told_once():
+    rivals = ["a + b + c", "a + b + d", "a + b"]
+    given = entry(question="structures", rivals=rivals, note="others (probability 0.82)")
+    given |= {"probabilities": [0.5, 0.3, 0.2]}
+    question = proposal_lines(given)[0]
+    expected = "What is missing beside a and b, by probability among these: "
+    assert question == f"{expected}c (0.50), d (0.30) and nothing more (0.20)."
+
+
 def test_a_variation_of_a_measured_run_is_told_by_what_it_changes():
     runs = [trial({("a", "b"): 3.0}) | {"like": "drop 2", "change": "force × 1.2, duration × 2"}]
     repeat = trial({("a", "b"): 1.0}, run="drop 1", information=0.2)

@@ -236,6 +236,9 @@ def test_averaged_parameters_stand_beside_the_estimates():
     assert (name, final, unit) == ("stiffness", "–", "kN/m")
     assert declared.startswith("1.520")
     assert averaged.startswith("1.500")
+    one["averaged"] = {**one["averaged"], "mean": 1600.0, "median": 1501.0}
+    table = structures.parameters({"structures": {"parameters": {"stiffness": one}}})
+    assert table.rows[0][3].startswith("1.501")
     assert interval == "1.480 … 1.521"
 
 
