@@ -7,6 +7,7 @@ ranks new runs by how well they separate the candidate effects.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,9 @@ from bayesoleo.model._model import Model
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._log_density import LogDensity
 
+#: Seconds of a quick search from which on its result is written before the posterior is sampled:
+#: a command that is killed then says that the search had ended.
+WORTH_KEEPING = 60.0
 #: What stands in the place of the search's last round while it goes on.
 NOT_YET = "the search had not finished when this was written"
 
@@ -114,9 +118,9 @@ def close(
     task = prepare(campaign, model, settings, progress=progress)
     _check_aim(task)
     with output.alone():
-        stages = Stages(callback)
+        stages, begun = Stages(callback), time.monotonic()
         loop, questions = search(task, settings.max_effects, stages, output, resume=True)
-        if not settings.quick:
+        if not settings.quick or time.monotonic() - begun > WORTH_KEEPING:
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
         place = output.checkpoints

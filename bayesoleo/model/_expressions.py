@@ -307,7 +307,7 @@ class _Builder(ast.NodeVisitor):
             return sp.pi
         if node.id == "time":
             return TIME
-        hint = choose(node.id, sorted(self.known))
+        hint = f"{choose(node.id, sorted(self.known))}; or declare it in parameters"
         raise ModelError(f"{self.where}: unknown name {node.id}", value=self.text, hint=hint)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> sp.Expr:

@@ -476,7 +476,7 @@ def _in_si(unit: Unit, value: float | None) -> str:
     converted = float(unit.to_si(value))
     if unit.shift:
         return f"write {converted:.10g} in {wanted}; differences keep their size"
-    more = f", and its prior times {unit.factor:.10g}" if value else ""
+    more = f", and its sd and bounds times {unit.factor:.10g} (relative_sd stays)" if value else ""
     return f"write {converted:.10g} in {wanted}{more}"
 
 

@@ -21,10 +21,13 @@ def law(unit: str = "N/m", **changes) -> Model:
 @pytest.mark.parametrize(
     ("unit", "message"),
     [
-        ("N/mm", r"parameter 'k' is in N/mm.*in SI.*write 5000 in N/m, and its prior times 1000"),
+        (
+            "N/mm",
+            r"parameter 'k' is in N/mm.*in SI.*write 5000 in N/m, and its sd and bounds times 1000",
+        ),
         ("bananas", r"parameter 'k' has a unit that is not known \(got 'bananas'\); write one"),
         ("Nm", r"not known \(got 'Nm'\); did you mean N\*m"),
-        ("bar", r"write 500000 in Pa, and its prior times 100000"),
+        ("bar", r"write 500000 in Pa, and its sd and bounds times 100000"),
         ("degC", r"write 278.15 in K; differences keep their size"),
         ("rpm", r"write 0.5235987756 in rad/s"),
     ],
