@@ -145,9 +145,27 @@ def estimate(
     if quantities:
         rows = [[name, row["estimate"], row["sd"]] for name, row in quantities.items()]
         console.print(shell.table(["of the errors and runs", "mode", "sd"], rows, words=1))
+    for line in _residuals(tree):
+        console.print(line, markup=False, highlight=False)
     for line in _how_it_went(_status(tree)):
         console.print(line, style="dim", markup=False, highlight=False)
     _print_written(out, console)
+
+
+def _residuals(tree: xr.DataTree) -> list[str]:
+    """The residual of each output, beside the noise of a sample of the fitted runs."""
+    import numpy as np
+
+    point, found = tree[schema.POINT].to_dataset(), []
+    noise = tree[schema.NOISE].to_dataset()
+    for name, variance in zip(
+        point[schema.OUTPUT].values, point[schema.VARIANCE].values, strict=True
+    ):
+        sd, sizes = float(np.sqrt(variance)), noise[str(name)]
+        size = float(np.sqrt(np.nanmean(sizes.values**2)))
+        more = f", {sd / size:.3g} times the noise of a sample ({size:.4g})" if size > 0 else ""
+        found.append(f"{name}: residual standard deviation {sd:.4g}{more}")
+    return found
 
 
 def _point(tree: xr.DataTree) -> dict[str, dict[str, Any]]:
@@ -185,7 +203,7 @@ def _how_it_went(status: dict[str, Any]) -> list[str]:
     if failures:
         lines.append(f"trials that failed: {failures}")
     if "steps" in status:
-        mesh = f"{status['scheme']} with {status['steps']} steps in a period"
+        mesh = f"{status['scheme']} with {status['steps']} steps in a period or transient"
         if status["mesh_shift"] <= SearchPolicy().mesh_shift:
             mesh += (
                 f": half as long, they would move no parameter by more than"

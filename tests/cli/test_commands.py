@@ -236,6 +236,7 @@ def test_estimate_shows_the_point(run, campaign, model, tmp_path):
     assert (out / "results.nc").exists()
     text = run("estimate", campaign, "-m", model, "--quiet").stdout
     assert "mbe" in text
+    assert "times the noise of a sample" in " ".join(text.split())
     assert "stiffness" in text
 
 
