@@ -71,7 +71,8 @@ def next_best(summary: Mapping[str, Any]) -> str:
     best = max(sums, key=lambda key: sums[key], default=None)
     if best is None or sums[best] < SHOWN:
         return ""
-    return f" The next is {_listed(best, summary)}, {spoken(sums[best])}."
+    only = "only " if best == (OUTSIDE,) else ""  # beside effects it has a probability of its own
+    return f" The next is {only}{_listed(best, summary)}, {spoken(sums[best])}."
 
 
 def _listed(names: Sequence[str], summary: Mapping[str, Any]) -> str:

@@ -86,6 +86,9 @@ def test_a_certain_name_is_said_with_its_probability_and_the_next():
     )
     assert text.endswith("The next is breakaway friction (stroke), 0.02.")
     assert badge(found) == "effect added · certain"
+    found = summary_of({(COULOMB,): 0.9, (COULOMB, OUTSIDE): 0.06, (OUTSIDE,): 0.03}, [COULOMB],
+                       schema.CERTAIN)  # fmt: skip
+    assert headline(found).endswith("The next is only something outside the catalogue, 0.03.")
 
 
 def test_nothing_missing_is_said_with_its_probability():
