@@ -165,7 +165,7 @@ def two_columns(correlation: float, truth: tuple[float, float]) -> Reduced:
 
 def pair_integral(part: Reduced, side: float, size: float, its: float) -> float:
     """Log evidence over that of nothing, the first amplitude with a likely side."""
-    grid = np.linspace(-4.0, 4.0, 3201)
+    grid = np.linspace(-3.0, 3.0, 1201)
     first, second = grid[:, None], grid
     (slope,), (gram,) = part.slope, part.gram
     log = slope[0] * first + slope[1] * second - gram[0, 1] * first * second
