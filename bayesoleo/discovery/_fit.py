@@ -11,7 +11,7 @@ priors have almost no mass. Only then is the time for other starts well spent.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -45,6 +45,8 @@ UNKNOWN_SHIFT = (
     "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
     " the estimates"
 )
+#: Shift, error of the motion and of the outputs of a mesh of which nothing is known.
+UNKNOWN_MESH = (float("nan"), float("nan"), np.full((1, 1), np.nan))
 #: Error of a motion over its swing below which its estimate resolves nothing more.
 RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
@@ -230,6 +232,9 @@ class ModelFit:
         points, in posterior standard deviations; NaN where it is not known.
     motion_error : float
         Estimated largest error of a fitted run's motion over its swing; NaN where it is not known.
+    mesh_error : ndarray, shape (runs, outputs)
+        Root mean square of what a finer mesh changes of the predictions, SI; NaN where it is not
+        known.
     """
 
     model: Model
@@ -241,6 +246,7 @@ class ModelFit:
     numerics: Numerics
     shift: float
     motion_error: float = float("nan")
+    mesh_error: Array = field(default_factory=lambda: np.full((1, 1), np.nan))
 
     @property
     def doubts(self) -> list[str]:
@@ -385,18 +391,20 @@ def fit_model(
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         # Without dofs there is no mesh.
-        shift, error = 0.0, 0.0
+        shift, error, change = 0.0, 0.0, np.zeros((1, 1))
         if model.dofs:
-            shift = error = float("nan")
+            shift, error, change = UNKNOWN_MESH
             if check_mesh:
-                shift, error = _mesh_shift(problem, point, predictions, policy)
+                shift, error, change = _mesh_shift(problem, point, predictions, policy)
         # The mode begins with the estimate, and that on a finer mesh with the last: what is told
         # is where all began.
         begun = mbe.start if begun is None else begun
         fine = not shift > policy.mesh_shift
         if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
             mbe, point = replace(mbe, start=begun), replace(point, start=begun)
-            return ModelFit(model, problem, mbe, point, predictions, steps, numerics, shift, error)
+            return ModelFit(
+                model, problem, mbe, point, predictions, steps, numerics, shift, error, change
+            )
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         steps, start = 2 * steps, point.theta
@@ -423,23 +431,29 @@ def _mesh_shift(
     point: PointEstimate,
     predictions: list[RunPrediction],
     policy: SearchPolicy,
-) -> tuple[float, float]:
-    """Shift of the estimate that the discretisation causes, in standard deviations, and the largest
-    error of a motion over its swing."""
+) -> tuple[float, float, Array]:
+    """Shift of the estimate that the discretisation causes, in standard deviations, the largest
+    error of a motion over its swing, and what a finer mesh changes of each output of each run."""
     coarse = problem.predictor
     halved = _halved(problem, point)
     if halved is None:
-        return float("nan"), float("nan")
+        return UNKNOWN_MESH
     shift = _shift(problem, point, predictions, halved)
     found = thread_map(lambda run: motion_error(run, RESOLVED), coarse.runs, coarse.jobs)
     error = float(np.max([one.error for one in found]))  # NaN where one is not known
     better = [outputs_of(run, one) for run, one in zip(coarse.runs, found, strict=True)]
     known = [y for y in better if y is not None and np.isfinite(y).all()]
     if len(known) < len(better):
-        return shift, error
+        return shift, error, _change(predictions, halved)
     missed = _shift(problem, point, predictions, known)
     clearly = missed > max(policy.missed_factor * shift, policy.mesh_shift)
-    return (missed if clearly else shift), error
+    return (missed if clearly else shift), error, _change(predictions, known)
+
+
+def _change(predictions: list[RunPrediction], better: list[Array]) -> Array:
+    """Root mean square of the difference, shape (runs, outputs)."""
+    pairs = zip(predictions, better, strict=True)
+    return np.array([np.sqrt(np.mean((y - run.y) ** 2, axis=1)) for run, y in pairs])
 
 
 def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | None:

@@ -40,9 +40,11 @@ NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
 
 #: Probability that the effect of a certain name has at least, where probabilities were computed.
 SURE = 0.95
-#: Movement of a parameter by a finer mesh, in standard deviations, from which on the residual may
-#: be the error of the solution.
+#: Movement of a parameter by a finer mesh, in standard deviations, beyond which no name is certain.
 UNRESOLVED = 1.0
+#: Part of the mean square of an excess, and of the expected error, that finer steps would change
+#: where the excess may be the error of the solution.
+OF_THE_MESH, LEAST_OF_THE_MESH = 0.5, 0.1
 #: Beginning of the note on probabilities that could not be computed.
 NO_PROBABILITIES = "the probabilities of structures could not be computed"
 #: Beginning of a note that lists parameters.
@@ -461,12 +463,24 @@ def _limit(state: State, rounds: int, max_effects: int) -> str:
         return f"the largest allowed number of effects, {max_effects}, has been added"
     if rounds > 2 * max_effects:
         return f"effects were added and removed again for {rounds} rounds"
-    if fit.shift > UNRESOLVED:
+    if _left_by_the_mesh(state):
         return (
-            f"the mesh is too coarse: {fit.steps} steps move a parameter by {fit.shift:.2g} of its"
-            " standard deviations, so that the residual may be the error of the solution"
+            f"the mesh of {fit.steps} steps is too coarse: what is left may be the error of the"
+            " solution"
         )
     return ""
+
+
+def _left_by_the_mesh(state: State) -> bool:
+    """Whether what finer steps would change is a large part of what is left of an output."""
+    change = np.sqrt(np.mean(np.square(state.fit.mesh_error), axis=0))
+    for output, size in zip(state.fit.predictor.outputs, change, strict=False):
+        chosen = [e for e in state.fit_errors.entries if e.output == output]
+        expected = np.mean([e.expected**2 for e in chosen])
+        excess = max(float(np.mean([e.repeating**2 for e in chosen]) - expected), 0.0)
+        if size**2 > max(OF_THE_MESH * excess, LEAST_OF_THE_MESH * expected):
+            return True
+    return False
 
 
 def _ratios(state: State) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from bayesoleo import system
 from bayesoleo.discovery._fit import FEWEST_STEPS, Numerics, first_steps, fit_model
-from bayesoleo.discovery._loop import UNRESOLVED, _limit, _warnings
+from bayesoleo.discovery._loop import _limit, _warnings
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._result_tree import point_group
 from bayesoleo.model import Model, Parameter
@@ -80,12 +80,22 @@ def test_a_mesh_that_did_not_do_is_said_plainly(monkeypatch):
 
 def test_no_effect_is_added_to_a_residual_that_may_be_the_solver_s():
     """Where no finer mesh is allowed, a further effect could explain what the steps leave."""
-    state = SimpleNamespace(assembly=SimpleNamespace(steps=()), fit=fit(1e-5, 64))
-    assert state.fit.shift > UNRESOLVED
-    assert "64 steps move a parameter by" in _limit(state, 1, 8)
-    state.fit = fit(1e-4, 512)
-    assert SearchPolicy().mesh_shift < state.fit.shift < UNRESOLVED
-    assert _limit(state, 1, 8) == ""
+    found = fit(1e-5, 64)
+    (size,) = found.mesh_error[0]
+    exact = fit(1e-5, 2048).problem.predictor
+    exact.set_anchor(found.problem.full(found.point.theta[None])[0])
+    y = exact.simulate(found.problem.full(found.point.theta[None]), 0).y[0]
+    assert size == pytest.approx(np.sqrt(np.mean((y - found.predictions[0].y) ** 2)), rel=0.02)
+
+    def limit(repeating: float, expected: float) -> str:
+        entry = SimpleNamespace(output="displacement", repeating=repeating, expected=expected)
+        errors = SimpleNamespace(entries=[entry])
+        assembly = SimpleNamespace(steps=())
+        return _limit(SimpleNamespace(assembly=assembly, fit=found, fit_errors=errors), 1, 8)
+
+    assert "the mesh of 64 steps is too coarse" in limit(1.5 * size, size)
+    assert limit(1.5 * size, 4.0 * size) == ""  # too small to be seen
+    assert limit(5.0 * size, size) == ""  # most of the excess is something else
 
 
 def test_the_start_told_is_that_of_the_first_mesh():
