@@ -21,7 +21,7 @@ from small_campaigns import (
 
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._score_basis import Base, Block, RunBase, _prior_terms, base_of
-from bayesoleo.discovery._score_tests import _evaluate, score_all
+from bayesoleo.discovery._score_tests import _directions_of, _evaluate, score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model._priors import Normal
@@ -397,3 +397,16 @@ def test_an_excess_is_doubted_as_the_noise_is_that_it_exceeds(lacking_cubic):
         total += size * (left - rng.chisquare(entry.free, draws) / entry.free)
     # A deviation from 4000 draws scatters by 1.1 %.
     assert base_of(fit, table).doubt == pytest.approx(np.std(total), rel=0.05)
+
+
+def test_columns_beyond_single_precision_keep_their_direction():
+    """A power of a pressure in pascals; a column that is nothing stays nothing."""
+    rng = np.random.default_rng(3)
+    rows = np.stack([1e60 * rng.standard_normal(50), -1e-50 * rng.random(50), np.zeros(50)])
+    found = _directions_of(rows)
+    assert found.dtype == np.float32
+    assert np.isfinite(found).all()
+    for row, direction in zip(rows[:2], found[:2].astype(float), strict=True):
+        cosine = row @ direction / np.linalg.norm(row) / np.linalg.norm(direction)
+        assert cosine == pytest.approx(1.0, abs=1e-6)
+    assert not found[2].any()
