@@ -91,7 +91,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     for part, moved in _moved(run, one, x) if derived.dofs else ():
         columns[:, part] += np.einsum("yzN,zkN->ykN", yz[0], moved)
     by_start = _moved_by_start(run, p, x)
-    columns = np.concatenate([columns, np.einsum("yzN,zkN->ykN", yz[0], by_start)], axis=1)
+    if by_start.shape[1]:  # hundreds of other columns are not copied for nothing
+        columns = np.concatenate([columns, np.einsum("yzN,zkN->ykN", yz[0], by_start)], axis=1)
     return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 

@@ -30,7 +30,7 @@ import sympy as sp
 from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import Derived
-from bayesoleo.model._drive_and_start import EQUILIBRIUM, START, start_of
+from bayesoleo.model._drive_and_start import EQUILIBRIUM, START, START_RATE, start_of
 from bayesoleo.model._expressions import (
     derivative_symbol,
     parse,
@@ -204,14 +204,17 @@ class InitialState:
         not estimated."""
         found: dict[str, tuple[str, int, sp.Symbol]] = {}
         for expression in self.declared:
-            names = {str(item) for item in expression.free_symbols}
-            if any(name.startswith(START) for name in names):
-                continue  # the estimate corrects what the channel shows
-            for item in expression.free_symbols:
+            for item in () if self._estimated(expression) else expression.free_symbols:
                 channel, order = split_derivative(item)
                 if channel in self.channels:
                     found[str(item)] = channel, order, item
         return [found[name] for name in sorted(found)]
+
+    def _estimated(self, expression: sp.Expr) -> bool:
+        """Whether an estimate corrects what the channel shows."""
+        dofs = self.kernels.derived.dofs
+        own = {symbol(begin + dof) for begin in (START, START_RATE) for dof in dofs}
+        return bool(own & expression.free_symbols)
 
     def by_measured(self, p: Array) -> Array:
         """Derivatives of the initial state by :meth:`measured`, shape (D, m), at constants ``p``
@@ -224,7 +227,7 @@ class InitialState:
         items = self.measured()
         found = np.zeros((len(self.declared), len(items)))
         for row, (expression, dof) in enumerate(zip(self.declared, owner, strict=True)):
-            for k, (_, _, item) in enumerate(items):
+            for k, (_, _, item) in enumerate([] if self._estimated(expression) else items):
                 slope = _measured(sp.diff(expression, item), self.record, set(self.channels))
                 values = {symbol(name): constants[name] for name in constants}
                 values[symbol(EQUILIBRIUM)] = rest[0, dof]

@@ -64,3 +64,32 @@ def test_a_start_that_is_estimated_or_known_has_no_error_of_a_channel(initial):
     assert status.ok
     p = predictor.constants(theta[None], 0)[0]
     assert input_columns(predictor.runs[0], p).shape[1] == 0
+
+
+def test_of_two_starts_only_the_one_that_is_not_estimated_has_the_error_of_the_channel():
+    """Both are read from one channel; the second is called like an estimated start."""
+    model = Model(
+        "two levels",
+        dofs={"first": Dof("m", initial="height + start_shift"), "second": Dof("m")},
+        equations={
+            "first": {"change": "dot(first)", "outflow": "rate*first"},
+            "second": {"change": "dot(second)", "outflow": "rate*second"},
+        },
+        outputs={"height": Output("second", "m"), "other": Output("first", "m")},
+        parameters={
+            "rate": Parameter(RATE, "1/s", relative_sd=0.5),
+            "start_shift": Parameter(0.0, "m", fixed=True),
+        },
+    )
+    noise = NOISE * np.random.default_rng(1).standard_normal((2, TIME.size))
+    height, other = START * np.exp(-RATE * TIME) + noise
+    record = transient_record("a", TIME, {"height": height, "other": other})
+    predictor = Predictor(with_estimated_starts(model), [record])
+    theta = predictor.layout.start(predictor.model)
+    (status,) = predictor.set_anchor(theta)
+    assert status.ok
+    columns = input_columns(predictor.runs[0], predictor.constants(theta[None], 0)[0])
+    assert columns.shape[1] == 1
+    sizes = dict(zip(predictor.outputs, np.abs(columns[:, 0]).max(axis=1), strict=True))
+    assert sizes["height"] == 0.0
+    assert sizes["other"] > 0.0
