@@ -277,10 +277,6 @@ class _Course:
         """The same: it is computed, not measured."""
         return self
 
-    def at_once(self, time: float, derivative: int = 0) -> float:
-        """At one time of a transient, s."""
-        return float(self.evaluate(np.array([time * self.rate]), self.rate, derivative)[0])
-
 
 class _Remembered:
     """Courses that are computed once for each set of phases."""

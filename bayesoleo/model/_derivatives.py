@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import sympy as sp
 
 from bayesoleo.errors import ModelError
@@ -62,18 +61,6 @@ class Derived:
     def gradient(self, expressions: Sequence[sp.Expr], of: Sequence[sp.Symbol]) -> list[sp.Expr]:
         """Partial derivatives, expression by expression, symbol by symbol."""
         return [partial(expression, item) for expression in expressions for item in of]
-
-    @property
-    def highest(self) -> tuple[sp.Symbol, ...]:
-        """The highest derivative of each dof."""
-        last = np.cumsum([order + 1 for order in self.orders]) - 1
-        return tuple(self.states[k] for k in last)
-
-    @property
-    def affine(self) -> bool:
-        """Whether the equations are linear in the highest derivatives, whose factors hold none."""
-        factors = self.gradient(self.residual, self.highest)
-        return not any(factor.free_symbols.intersection(self.highest) for factor in factors)
 
     @property
     def active_symbols(self) -> tuple[sp.Symbol, ...]:

@@ -25,7 +25,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import perm
 
 import numpy as np
 from scipy import signal
@@ -124,16 +123,6 @@ class Smoothed:
     def pieces(self) -> Array:
         """Coefficients ``(N - 1, 6)`` by rising power over each sampling interval, made one."""
         return pieces(self.states, self.step)
-
-    def at_once(self, time: float, derivative: int = 0) -> float:
-        """One value, as :meth:`at`, without the cost of arrays: integrators ask for many."""
-        scaled = time / self.step
-        index = min(max(int(scaled), 0), len(self.states) - 2)
-        inside, total = scaled - index, 0.0
-        piece = self.pieces[index]
-        for power in range(5, derivative - 1, -1):
-            total = total * inside + perm(power, derivative) * float(piece[power])
-        return total / self.step**derivative
 
     def errors(self, count: int, seed: int = 0) -> list[Smoothed]:
         """Draws of what may lie between this curve and the true one.

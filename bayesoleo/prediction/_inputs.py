@@ -171,6 +171,30 @@ def input_rows(
     return table
 
 
+def signal_of_transient(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSignal:
+    """Input rows of a transient in cubic pieces between its samples, for an integrator.
+
+    Parameters
+    ----------
+    record : Record
+        A transient run; its first sample is time zero.
+    rows : tuple of (str, int)
+        As in ``Derived``.
+    """
+    edges = np.interp(np.arange(0, record.time.size - 0.75, 0.5), np.arange(record.time.size),
+                      record.position)  # fmt: skip
+    length = np.diff(edges)
+    inside = edges[:-1, None] + length[:, None] * np.arange(3) / 3.0
+    values = input_rows(record, rows, np.append(inside.ravel(), edges[-1]))
+    y = np.stack([values[:, k : values.shape[1] - 3 + k : 3] for k in range(3)])
+    y = np.concatenate([y, values[None, :, 3::3]])
+    powers = np.array([[6, 0, 0, 0], [-11, 18, -9, 2], [6, -15, 12, -3], [-1, 3, -3, 1]]) / 6.0
+    scale = (3.0 / (length / record.rate)) ** np.arange(4)[:, None]
+    pieces = np.einsum("jk,krm,jm->mrj", powers, y, scale)
+    nothing = np.zeros((len(rows), 0))
+    return InputSignal(0.0, nothing, nothing, edges / record.rate, np.ascontiguousarray(pieces))
+
+
 def dynamics_of(
     model: Model, record: Record, active: Sequence[str] | None = None, backend: str = "numba"
 ) -> Dynamics:

@@ -27,6 +27,7 @@ from typing import cast
 import numpy as np
 import sympy as sp
 
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import Derived
@@ -43,9 +44,11 @@ from bayesoleo.model._model import Model
 from bayesoleo.prediction._inputs import dynamics_of, harmonics_of, input_rows, signal_of
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._stability import compared, count_unstable, is_jump, jumps, swings
+from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._orbit import Status, floquet_multipliers
 from bayesoleo.solvers._periodic import Boundary, Solution, solve_periodic
 from bayesoleo.solvers._periodic_newton import Extrapolation
+from bayesoleo.solvers._radau_step import Workspace, evaluate_kernel, inner, workspace
 from bayesoleo.solvers._shooting import solve_shooting
 
 #: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.
@@ -55,6 +58,9 @@ KnownRows = dict[tuple[str, int], Array]
 MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
 #: A Newton step this small, over the state's size, leaves round-off only.
 SMALL_STEP = 1e-12
+#: As compiled code returns them.
+CONVERGED, NOT_FINITE = Status.CONVERGED.value, Status.NOT_FINITE.value
+SINGULAR, NO_CONVERGENCE = Status.SINGULAR.value, Status.NO_CONVERGENCE.value
 
 
 def guess_rows(
@@ -259,7 +265,7 @@ class InitialState:
         status = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
         for lane in lanes:
             free = ~silent[lane]
-            status[lane] = self._solve(z, p, int(lane), own[free], values[free])
+            status[lane] = self._solve(z[lane, :, 0], p[lane], own[free], values[free])
         with np.errstate(all="ignore"):
             self._evaluate(z, p, lanes, g, gz)
             self.kernels.parameters(z, self.inputs, p, lanes, gp)
@@ -277,50 +283,92 @@ class InitialState:
         with np.errstate(all="ignore"):
             self.kernels.jacobian(z, self.inputs, p, lanes, g, gz)
 
-    def _solve(self, z: Array, p: Array, lane: int, rows: Integers, columns: Integers) -> int:
-        """Newton's method on one lane's static equations, in place."""
-        one, where = z[lane : lane + 1], p[lane : lane + 1]
-        d, nz = len(self.kernels.derived.dofs), z.shape[1]
-        g, gz, only = np.zeros((1, d, 1)), np.zeros((1, d, nz, 1)), np.zeros(1, dtype=np.int64)
-        self._evaluate(one, where, only, g, gz)
-        for _ in range(MAXIMUM_ITERATIONS):
-            matrix, right = gz[0][np.ix_(rows, columns)][:, :, 0], g[0, rows, 0]
-            if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
-                return Status.NOT_FINITE.value
-            try:
-                step = -np.linalg.solve(matrix, right)
-            except np.linalg.LinAlgError:
-                return Status.SINGULAR.value
-            base = one[0, columns, 0].copy()
-            if np.all(np.abs(step) <= SMALL_STEP * (np.abs(base) + np.abs(step))):
-                return Status.CONVERGED.value
-            unit = np.abs(gz[0, rows, :, 0] * one[0, :, 0]).sum(axis=1) + np.abs(right) + 1e-300
-            before, fraction = float(np.sum((right / unit) ** 2)), 1.0
-            for _ in range(MAXIMUM_HALVINGS):
-                one[0, columns, 0] = base + fraction * step
-                self._evaluate(one, where, only, g, gz)
-                with np.errstate(over="ignore"):  # a step so far off is not taken
-                    after = float(np.sum((g[0, rows, 0] / unit) ** 2))
-                better = after < before or before < 1e-24
+    def _solve(self, z: Array, p: Array, rows: Integers, columns: Integers) -> int:
+        """Newton's method on the static equations at one lane's ``z (nz,)``, in place."""
+        kernels, conditions = self.kernels, len(self.kernels.derived.admissible)
+        admissible = kernels.admissible.address if conditions else 0
+        work = workspace(1, kernels.derived.orders, self.inputs.shape[0], 0, conditions, 0)
+        work.u[: self.inputs.shape[0], 0] = self.inputs[:, 0]
+        with np.errstate(all="ignore"):
+            return int(
+                _rest(kernels.jacobian.address, admissible, conditions, z, p, rows, columns, work)
+            )
+
+
+@jit
+def _rest(
+    jacobian: int, admissible: int, conditions: int, z: Array, p: Array, rows: Integers,
+    columns: Integers, work: Workspace,
+) -> int:  # fmt: skip
+    """Zeros of the equations ``rows`` by the entries ``columns`` of ``z (nz,)``; a status."""
+    nz, m = z.size, rows.size
+    d = work.small.shape[0]
+    base, step, unit = np.empty(m), np.empty((m, 1)), np.empty(m)
+    matrix = np.empty((m, m))
+    for k in range(nz):
+        work.z[k, 0] = z[k]
+    evaluate_kernel(jacobian, work.z, work.u, p, work.g, 1)
+    for _ in range(MAXIMUM_ITERATIONS):
+        for i in range(m):
+            step[i, 0] = -work.g[rows[i], 0]
+            for j in range(m):
+                matrix[i, j] = work.g[d + rows[i] * nz + columns[j], 0]
+                if not (np.isfinite(matrix[i, j]) and np.isfinite(step[i, 0])):
+                    return NOT_FINITE
+        if not eliminate(matrix, step, 1e-300):
+            return SINGULAR
+        small, near, before = True, True, 0.0
+        for i in range(m):
+            base[i] = work.z[columns[i], 0]
+            size = abs(base[i]) + abs(step[i, 0])
+            small = small and abs(step[i, 0]) <= SMALL_STEP * size
+            near = near and abs(step[i, 0]) <= 1e-7 * size
+            unit[i] = abs(work.g[rows[i], 0]) + 1e-300
+            for k in range(nz):
+                unit[i] += abs(work.g[d + rows[i] * nz + k, 0] * work.z[k, 0])
+            before += (work.g[rows[i], 0] / unit[i]) ** 2
+        if small:
+            break
+        fraction, taken = 1.0, False
+        for _ in range(MAXIMUM_HALVINGS):
+            for i in range(m):
+                work.z[columns[i], 0] = base[i] + fraction * step[i, 0]
+            evaluate_kernel(jacobian, work.z, work.u, p, work.g, 1)
+            after, felt = 0.0, True
+            for i in range(m):
+                after += (work.g[rows[i], 0] / unit[i]) ** 2
                 # Where nothing answers to a dof, such as below the bottom of a tank, no further
                 # step would lead away.
-                felt = np.abs(gz[0][np.ix_(rows, columns)]).max(axis=(0, 2)).all()
-                if better and felt and self._admissible(one, where):
-                    break
-                fraction *= 0.5
-            else:
-                # Round-off keeps the residual from falling where the step is as small as that.
-                small = np.all(np.abs(step) <= 1e-7 * (np.abs(base) + np.abs(step)))
-                return Status.CONVERGED.value if small else Status.NO_CONVERGENCE.value
-        return Status.NO_CONVERGENCE.value
+                answer = 0.0
+                for e in range(m):
+                    answer += abs(work.g[d + rows[e] * nz + columns[i], 0])
+                felt = felt and answer > 0.0
+            if felt and (after < before or before < 1e-24):
+                taken = _is_inside(admissible, conditions, p, work)
+            if taken:
+                break
+            fraction *= 0.5
+        if not taken and not near:
+            return NO_CONVERGENCE
+        if not taken:
+            # Round-off keeps the residual from falling where the step is as small as that.
+            break
+    else:
+        return NO_CONVERGENCE
+    for k in range(nz):
+        z[k] = work.z[k, 0]
+    return CONVERGED
 
-    def _admissible(self, z: Array, p: Array) -> bool:
-        conditions = len(self.kernels.derived.admissible)
-        a = np.ones((1, conditions, 1))
-        if conditions:
-            with np.errstate(all="ignore"):
-                self.kernels.admissible(z, self.inputs, p, np.zeros(1, dtype=np.int64), a)
-        return bool((a > 0).all())
+
+@inner
+def _is_inside(admissible: int, conditions: int, p: Array, work: Workspace) -> bool:
+    """Whether one point lies in the admissible region."""
+    if conditions > 0:
+        evaluate_kernel(admissible, work.z, work.u, p, work.a, 1)
+    for k in range(conditions):  # noqa: SIM110 - Numba compiles no generator
+        if not work.a[k, 0] > 0.0:
+            return False
+    return True
 
 
 class _Table:
@@ -335,6 +383,7 @@ class _Table:
             flat += [expression, sp.diff(expression, rest)]
             flat += [sp.diff(expression, symbol(name)) for name in derived.active]
         used = set().union(*(e.free_symbols for e in flat)) if flat else set()
+        self.alike = rest not in used
         self.used = [k for k, item in enumerate(names) if item in used]
         self.function = sp.lambdify([*(names[k] for k in self.used), rest], flat, "numpy")
 
@@ -346,8 +395,10 @@ class _Table:
         table = np.zeros((p.shape[0], self.count, 2 + self.active))
         with np.errstate(all="ignore"):
             for lane in range(p.shape[0]):
+                row: list[float] = []
                 for k in range(self.count):
-                    row = self.function(*p[lane, self.used], rest[lane, k])
+                    if not (row and self.alike):
+                        row = self.function(*p[lane, self.used], rest[lane, k])
                     size = 2 + self.active
                     table[lane, k] = row[k * size : (k + 1) * size]
         return table[:, :, 0], table[:, :, 2:], table[:, :, 1]

@@ -6,32 +6,42 @@ The mesh is chosen once; every solution starts from the initial state and is eva
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._inputs import RowCache, highest_derivatives, input_rows, signal_of
+from bayesoleo.prediction._inputs import (
+    RowCache,
+    highest_derivatives,
+    input_rows,
+    signal_of,
+    signal_of_transient,
+)
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._starts import Anchor, InitialState, Motion
 from bayesoleo.solvers._collocation import Collocation
-from bayesoleo.solvers._library_integrator import halved, integrate, resolving
-from bayesoleo.solvers._mesh import Mesh, equidistant, tableau
+from bayesoleo.solvers._initial_value import Dynamics
+from bayesoleo.solvers._mesh import Mesh, equidistant, halved, resolving, tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, Solution
 from bayesoleo.solvers._schemes import DEFAULT_SCHEME
-from bayesoleo.solvers._state_space import StateSpace
-from bayesoleo.solvers._transient import solve_transient, state_rows, transient_sensitivities
+from bayesoleo.solvers._transient import (
+    integrate,
+    solve_transient,
+    state_rows,
+    transient_sensitivities,
+)
 
 #: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
 WHOLE = 128
 #: To follow the inputs, steps are shortened to this many samples and to this angle at the highest
 #: frequency of an input at most, which a method of fifth order follows to 1e-4.
 SAMPLES_A_STEP, ANGLE = 4, 0.75
-#: Steps of that angle beyond which a library's integrator, step by step, would take minutes.
+#: Steps of that angle beyond which an integrator would take minutes, step by step in arrays.
 MOST_INTEGRATED = 5_000
 #: Where steps are chosen by the inputs alone they are halved until the motion changes by less than
 #: this part of its size, and are no more than so many.
@@ -92,14 +102,6 @@ class TransientRun(RunPredictor):
             for name, order in highest.items()
             if name != "time"
         }
-        self.space = StateSpace(
-            kernels,
-            derived.orders,
-            self._inputs,
-            len(derived.active),
-            len(derived.admissible),
-            affine=derived.affine,
-        )
         #: The mesh as chosen, before it is cut finer; none yet where nobody chose one.
         self.chosen: Mesh | None = None if like is None else like.chosen
         self.motions: dict[str, Motion] = {} if like is None else like.known_motions()
@@ -121,13 +123,17 @@ class TransientRun(RunPredictor):
             other.plan = self.collocation.plan(other.position, self.steps, initial=True)
         return other
 
-    def _inputs(self, time: Array) -> Array:
-        if time.size == 1 and all(name in self.curves for name, _ in self._input_names):
-            now, known = float(time[0]), self.curves
-            rows = [known[name].at_once(now, k) for name, k in self._input_names]
-            # A column also where a model has no input.
-            return np.array(rows, dtype=float).reshape(-1, 1)
-        return input_rows(self.record, self.kernels.derived.inputs, time / self.period)
+    def _inputs(self, position: Array) -> Array:
+        return input_rows(self.record, self.kernels.derived.inputs, position)
+
+    @property
+    def _dynamics(self) -> Dynamics:
+        """Equations and inputs as an integrator takes them."""
+        derived = self.kernels.derived
+        signal = signal_of_transient(self.record, derived.inputs)
+        return Dynamics(
+            self.kernels, derived.orders, signal, len(derived.active), len(derived.admissible)
+        )
 
     def _adopt(self, mesh: Mesh) -> None:
         """Work on a mesh, cut as fine as asked for."""
@@ -151,9 +157,7 @@ class TransientRun(RunPredictor):
 
     def _choose(self, mesh: Mesh) -> None:
         """Keep a mesh for good, cut where the inputs change faster than its steps can follow."""
-        self.chosen = resolving(
-            mesh, lambda position: self._inputs(position * self.period), self.method, self._shortest
-        )
+        self.chosen = resolving(mesh, self._inputs, self.method, self._shortest)
         self._adopt(self.chosen)
 
     @property
@@ -210,14 +214,13 @@ class TransientRun(RunPredictor):
                 return equal
             # Where a force jumps, an integrator's own steps may still get across.
             self.chosen = None
-        if self.chosen is None or not self.motions:
-            found = integrate(self.space, p, state, self.period)
+        if self.chosen is None:
+            found = integrate(self._dynamics, p, state, self.period)
             if not found.status.ok and found.status is not Status.SINGULAR:
                 return found.status
-            if self.chosen is None:
-                self._choose(found.mesh or equidistant(FALLBACK))
-            if found.states is not None:
-                rows = self._integrated(found.states, p)
+            self._choose(found.mesh or equidistant(FALLBACK))
+            if (integrated := found.rows) is not None:
+                rows = lambda position: integrated(position * self.period)  # noqa: E731
         start = self._unknowns(rows)
         start[:, 0, : self.scheme.state_size] = state
         return solve_transient(self.boundary, p[None], start)
@@ -263,13 +266,6 @@ class TransientRun(RunPredictor):
         nodes = self.collocation.nodes(self.steps)
         return self.scheme.from_motion(rows(nodes)[None], rows(self.points)[None])
 
-    def _integrated(self, states: Motion, p: Array) -> Motion:
-        def rows(position: Array) -> Array:
-            time = position * self.period
-            return cast(Array, self.space.complete(time, states(time)[None], p[None])[0][0])
-
-        return rows
-
     def _known(self, position: Array, state: Array) -> Array:
         """Rows ``(nz, N)`` of the known motions; what is not known stays as it starts."""
         derived, first, value = self.kernels.derived, 0, 0
@@ -303,11 +299,12 @@ class TransientRun(RunPredictor):
         start = self.initial(p)
         x = self.anchor.predict(p[:, self.active] - self.anchor.p[self.active])
         x[:, 0, : self.scheme.state_size] = start.state
-        solution = solve_transient(self.boundary, p, x)
-        bad = start.status != Status.CONVERGED.value
-        return Solution(
-            solution.x, np.where(bad, start.status, solution.status), solution.iterations
-        )
+        found = Solution(x, start.status.copy(), np.zeros(p.shape[0], dtype=np.int64))
+        good = start.status == Status.CONVERGED.value
+        solution = solve_transient(self.boundary, p[good], x[good])
+        found.x[good], found.status[good] = solution.x, solution.status
+        found.iterations[good] = solution.iterations
+        return found
 
     def predict(self, p: Array, *, derivatives: bool = False) -> PredictedSamples:
         """Outputs at the raw samples for constants ``p (L, np)``."""

@@ -178,6 +178,8 @@ def solve_initial_value(
     dense: bool = False,
     scale: Array | None = None,
     first_step: float | None = None,
+    longest_step: float | None = None,
+    most_steps: int = 1_000_000,
     exact: bool = True,
 ) -> DenseTrajectory:
     """Integrate one parameter vector from a start.
@@ -211,6 +213,10 @@ def solve_initial_value(
         Sizes of the state components so far known.
     first_step : float, optional
         First step to be tried, s.
+    longest_step : float, optional
+        Longest step, s, where steps are chosen.
+    most_steps : int
+        Number of steps at which the integration has failed.
     exact : bool
         Solve stages to round-off, so that derivatives are exact too.
 
@@ -230,6 +236,7 @@ def solve_initial_value(
     """
     _check(dynamics, start, times, stages)
     span = times[-1] - times[0]
+    longest = span if longest_step is None else longest_step
     first = span / 100 if first_step is None else first_step
     sizes = np.full(dynamics.size, 1e-30) if scale is None else np.array(scale, dtype=float)
     if scale is None:
@@ -239,16 +246,16 @@ def solve_initial_value(
         flags = np.zeros(times.size - 1, dtype=np.bool_) if cut is None else cut
         task = loop.MarchTask(
             np.array(times, dtype=float), flags, adaptive, tolerance,
-            1e-13 if exact else 1e-2 * tolerance, first, span, capacity, dense,
+            1e-13 if exact else 1e-2 * tolerance, min(first, longest), longest, capacity, dense,
         )  # fmt: skip
         kept = np.zeros((dynamics.size, 0)) if columns is None else np.array(columns, order="C")
         size = sizes.copy()
         path, n, outcome, evaluations = _run(
             dynamics, p, start, task, kept, size, stages, by_parameter
         )
-        if outcome != loop.FULL or capacity > 1_000_000:
+        if outcome != loop.FULL or capacity >= most_steps:
             break
-        capacity *= 4
+        capacity = min(4 * capacity, most_steps)
     few = n if dense else 0
     return DenseTrajectory(
         path.times[: n + 1].copy(), path.states[: n + 1].copy(), path.tops[:n].copy(),

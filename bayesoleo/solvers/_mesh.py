@@ -5,6 +5,7 @@ Nodes, weights and interpolation polynomials of a method are computed, not tabul
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -14,6 +15,13 @@ from numpy.polynomial.polynomial import polyval
 
 from bayesoleo._types import Array, Float, Integers
 from bayesoleo.errors import InputError
+
+#: Neighbouring steps differ by this factor at most. If other parameters move a kink (a velocity
+#: that changes sign under dry friction) away from its fine steps, the step that it reaches is no
+#: longer than a fixed part of the distance moved.
+GRADING = 1.5
+#: Part of an input's range by which a step may miss it between the points where it is seen.
+INPUT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,11 @@ class Tableau:
     def stages(self) -> int:
         """Number of stages."""
         return self.c.size
+
+    @property
+    def polynomials(self) -> Array:
+        """Coefficients of the stages' Lagrange polynomials, by stage and power, shape (s, s)."""
+        return np.ascontiguousarray(_coefficients(tuple(self.c))[0].T)
 
     def weights(self, position: Array) -> tuple[Array, Array, Array]:
         """Lagrange polynomials of the stages and their first and second integrals from 0.
@@ -179,3 +192,95 @@ class Mesh:
 def equidistant(n: int) -> Mesh:
     """``n`` steps of one length."""
     return Mesh(np.arange(n + 1) / n)
+
+
+def graded(mesh: Mesh, ratio: float = GRADING) -> Mesh:
+    """Cut steps until neighbours differ by a factor at most.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    ratio : float
+        The factor, above one.
+    """
+    lengths = np.diff(mesh.edges)
+    allowed = lengths.copy()
+    # A step may be longer than its neighbour by what one cut of that factor leaves.
+    for n in range(1, lengths.size):
+        allowed[n] = min(allowed[n], ratio * allowed[n - 1])
+    for n in range(lengths.size - 2, -1, -1):
+        allowed[n] = min(allowed[n], ratio * allowed[n + 1])
+    edges = [0.0]
+    for n, length in enumerate(lengths):
+        edges += _cut(mesh.edges[n], length, allowed, n, ratio)
+    edges[-1] = 1.0
+    return Mesh(np.array(edges))
+
+
+def _cut(left: float, length: float, allowed: Array, n: int, ratio: float) -> list[float]:
+    """Right edges of the pieces of one step, that grow from both of its neighbours."""
+    before = allowed[n - 1] if n > 0 else length
+    after = allowed[n + 1] if n + 1 < allowed.size else length
+    first, last = min(length, ratio * before), min(length, ratio * after)
+    if length <= min(first, last) * (1 + 1e-12):
+        return [left + length]
+    position, pieces = 0.0, []
+    while position < length * (1 - 1e-12):
+        # No piece longer than the geometric growth from either end allows at its place.
+        ahead = length - position
+        piece = min(first + (ratio - 1) * position, (last + (ratio - 1) * ahead) / ratio)
+        pieces.append(min(piece, ahead))
+        position += pieces[-1]
+    if len(pieces) > 1 and pieces[-1] < 0.5 * pieces[-2]:
+        merged = 0.5 * (pieces[-1] + pieces[-2])
+        pieces[-2:] = [merged, merged]
+    return [*(left + np.cumsum(pieces[:-1])), left + length]
+
+
+def halved(mesh: Mesh, times: int = 1) -> Mesh:
+    """Cut every step into two, so many times."""
+    edges = mesh.edges
+    for _ in range(times):
+        middle = 0.5 * (edges[:-1] + edges[1:])
+        edges = np.sort(np.concatenate([edges, middle]))
+    return Mesh(edges)
+
+
+def resolving(
+    mesh: Mesh,
+    inputs: Callable[[Array], Array],
+    method: Tableau,
+    shortest: float,
+    tolerance: float = INPUT_TOLERANCE,
+) -> Mesh:
+    """Halve the steps in which the inputs are no polynomial through what the method sees of them.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    inputs : callable
+        Rows of inputs ``(nu, N)`` at parts of the time ``(N,)``.
+    method : Tableau
+        Its stages are where inputs are seen.
+    shortest : float
+        Steps below twice this part of the time are not cut.
+    tolerance : float
+        Largest distance between them, over each row's range.
+    """
+    between = np.linspace(0.0, 1.0, 2 * method.stages + 1)
+    weights = method.weights(between)[0]
+    for _ in range(64):
+        edges, count = mesh.edges, mesh.steps
+        seen = inputs(mesh.points(method.c))
+        if seen.shape[0] == 0:
+            return mesh
+        true = inputs(mesh.points(between))
+        span = np.ptp(true, axis=1)[:, None, None]
+        follows = seen.reshape(-1, count, method.stages) @ weights.T
+        missed = np.abs(true.reshape(-1, count, between.size) - follows).max(axis=2)
+        cut = (missed > tolerance * span[:, :, 0]).any(axis=0) & (np.diff(edges) >= 2 * shortest)
+        if not cut.any():
+            return mesh
+        middle = 0.5 * (edges[:-1] + edges[1:])[cut]
+        mesh = Mesh(np.sort(np.concatenate([edges, middle])))
+    return mesh

@@ -16,7 +16,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial import Polynomial
 
 from bayesoleo._compiled import BLOCK, cached, call_kernel, pointer
 from bayesoleo._types import Array, Integers
@@ -83,12 +82,8 @@ def radau_method(stages: int) -> Method:
     powers = np.vander(table.c, increasing=True).T
     moments = 1.0 / np.arange(1, stages + 1)
     moments[0] -= gamma
-    lagrange = np.zeros((stages, stages))
-    for i, own in enumerate(table.c):
-        others = np.delete(table.c, i)
-        lagrange[i] = (Polynomial.fromroots(others) / float(np.prod(own - others))).coef
     error = np.linalg.solve(powers, moments) - table.b
-    return Method(table.c, table.a, table.a @ table.a, lagrange, error, gamma)
+    return Method(table.c, table.a, table.a @ table.a, table.polynomials, error, gamma)
 
 
 class Workspace(NamedTuple):

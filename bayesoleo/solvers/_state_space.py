@@ -62,9 +62,6 @@ class StateSpace:
         Number of parameters with derivatives.
     conditions : int
         Number of conditions on the admissible region.
-    affine : bool
-        Whether the equations are known to be linear in the highest derivatives: one step of
-        Newton's method then solves them, and an integrator need not make sure.
     """
 
     equations: ImplicitEquations
@@ -72,7 +69,6 @@ class StateSpace:
     inputs: Inputs
     active: int
     conditions: int = 0
-    affine: bool = False
 
     @property
     def size(self) -> int:
@@ -190,15 +186,6 @@ class StateSpace:
             return self.rates(np.array([t]), s[None, :, None], constants).rates[0, :, 0]
 
         return f
-
-    def state_jacobian(self, p: Array) -> Callable[[float, Array], Array]:
-        """``df/ds (D, D)`` of one lane, to go with :meth:`right_side`."""
-        constants = p[None]
-
-        def jacobian(t: float, s: Array) -> Array:
-            return self.linearise(np.array([t]), s[None, :, None], constants).by_state[0, :, :, 0]
-
-        return jacobian
 
     def variational(self, p: Array) -> Callable[[float, Array], Array]:
         """The state with its derivatives as one system, of one lane ``p (np,)``.

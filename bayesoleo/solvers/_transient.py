@@ -1,11 +1,10 @@
 """Transient solutions from given states, for many parameter vectors at once.
 
-A library's integrator chooses the steps, once, according to the error
-(``_library_integrator.py``); collocation on those steps then gives every further solution. On a
-frozen mesh a solution is a smooth function of its own parameters, with sensitivities exact to
-round-off and the same bits whatever the batch; an integrator that chose its steps anew for each
-vector has none of these properties. The default scheme is the integrator's own method, so that the
-error it controlled is the error of the solution.
+An integrator chooses the steps, once, according to the error; collocation on those steps then gives
+every further solution. On a frozen mesh a solution is a smooth function of its own parameters, with
+sensitivities exact to round-off and the same bits whatever the batch; an integrator that chose its
+steps anew for each vector has none of these properties. The default scheme is the integrator's own
+method, so that the error it controlled is the error of the solution.
 
 Lanes (parameter vectors) are independent, as in ``_periodic.py``.
 
@@ -16,30 +15,111 @@ Verbeek (1993), section 4.2, eqs. 4.10-4.11.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesoleo._compiled import BlockKernel, jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as measures
-from bayesoleo.solvers._collocation import Collocation, SamplePlan
-from bayesoleo.solvers._mesh import Mesh
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._elimination import eliminate
+from bayesoleo.solvers._initial_value import Dynamics, solve_initial_value
+from bayesoleo.solvers._mesh import Mesh, graded
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import LAST_STEP, SMALL_STEP, Boundary, Solution, Trial
+from bayesoleo.solvers._radau_step import (
+    ROUND_OFF,
+    Method,
+    Workspace,
+    assemble,
+    copy_to,
+    evaluate_kernel,
+    inner,
+    rows_of_stages,
+    stretch,
+    workspace,
+)
 
-#: Newton iterations on the whole time at once, before it is walked through piece by piece.
-MAXIMUM_ITERATIONS = 12
+#: Local error of the integrator over the size of each state: what its steps leave in a solution is
+#: of this order, far below what a channel resolves.
+TOLERANCE = 1e-6
+#: Local error of the first look, which tells how large the states get, and their least size there.
+LOOK, LEAST_SIZE = 1e-3, 1e-6
+#: Steps at least, of an integrator that must not stride over the inputs, and at most.
+FEWEST_STEPS, MOST_STEPS = 64, 65_536
+#: Newton iterations on the whole time at once, before it is solved step by step: compiled code
+#: takes as long for four of them as for all steps, arrays much longer for the steps.
+MAXIMUM_ITERATIONS, ITERATIONS_OF_ARRAYS = 6, 12
 MAXIMUM_HALVINGS = 8
-#: Newton iterations on one piece. A piece is solved when the next Newton step is below this part of
-#: its size; that step is still taken and leaves round-off.
-PIECE_ITERATIONS, SETTLED = 16, 1e-6
+#: Newton iterations on one step.
+STEP_ITERATIONS = 16
+
+
+@dataclass(frozen=True)
+class Integration:
+    """One integrated transient.
+
+    Parameters
+    ----------
+    status : Status
+        Unless it is ``CONVERGED`` there is nothing else.
+    mesh : Mesh or None
+        Steps in parts of the duration.
+    rows : callable or None
+        Values and derivatives ``(nz, N)`` at times ``(N,)`` in s since the start.
+    """
+
+    status: Status
+    mesh: Mesh | None = None
+    rows: Callable[[Array], Array] | None = None
+
+
+def integrate(
+    dynamics: Dynamics, p: Array, start: Array, duration: float, tolerance: float = TOLERANCE
+) -> Integration:
+    """Integrate one transient in steps chosen by their error, and keep the steps.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Equations and inputs.
+    p : ndarray, shape (np,)
+        Constants.
+    start : ndarray, shape (D,)
+        State at time zero.
+    duration : float
+        Seconds.
+    tolerance : float
+        Local error over each state's size.
+
+    Returns
+    -------
+    Integration
+    """
+    size = np.maximum(np.abs(start), LEAST_SIZE)
+    for relative in (LOOK, tolerance):
+        found = solve_initial_value(
+            dynamics, p, start, np.array([0.0, duration]), tolerance=relative, scale=size,
+            longest_step=duration / FEWEST_STEPS, most_steps=MOST_STEPS, exact=False,
+        )  # fmt: skip
+        if not found.status.ok:
+            # Without rates at the start, equations have no explicit form.
+            rateless = found.status is Status.NOT_FINITE and found.times.size == 1
+            return Integration(Status.SINGULAR if rateless else found.status)
+        largest = np.abs(found.states).max(axis=0)
+        size = np.where(largest > 0, largest, 1.0)
+    edges = found.times / duration
+    edges[0], edges[-1] = 0.0, 1.0
+    return Integration(Status.CONVERGED, graded(Mesh(edges)), found.sample)
 
 
 def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
     """Solve the collocation equations from given first states.
 
-    Newton's method on all steps at once; a lane that does not converge so is walked through in
-    pieces, from the first step on: an initial value problem always can be.
+    Newton's method on all steps at once; a lane that does not converge so is solved step by step,
+    from the first one on: an initial value problem always can be.
 
     Parameters
     ----------
@@ -54,14 +134,15 @@ def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
     -------
     Solution
     """
-    solution = newton(problem, p, start)
+    compiled = isinstance(problem.equations.jacobian, BlockKernel)
+    most = MAXIMUM_ITERATIONS if compiled else ITERATIONS_OF_ARRAYS
+    solution = newton(problem, p, start, most)
     failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
     if failed.size == 0:
         return solution
     x, status, iterations = solution.x, solution.status.copy(), solution.iterations.copy()
     for lane in failed:
-        one = slice(lane, lane + 1)
-        x[one], status[lane], more = _walk(problem, p[one], start[one].copy())
+        x[lane], status[lane], more = _march(problem, p[lane], start[lane])
         iterations[lane] += more
     return Solution(x, status, iterations)
 
@@ -70,16 +151,13 @@ def newton(
     problem: Boundary,
     p: Array,
     start: Array,
-    max_iterations: int = MAXIMUM_ITERATIONS,
-    *,
-    to_end: bool = False,
+    max_iterations: int = ITERATIONS_OF_ARRAYS,
 ) -> Solution:
     """Newton's method on all steps at once, halved where a step leaves the admissible region.
 
-    Parameters are those of :func:`solve_transient`; `to_end` asks that the state at the end of the
-    time rests as well, which is where a next piece begins.
+    Parameters are those of :func:`solve_transient`.
     """
-    state = _State(problem, p, start.copy(), to_end)
+    state = _State(problem, p, start.copy())
     lanes = np.arange(start.shape[0])
     lanes = state.keep(lanes, state.trial.evaluate(lanes))
     last = np.full(start.shape[0], np.inf)
@@ -99,9 +177,8 @@ def newton(
 class _State:
     """State of one batched iteration."""
 
-    def __init__(self, problem: Boundary, p: Array, x: Array, to_end: bool):
+    def __init__(self, problem: Boundary, p: Array, x: Array):
         self.trial = Trial(problem, p, x)
-        self.end = _end(problem, x.shape[1]) if to_end else None
         self.status = np.full(x.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
         self.iterations = np.zeros(x.shape[0], dtype=np.int64)
 
@@ -118,16 +195,9 @@ class _State:
         """Newton's step, and its size over the states' by lane, (L,); infinite where singular."""
         trial, size = self.trial, np.full(self.status.size, np.inf)
         dx, ok = trial.newton_step(lanes, initial=True)
-        # Over the largest value: a piece of a transient may hardly move.
+        # Over the largest value: a transient may hardly move.
         states, moved = trial.problem.scheme.state_size, np.empty(self.status.size)
         measures.step_size(trial.x, dx, lanes, states, moved, size)
-        if self.end is not None:
-            change = np.abs(end_state(trial.problem, dx[..., 0], self.end))
-            largest = np.abs(trial.x[:, :, :states]).max(axis=1)
-            largest = np.maximum(largest, np.abs(end_state(trial.problem, trial.x, self.end)))
-            with np.errstate(invalid="ignore"):
-                part = np.where(change > 0.0, change / np.maximum(largest, change), 0.0)
-            size[lanes] = np.maximum(size, part.max(axis=1))[lanes]
         size[~ok] = np.inf
         return dx, size
 
@@ -151,98 +221,163 @@ class _State:
         return self.keep(lanes, ~np.isin(lanes, pending))
 
 
-def _walk(problem: Boundary, p: Array, x: Array) -> tuple[Array, int, int]:
-    """Solve one lane piece by piece.
-
-    What a step is depends on those before it alone: where a piece does not converge, its steps up
-    to the first that still moves do, and the next piece begins there. Where not one does, pieces
-    are made shorter, down to one step.
-    """
-    n, first, size, iterations = x.shape[1], 0, max(x.shape[1] // 8, 1), 0
-    states = problem.scheme.state_size
-    while first < n:
-        piece = slice(first, min(first + size, n))
-        found, count, more = _solved(problem, p, piece, x[:, piece])
-        iterations += more
-        if count == 0:
-            found, count, more = _solved(problem, p, piece, _constant(x[:, piece], states))
-            iterations += more
-        if count == 0:
-            if size == 1:
-                return x, int(found.status[0]), iterations
-            size = max(size // 4, 1)
-            continue
-        last = first + count
-        x[:, first:last] = found.x
-        if last < n:
-            x[:, last, :states] = end_state(_piece(problem, first, last), found.x)
-        first, size = last, 2 * size if last == piece.stop else max(count, size // 4)
-    return x, Status.CONVERGED.value, iterations
-
-
-def _solved(problem: Boundary, p: Array, piece: slice, start: Array) -> tuple[Solution, int, int]:
-    """Solution of a piece's first steps, up to one that Newton's method still moves.
-
-    With their number, none where they do not stand by themselves either, and all iterations.
-    """
-    part, lane = _piece(problem, piece.start, piece.stop), np.zeros(1, dtype=np.int64)
-    found = newton(part, p, start, PIECE_ITERATIONS, to_end=True)
-    if found.status[0] == Status.CONVERGED.value:
-        return found, found.x.shape[1], int(found.iterations[0])
-    trial = Trial(part, p, found.x.copy())
-    trial.evaluate(lane)
-    dx, _ = trial.newton_step(lane, initial=True)
-    states = problem.scheme.state_size
-    with np.errstate(all="ignore"):
-        size = np.maximum.accumulate(np.abs(found.x[0, :, :states]), axis=0)
-        moves = ~(np.abs(dx[0, :, :states, 0]) <= SETTLED * size).all(axis=1)
-    # A step is solved where the state that it leads to rests.
-    count = max(int(np.argmax(moves)) - 1, 0) if moves.any() else moves.size - 1
-    if count == 0:
-        return found, 0, int(found.iterations[0])
-    settled = np.ascontiguousarray(found.x[:, :count])
-    part = _piece(problem, piece.start, piece.start + count)
-    again = newton(part, p, settled, PIECE_ITERATIONS, to_end=True)
-    done = count if again.status[0] == Status.CONVERGED.value else 0
-    return again, done, int(found.iterations[0] + again.iterations[0])
-
-
-def _constant(x: Array, state_size: int) -> Array:
-    """A start that stays where it begins: of no use but for being close in short pieces."""
-    still = np.zeros(x.shape)
-    still[:, :, :state_size] = x[:, :1, :state_size]
-    return still
-
-
-def _piece(problem: Boundary, first: int, last: int) -> Boundary:
-    """The same equations over some of the steps."""
-    scheme = problem.scheme
+def _march(problem: Boundary, p: Array, start: Array) -> tuple[Array, int, int]:
+    """Solve one lane step by step: unknowns ``(n, w)``, status and number of iterations."""
+    scheme, equations = problem.scheme, problem.equations
     assert isinstance(scheme, Collocation)
-    assert scheme.mesh is not None
-    edges, stages = scheme.mesh.edges[first : last + 1], scheme.method.stages
-    length = edges[-1] - edges[0]
-    inner = (edges - edges[0]) / length
-    inner[-1] = 1.0
-    return replace(
-        problem,
-        scheme=replace(scheme, mesh=Mesh(inner)),
-        period=problem.period * float(length),
-        inputs=np.ascontiguousarray(problem.inputs[:, first * stages : last * stages]),
+    x, n, table = start.copy(), start.shape[0], scheme.method
+    orders = np.array(scheme.orders, dtype=np.int64)
+    method = Method(
+        table.c, table.a, table.a @ table.a, table.polynomials, np.zeros(table.stages), 0.0
     )
+    work = workspace(table.stages, scheme.orders, problem.inputs.shape[0], 0, problem.conditions, 0)
+    conditions = equations.admissible.address if problem.conditions else 0
+    with np.errstate(all="ignore"):
+        done, iterations, outside = _steps(
+            equations.jacobian.address, conditions, problem.conditions, x, problem.inputs,
+            scheme.lengths(n, problem.step(n)), p, method, table.b, table.b @ table.a, orders, work,
+        )  # fmt: skip
+    if done == n:
+        return x, Status.CONVERGED.value, iterations
+    status = Status.INADMISSIBLE if outside else Status.NO_CONVERGENCE
+    return start, status.value, iterations
 
 
-def end_state(problem: Boundary, x: Array, end: SamplePlan | None = None) -> Array:
-    """States at the end of the time, shape (L, D), from unknowns ``(L, n, w)``."""
-    scheme, n = problem.scheme, x.shape[1]
-    assert isinstance(scheme, Collocation)
-    rows = scheme.sample(x[..., None], end or _end(problem, n), problem.step(n))
-    return rows[:, state_rows(scheme.orders), 0, 0]
+@jit
+def _steps(
+    jacobian: int, admissible: int, conditions: int, x: Array, inputs: Array, lengths: Array,
+    p: Array, method: Method, b: Array, ba: Array, orders: Integers, work: Workspace,
+) -> tuple[int, int, bool]:  # fmt: skip
+    """Solve the steps of ``x (n, w)`` in place.
+
+    Returns how many are solved, all iterations, and whether the one that is not leaves the
+    admissible region.
+    """
+    n, d, s = lengths.size, orders.size, b.size
+    D = x.shape[1] - s * d
+    top, last, scale = np.zeros((s, d)), np.zeros((s, d)), np.zeros(D)
+    kept, total = x[:, D:].copy(), 0
+    for m in range(n):
+        for k in range(inputs.shape[0]):
+            for i in range(s):
+                work.u[k, i] = inputs[k, m * s + i]
+        for k in range(D):
+            scale[k] = max(scale[k], abs(x[m, k]))
+        solved = left = False
+        # Where the last step leads, what was guessed, and no acceleration at all.
+        for attempt in range(3):
+            if attempt == 0 and m == 0:
+                continue
+            if attempt == 0:
+                stretch(last, lengths[m] / lengths[m - 1], method, top)
+            else:
+                for i in range(s):
+                    for j in range(d):
+                        top[i, j] = kept[m, i * d + j] if attempt == 1 else 0.0
+            solved, outside, count = _step(
+                jacobian, admissible, conditions, x[m, :D], top, lengths[m], scale, method, orders,
+                p, work,
+            )  # fmt: skip
+            total, left = total + count, left or outside
+            if solved:
+                break
+        if not solved:
+            return m, total, left
+        for i in range(s):
+            for j in range(d):
+                last[i, j] = x[m, D + i * d + j] = top[i, j]
+        if m + 1 < n:
+            _end_of(x[m], lengths[m], b, ba, orders, x[m + 1])
+    return n, total, False
 
 
-def _end(problem: Boundary, n: int) -> SamplePlan:
-    """The place of the end of the time."""
-    assert isinstance(problem.scheme, Collocation)
-    return problem.scheme.plan(np.ones(1), n, initial=True)
+@inner
+def _step(
+    jacobian: int, admissible: int, conditions: int, state: Array, top: Array, h: float,
+    scale: Array, method: Method, orders: Integers, p: Array, work: Workspace,
+) -> tuple[bool, bool, int]:  # fmt: skip
+    """Newton's method for one step's stages ``top (s, d)``, halved where a step leaves the
+    admissible region; whether it is solved, whether it left the region, iterations."""
+    d, s = orders.size, method.c.size
+    base, before, left = top.copy(), np.inf, False
+    finite, inside = _evaluated(
+        jacobian, admissible, conditions, state, top, h, method, orders, p, work
+    )
+    for iteration in range(STEP_ITERATIONS):
+        left = left or not inside
+        if not (finite and inside):
+            return False, left, iteration
+        assemble(work.g, h, method, orders, work.matrix)
+        for i in range(s):
+            for e in range(d):
+                work.right[i * d + e, 0] = -work.g[e, i]
+        if not eliminate(work.matrix, work.right, 1e-300):
+            return False, left, iteration
+        size, row = 0.0, -1
+        for j in range(d):
+            row += orders[j]
+            for i in range(s):
+                change = abs(h * work.right[i * d + j, 0])
+                size = max(size, change / max(scale[row], abs(h * top[i, j]), change, 1e-300))
+        if not np.isfinite(size):
+            return False, left, iteration
+        # What a step of this size leaves is round-off: quadratic, at a kink, or no better any more.
+        done = size < SMALL_STEP or (size < LAST_STEP and size < 0.1 * before)
+        done = done or (size < ROUND_OFF and size > 0.1 * before)
+        copy_to(top, base)
+        fraction = 1.0
+        for _ in range(MAXIMUM_HALVINGS):
+            for i in range(s):
+                for j in range(d):
+                    top[i, j] = base[i, j] + fraction * work.right[i * d + j, 0]
+            if done:
+                return True, left, iteration + 1
+            finite, inside = _evaluated(
+                jacobian, admissible, conditions, state, top, h, method, orders, p, work
+            )
+            left = left or not inside
+            if finite and inside:
+                break
+            fraction *= 0.5
+        before = size
+    return False, left, STEP_ITERATIONS
+
+
+@inner
+def _evaluated(
+    jacobian: int, admissible: int, conditions: int, state: Array, top: Array, h: float,
+    method: Method, orders: Integers, p: Array, work: Workspace,
+) -> tuple[bool, bool]:  # fmt: skip
+    """Equations and derivatives at the stages: whether they are finite, and admissible."""
+    d, s = orders.size, method.c.size
+    rows_of_stages(state, top, h, method, orders, work.z)
+    evaluate_kernel(jacobian, work.z, work.u, p, work.g, s)
+    if conditions > 0:
+        evaluate_kernel(admissible, work.z, work.u, p, work.a, s)
+    finite, inside = True, True
+    for k in range(d + d * (d + state.size)):
+        for i in range(s):
+            finite = finite and np.isfinite(work.g[k, i])
+    for k in range(conditions):
+        for i in range(s):
+            inside = inside and work.a[k, i] > 0.0
+    return finite, inside
+
+
+@inner
+def _end_of(x: Array, h: float, b: Array, ba: Array, orders: Integers, following: Array) -> None:
+    """State at the end of a step with unknowns ``x (w,)``, where the following one begins."""
+    d, D, first = orders.size, orders.sum(), 0
+    for j in range(d):
+        last = first + orders[j] - 1
+        once = twice = 0.0
+        for i in range(b.size):
+            once += b[i] * x[D + i * d + j]
+            twice += ba[i] * x[D + i * d + j]
+        following[last] = x[last] + h * once
+        if orders[j] == 2:
+            following[first] = x[first] + h * (x[last] + h * twice)
+        first += orders[j]
 
 
 def state_rows(orders: tuple[int, ...]) -> Integers:

@@ -39,13 +39,6 @@ LENGTH, SAMPLES, BATCH = 10.0, 1001, 32
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
-class Known(Harmonics):
-    """The input as the package takes that of a transient; nothing is lost in smoothing."""
-
-    def at_once(self, time: float, derivative: int = 0) -> float:
-        return float(self.evaluate(np.array([time / LENGTH]), 1.0 / LENGTH, derivative)[0])
-
-
 def force(time: Array) -> Array:
     """The input at times in s."""
     turn = 2 * np.pi * np.multiply.outer(time, FREQUENCIES) + PHASES
@@ -107,7 +100,7 @@ def ours() -> tuple[Callable[[Array], Any], Callable[[Any, int], tuple[Array, Ar
     time = times()
     length = 2 * np.pi * FREQUENCIES * LENGTH
     orders = np.round(length / (2 * np.pi)).astype(int)
-    known = Known(orders, -1j * AMPLITUDES * np.exp(1j * PHASES), np.zeros(orders.size))
+    known = Harmonics(orders, -1j * AMPLITUDES * np.exp(1j * PHASES), np.zeros(orders.size))
     samples = {"u": force(time), "y": np.zeros(time.size)}
     record = Record(
         "a", "", "fit", "transient", np.nan, np.nan, 0, time, samples, {},

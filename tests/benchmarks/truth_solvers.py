@@ -74,13 +74,6 @@ class Case:
     transient: Callable[[float], Array]
 
 
-class Known(Harmonics):
-    """Harmonics that a transient can be driven by as well: nothing is lost in smoothing."""
-
-    def at_once(self, time: float, derivative: int = 0) -> float:
-        return float(self.evaluate(np.array([time]), 1.0, derivative)[0])
-
-
 def model_of(name: str, equations: Mapping[str, str]) -> Model:
     """A model whose dofs start from zero, with a dummy parameter to be estimated."""
     dofs = {dof: Dof("", initial="0") for dof in equations}
@@ -522,7 +515,7 @@ def solve_transient(case: Case) -> Solve:
     """From rest, through one period of the same input."""
     times = np.linspace(0.0, 1.0, 1025)
     samples = {"u": case.force.evaluate(times, 1.0), "y": np.zeros(times.size)}
-    exact = Known(case.force.orders, case.force.coefficients, case.force.variances)
+    exact = Harmonics(case.force.orders, case.force.coefficients, case.force.variances)
     record = Record(
         "a", "", "fit", "transient", np.nan, np.nan, 0, times, samples, {},
         dict.fromkeys(samples, 0.0), smoothed={"u": exact},

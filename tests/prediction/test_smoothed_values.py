@@ -1,24 +1,15 @@
-"""A smoothed signal gives the same values one by one as all at once."""
+"""Values of a smoothed signal between its samples, and of its pieces for an integrator."""
 
 import numpy as np
 import pytest
 from synthetic_runs import exact_signal
 
-from bayesoleo.prediction._band_limited import smooth_signal
+from bayesoleo.prediction._inputs import input_rows, signal_of_transient
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.solvers._switching import evaluate
 
 STEP = 0.02
 TIME = STEP * np.arange(120)
-
-
-@pytest.mark.parametrize("derivative", range(4))
-def test_one_value_at_a_time(derivative):
-    rng = np.random.default_rng(3)
-    smoothed = smooth_signal(np.sin(4 * TIME) + 0.01 * rng.standard_normal(TIME.size), STEP)
-    # Inside, on samples, on both ends and beyond them.
-    where = np.array([-0.01, 0.0, 0.013, STEP, 1.0, 1.2345, TIME[-1], TIME[-1] + 0.01])
-    single = [smoothed.at_once(float(t), derivative) for t in where]
-    together = smoothed.at(where, derivative)
-    np.testing.assert_allclose(single, together, rtol=1e-12, atol=1e-12 * np.abs(together).max())
 
 
 def test_derivatives_are_those_of_the_polynomial():
@@ -28,4 +19,15 @@ def test_derivatives_are_those_of_the_polynomial():
     for derivative in range(3):
         expected = cubic.deriv(derivative)(1.234)
         # The states at the samples are differences of neighbours, exact for a cubic.
-        assert smoothed.at_once(1.234, derivative) == pytest.approx(expected, rel=1e-6)
+        assert smoothed.at(np.array([1.234]), derivative)[0] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("derivative", range(3))
+def test_pieces_for_an_integrator_follow_the_curve(derivative):
+    """Cubics through four points between neighbouring samples and their middles."""
+    record = transient_record("a", TIME, {"force": np.sin(4 * TIME)})
+    rows = tuple(("force", k) for k in range(derivative + 1))
+    times = np.linspace(TIME[0], TIME[-1], 977)
+    pieces = evaluate(signal_of_transient(record, rows), times)
+    curve = input_rows(record, rows, times / TIME[-1])
+    np.testing.assert_allclose(pieces, curve, atol=1e-5 * 4.0**derivative)

@@ -1,7 +1,5 @@
 """The explicit form of implicit equations, and its derivatives."""
 
-from dataclasses import replace
-
 import mpmath
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.model import Model, Parameter
 from bayesoleo.model._kernels import kernels
-from bayesoleo.solvers._library_integrator import _right_side
 from bayesoleo.solvers._state_space import StateSpace
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
@@ -129,21 +126,6 @@ def test_the_variational_form_integrates_to_differences_of_solutions():
         move, moved = step * np.eye(2)[k], step * s_theta[:, k]
         ends = [end(start + sign * moved, p[0] + sign * move) for sign in (1, -1)]
         np.testing.assert_allclose(table[:, 4 + k], (ends[0] - ends[1]) / (2 * step), atol=1e-6)
-
-
-@pytest.mark.parametrize("model", [duffing(), coupled(), implicit(), friction_oscillator()])
-def test_one_point_at_a_time_as_many_together(model):
-    space, p = state_space(model)
-    affine = space.equations.derived.affine
-    assert affine == (model.name != "implicit")
-    known = _right_side(replace(space, affine=affine), p[0])
-    one, many = _right_side(space, p[0]), space.right_side(p[0])
-    rng = np.random.default_rng(1)
-    for t in (0.0, 0.7, 2.9):
-        # Near the origin, where every one of the models is defined.
-        s = 0.1 * rng.standard_normal(sum(space.orders))
-        np.testing.assert_allclose(one(t, s), many(t, s), rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(known(t, s), many(t, s), rtol=1e-9, atol=1e-12)
 
 
 def test_where_there_are_no_rates():

@@ -1,4 +1,4 @@
-"""A transient that Newton's method does not solve at once is walked through, and quickly."""
+"""A transient that Newton's method does not solve at once is solved step by step."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from periodic_problems import friction_oscillator
 
+from bayesoleo.model import Dof, Model, Parameter
 from bayesoleo.model._kernels import kernels
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._mesh import equidistant, tableau
@@ -16,12 +17,15 @@ from bayesoleo.solvers._transient import _carried, newton, solve_transient
 STEPS, TIME = 1024, 40.0
 
 
-@pytest.fixture(scope="module")
-def problem():
+@pytest.fixture(
+    scope="module", params=[("numpy", "radau3"), ("numba", "radau3"), ("numba", "gauss3")], ids=str
+)
+def problem(request):
     model = friction_oscillator().with_values({"slope": 300.0, "amplitude": 1.0})
-    equations = kernels(model, backend="numpy")
+    backend, method = request.param
+    equations = kernels(model, backend=backend)
     derived = equations.derived
-    scheme = Collocation(tableau("radau3"), derived.orders, equidistant(STEPS))
+    scheme = Collocation(tableau(method), derived.orders, equidistant(STEPS))
     time = TIME * scheme.phases(STEPS)
     force = [1.5 * np.cos(1.7 * time + 0.5 * order * np.pi) * 1.7**order for order in range(3)]
     inputs = np.array([force[order] for _, order in derived.inputs])
@@ -45,8 +49,33 @@ def test_a_bad_start_leads_to_the_same_motion(problem):
     walked = solve_transient(boundary, p, wild)
     assert walked.status[0] == Status.CONVERGED.value
     np.testing.assert_allclose(walked.x, solved.x, atol=1e-8 * np.abs(solved.x).max())
-    # What is solved of a piece is kept, and not solved again with the next, shorter one.
+    # A step begins where the last one leads to: a few iterations each.
     assert walked.iterations[0] < 8 * STEPS
+
+
+def test_a_step_that_leaves_the_region_of_the_equations_is_told():
+    model = Model(
+        "filling",
+        inputs={"flow": "m/s"},
+        dofs={"level": Dof("m", initial="0")},
+        parameters={"gain": Parameter(1.0, sd=0.1)},
+        equations={"level": "dot(level) - gain*flow*sqrt(1 - level)"},
+        outputs={"y": "level"},
+        admissible=["1 - level"],
+    )
+    equations = kernels(model, backend="numba")
+    derived = equations.derived
+    scheme = Collocation(tableau("radau3"), derived.orders, equidistant(64))
+    inputs = np.ones((len(derived.inputs), scheme.phases(64).size))
+
+    def solved(duration):
+        boundary = Boundary(equations, scheme, duration, inputs, 1, len(derived.active))
+        start = np.zeros((1, 64, scheme.width))
+        return solve_transient(boundary, np.ones((1, len(derived.constants))), start)
+
+    # The level is 1 - (1 - t / 2)**2: full, and no longer defined, after two seconds.
+    assert solved(1.5).status[0] == Status.CONVERGED.value
+    assert solved(4.0).status[0] == Status.INADMISSIBLE.value
 
 
 def test_without_a_force_a_velocity_moves_on_and_a_state_of_first_order_stays():
