@@ -5,9 +5,9 @@ catalogue does not have, at one to ten times the detection limit. Systems, motio
 drawn by the benchmarks' own simulator, which shares no code with the package. An effect is true if
 it acts, or if its columns are exactly those of one that acts, so that the two are one effect in the
 catalogue. Of effects that only resemble each other one is true and the others are false. Rows go
-to a file as they come, so that a run that was stopped goes on, and parts can be run side by side:
+to a file as they come, so that a run that was stopped goes on:
 
-    python studies/structure_probabilities.py rows.jsonl --part 1/2 --campaigns 1000
+    python studies/structure_probabilities.py rows.jsonl --campaigns 1000 --jobs 2
 
 ``--store`` writes the table that the gallery shows.
 """
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -219,17 +220,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("results", type=Path, help="file of results, one JSON object a line")
     parser.add_argument("--campaigns", type=int, default=1000)
-    parser.add_argument("--part", default="1/1", help="which of how many parts, e.g. 2/4")
+    parser.add_argument("--jobs", type=int, default=1, help="campaigns at a time")
     parser.add_argument("--store", action="store_true", help="write the table of all rows")
     given = parser.parse_args()
-    which, parts = (int(text) for text in given.part.split("/"))
     done = {row["number"] for row in read(given.results)}
-    for number in range(which - 1, given.campaigns, parts):
-        if number in done:
-            continue
-        row = run(number)
-        with given.results.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+    numbers = [number for number in range(given.campaigns) if number not in done]
+    with multiprocessing.Pool(given.jobs) as pool:
+        for row in pool.imap_unordered(run, numbers):
+            with given.results.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
     found = [row for row in read(given.results) if row["number"] < given.campaigns]
     if given.store:
         store(found, given.campaigns)

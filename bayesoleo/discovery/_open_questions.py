@@ -276,7 +276,7 @@ def _of_structures(
         return ()
     names = tuple(structure_label(effects, chosen) for effects in chosen)
     number = len(loop.rounds)
-    plan.callback(f"look for a run that distinguishes {', '.join(names)}")
+    plan.callback(f"look for a run that distinguishes {len(names)} structures")
     try:
         first = loop.first
         scores = [item.score for item in loop.rounds[0].ranking]
