@@ -78,8 +78,17 @@ class Axis:
 
     def basis(self, values: Array, pieces: int) -> Array:
         """The ``pieces + 3`` splines at some values ``(N,)``, shape (K, N)."""
-        place = (np.asarray(values) - self.low) / (self.high - self.low)
-        return bspline_values(pieces * place - _centres(pieces)[:, None])
+        place = pieces * ((np.asarray(values) - self.low) / (self.high - self.low))
+        found = np.zeros((pieces + 3, place.size))
+        found[:, np.isnan(place)] = np.nan
+        # Four of them are not zero at a value.
+        with np.errstate(invalid="ignore"):
+            nearest = np.floor(place)
+        for centre in (nearest - 1, nearest, nearest + 1, nearest + 2):
+            inside = (centre >= -1) & (centre <= pieces + 1)
+            row = centre[inside].astype(np.int64) + 1
+            found[row, np.flatnonzero(inside)] = bspline_values((place - centre)[inside])
+        return found
 
     def splines(self, pieces: int) -> list[sp.Expr]:
         """The same as expressions."""
@@ -92,7 +101,8 @@ def bspline_values(t: Array) -> Array:
     """The cardinal cubic B-spline; see :class:`bayesoleo.model._expressions.bspline`."""
     size = np.abs(t)
     far, near = np.maximum(2.0 - size, 0.0), np.maximum(1.0 - size, 0.0)
-    found: Array = (far**3 - 4.0 * near**3) / 6.0
+    # Products: a library's power takes ten times as long.
+    found: Array = (far * far * far - 4.0 * near * near * near) / 6.0
     return found
 
 
