@@ -21,9 +21,9 @@ from bayesoleo.discovery._varied_runs import REACH, stretched, varied_runs
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction import _transient_run
 from bayesoleo.prediction._records import transient_record
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of
-from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.systems import system
 
 FREE = (-np.inf, np.inf)
@@ -335,13 +335,13 @@ def test_variations_of_a_held_out_transient_begin_with_its_motion(monkeypatch):
     """One integration for the run itself; the same figures as with one for each variation."""
     records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
     state = fit_state(Assembly(decay_model()), _roles_of(records[:1]), NUMERICS)
-    integrated, counts, told = TransientRun._integrated, [], []
+    integrate, counts, told = _transient_run.integrate, [], []
 
-    def counted(self, *given):
+    def counted(*given):
         counts[-1] += 1
-        return integrated(self, *given)
+        return integrate(*given)
 
-    monkeypatch.setattr(TransientRun, "_integrated", counted)
+    monkeypatch.setattr(_transient_run, "integrate", counted)
     for begins in (True, False):
         if not begins:
             monkeypatch.setattr(_next_experiment, "solved_like", lambda *_: None)
