@@ -9,7 +9,8 @@ to a file as they come, so that a run that was stopped goes on:
 
     python studies/structure_probabilities.py rows.jsonl --campaigns 1000 --jobs 2
 
-``--store`` writes the table that the gallery shows.
+``--store`` writes the table that the gallery shows; ``--from-stored`` begins with its campaigns,
+for as long as what the package says of a campaign is the same.
 """
 
 from __future__ import annotations
@@ -193,11 +194,16 @@ def store(rows: Sequence[Mapping[str, Any]], campaigns: int) -> None:
         "campaigns": len(kept),
         "failed": len(rows) - len(kept),
     }
-    kept = [row | {"by_mix": statements_by_mix(row)} for row in kept]
+    kept = [_with_mix(row) for row in kept]
     kept = [{key: value for key, value in row.items() if key != "evidence"} for row in kept]
     lines = ",\n".join(json.dumps(_brief(row)) for row in kept)
     text = json.dumps(head)[:-1] + f', "rows": [\n{lines}\n]}}\n'
     TABLE.write_text(text, encoding="utf-8")
+
+
+def _with_mix(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """With the statements by the prior of the study, which rows of the stored table have."""
+    return {**row, "by_mix": statements_by_mix(row)} if "evidence" in row else row
 
 
 def _brief(value: Any) -> Any:
@@ -222,7 +228,11 @@ def main() -> None:
     parser.add_argument("--campaigns", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1, help="campaigns at a time")
     parser.add_argument("--store", action="store_true", help="write the table of all rows")
+    parser.add_argument("--from-stored", action="store_true", help="begin with the stored table")
     given = parser.parse_args()
+    if given.from_stored and not given.results.exists():
+        stored = json.loads(TABLE.read_text(encoding="utf-8"))["rows"]
+        given.results.write_text("".join(json.dumps(row) + "\n" for row in stored), "utf-8")
     done = {row["number"] for row in read(given.results)}
     numbers = [number for number in range(given.campaigns) if number not in done]
     with multiprocessing.Pool(given.jobs) as pool:
@@ -232,8 +242,7 @@ def main() -> None:
     found = [row for row in read(given.results) if row["number"] < given.campaigns]
     if given.store:
         store(found, given.campaigns)
-    by_mix = [r | {"by_mix": statements_by_mix(r)} if "evidence" in r else r for r in found]
-    print(json.dumps(figures(by_mix), indent=1))
+    print(json.dumps(figures([_with_mix(row) for row in found]), indent=1))
 
 
 if __name__ == "__main__":
