@@ -177,6 +177,11 @@ class BlockKernel:
         """Address of the compiled function, for :func:`caller`."""
         return int(self.pointer.address)
 
+    @property
+    def compiled(self) -> BlockKernel:
+        """This one; see :attr:`ArrayKernel.compiled`."""
+        return self
+
     def __call__(self, z: Array, u: Array, p: Array, lanes: Integers, *results: Array) -> None:
         """Evaluate lanes of ``z (L, nz, N)``, ``u (nu, N)``, ``p (L, np)`` into one or two arrays
         of shape (L, …, N)."""
@@ -196,10 +201,24 @@ class ArrayKernel:
         Rows that it fills.
     sizes : tuple of int
         Numbers of rows of ``z`` and ``u`` and of constants.
+    block : callable
+        Makes the same kernel for blocks of points.
     """
 
-    def __init__(self, function: Callable[..., None], rows: int, sizes: tuple[int, int, int]):
-        self.function, self.rows, self.sizes = function, rows, sizes
+    def __init__(
+        self,
+        function: Callable[..., None],
+        rows: int,
+        sizes: tuple[int, int, int],
+        block: Callable[[], BlockKernel],
+    ):
+        self.function, self.rows, self.sizes, self._block_kernel = function, rows, sizes, block
+
+    @cached_property
+    def compiled(self) -> BlockKernel:
+        """The same kernel, compiled: for callers that ask for a few points thousands of times."""
+        with COMPILING:
+            return self._block_kernel()
 
     def __call__(self, z: Array, u: Array, p: Array, lanes: Integers, *results: Array) -> None:
         """As :meth:`BlockKernel.__call__`."""

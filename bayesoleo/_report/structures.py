@@ -292,7 +292,9 @@ def _with_titles(entry: Mapping[str, Any], titles: Mapping[str, str]) -> dict[st
 
     def words(names: Sequence[str]) -> list[str]:
         own = [[e for e in one.split(" + ") if e not in shared] for one in names]
-        return [" with ".join(called(e, titles) for e in one) or "nothing more" for one in own]
+        titled = [[called(e, titles) for e in one] for one in own]
+        # "A with B" reads well; of three or more it is not seen where one rival ends.
+        return [(" with " if len(t) < 3 else " + ").join(t) or "nothing more" for t in titled]
 
     def run(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
         if found is None:

@@ -336,8 +336,9 @@ def _cached(like: Structured, active: tuple[str, ...], backend: str) -> Kernels:
         return Kernels(derived, source=source, **functions)
     # A search evaluates many models once, and few of their kernels: each is made when it is asked.
     sizes = (len(derived.states), len(derived.inputs), len(derived.constants))
+    made = {name: _Later(derived, name) for name in _counts(derived)}
     later: dict[str, Kernel] = {
-        name: ArrayKernel(_Later(derived, name), rows, sizes)
+        name: ArrayKernel(made[name], rows, sizes, made[name].compiled)
         for name, rows in _counts(derived).items()
     }
     return Kernels(derived, source="", **later)
@@ -363,6 +364,12 @@ class _Later:
 
     def __call__(self, *arguments: Any) -> None:
         self._made(*arguments)
+
+    def compiled(self) -> BlockKernel:
+        """The same kernel for blocks of points, by itself."""
+        items = _results(self._derived)[self._name]()
+        module = load(_module({self._name: items}, self._derived, "numba"))
+        return BlockKernel(getattr(module, self._name), len(items))
 
 
 def _counts(derived: Derived) -> dict[str, int]:

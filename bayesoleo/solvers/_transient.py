@@ -55,6 +55,9 @@ MAXIMUM_ITERATIONS, ITERATIONS_OF_ARRAYS = 6, 12
 MAXIMUM_HALVINGS = 8
 #: Newton iterations on one step.
 STEP_ITERATIONS = 16
+#: Steps from which on calls back into Python, some ten microseconds each, take longer than to
+#: compile the kernels that are called, where a model is estimated.
+WORTH_COMPILING = 1000
 
 
 @dataclass(frozen=True)
@@ -231,10 +234,13 @@ def _march(problem: Boundary, p: Array, start: Array) -> tuple[Array, int, int]:
         table.c, table.a, table.a @ table.a, table.polynomials, np.zeros(table.stages), 0.0
     )
     work = workspace(table.stages, scheme.orders, problem.inputs.shape[0], 0, problem.conditions, 0)
-    conditions = equations.admissible.address if problem.conditions else 0
+    jacobian, admissible = equations.jacobian, equations.admissible
+    if n >= WORTH_COMPILING:
+        jacobian, admissible = jacobian.compiled, admissible.compiled
+    conditions = admissible.address if problem.conditions else 0
     with np.errstate(all="ignore"):
         done, iterations, outside = _steps(
-            equations.jacobian.address, conditions, problem.conditions, x, problem.inputs,
+            jacobian.address, conditions, problem.conditions, x, problem.inputs,
             scheme.lengths(n, problem.step(n)), p, method, table.b, table.b @ table.a, orders, work,
         )  # fmt: skip
     if done == n:

@@ -72,6 +72,12 @@ def test_effects_that_all_rivals_have_are_told_once():
     assert question == f"{expected}c (0.50), d (0.30) and nothing more (0.20)."
 
 
+def test_three_effects_of_a_rival_are_seen_as_one():
+    given = entry(question="structures", rivals=["a + b + c", "d"])
+    question = proposal_lines(given)[0]
+    assert question == "What is missing, by probability: a + b + c (0.60) and d (0.40)."
+
+
 def test_a_variation_of_a_measured_run_is_told_by_what_it_changes():
     runs = [trial({("a", "b"): 3.0}) | {"like": "drop 2", "change": "force × 1.2, duration × 2"}]
     repeat = trial({("a", "b"): 1.0}, run="drop 1", information=0.2)
