@@ -58,7 +58,10 @@ KnownRows = dict[tuple[str, int], Array]
 MAXIMUM_ITERATIONS, MAXIMUM_HALVINGS = 60, 30
 #: A Newton step this small, over the state's size, leaves round-off only.
 SMALL_STEP = 1e-12
+#: Evaluations by calls back into Python, where kernels are not compiled; then they are.
+CALLED_BACK = 60
 #: As compiled code returns them.
+UNFINISHED = -1
 CONVERGED, NOT_FINITE = Status.CONVERGED.value, Status.NOT_FINITE.value
 SINGULAR, NO_CONVERGENCE = Status.SINGULAR.value, Status.NO_CONVERGENCE.value
 
@@ -286,21 +289,30 @@ class InitialState:
     def _solve(self, z: Array, p: Array, rows: Integers, columns: Integers) -> int:
         """Newton's method on the static equations at one lane's ``z (nz,)``, in place."""
         kernels, conditions = self.kernels, len(self.kernels.derived.admissible)
-        admissible = kernels.admissible.address if conditions else 0
+        jacobian, admissible = kernels.jacobian, kernels.admissible
         work = workspace(1, kernels.derived.orders, self.inputs.shape[0], 0, conditions, 0)
         work.u[: self.inputs.shape[0], 0] = self.inputs[:, 0]
-        with np.errstate(all="ignore"):
-            return int(
-                _rest(kernels.jacobian.address, admissible, conditions, z, p, rows, columns, work)
-            )
+        for most in (CALLED_BACK, MAXIMUM_ITERATIONS * MAXIMUM_HALVINGS):
+            where = admissible.address if conditions else 0
+            with np.errstate(all="ignore"):
+                status = int(
+                    _rest(jacobian.address, where, conditions, most, z, p, rows, columns, work)
+                )
+            if status != UNFINISHED:
+                return status
+            jacobian, admissible = jacobian.compiled, admissible.compiled
+        return NO_CONVERGENCE
 
 
 @jit
 def _rest(
-    jacobian: int, admissible: int, conditions: int, z: Array, p: Array, rows: Integers,
+    jacobian: int, admissible: int, conditions: int, most: int, z: Array, p: Array, rows: Integers,
     columns: Integers, work: Workspace,
 ) -> int:  # fmt: skip
-    """Zeros of the equations ``rows`` by the entries ``columns`` of ``z (nz,)``; a status."""
+    """Zeros of the equations ``rows`` by the entries ``columns`` of ``z (nz,)``.
+
+    Returns a status, or ``UNFINISHED`` after ``most`` evaluations.
+    """
     nz, m = z.size, rows.size
     d = work.small.shape[0]
     base, step, unit = np.empty(m), np.empty((m, 1)), np.empty(m)
@@ -331,6 +343,9 @@ def _rest(
             break
         fraction, taken = 1.0, False
         for _ in range(MAXIMUM_HALVINGS):
+            most -= 1
+            if most < 0:
+                return UNFINISHED
             for i in range(m):
                 work.z[columns[i], 0] = base[i] + fraction * step[i, 0]
             evaluate_kernel(jacobian, work.z, work.u, p, work.g, 1)

@@ -57,7 +57,7 @@ MAXIMUM_HALVINGS = 8
 STEP_ITERATIONS = 16
 #: Steps from which on calls back into Python, some ten microseconds each, take longer than to
 #: compile the kernels that are called, where a model is estimated.
-WORTH_COMPILING = 1000
+WORTH_COMPILING = 250
 
 
 @dataclass(frozen=True)
