@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from itertools import groupby
 from pathlib import Path
 
 from mutant_table import MUTANTS, Mutant
@@ -200,6 +201,10 @@ class Copy:
             file.unlink()
 
 
+def _package(mutant: Mutant) -> str:
+    return mutant.file.partition("/")[0]
+
+
 def chosen(few: bool = False, only: str = "") -> list[Mutant]:
     """Mutants that count: all, a sample over the packages, or those that are named.
 
@@ -212,7 +217,9 @@ def chosen(few: bool = False, only: str = "") -> list[Mutant]:
         return found
     if few:
         sources = {m.file: (ROOT / "bayesoleo" / m.file).read_text("utf-8") for m in MUTANTS}
-        return [mutant for mutant in MUTANTS if not is_compiled(sources[mutant.file])][::SPARSE]
+        small = [mutant for mutant in MUTANTS if not is_compiled(sources[mutant.file])]
+        by_package = groupby(sorted(small, key=_package), key=_package)
+        return [mutant for _, group in by_package for mutant in list(group)[::SPARSE]]
     return list(MUTANTS)
 
 

@@ -84,6 +84,7 @@ def test_what_is_no_limit_is_refused(refused, springs, option, message):
     assert message in line
 
 
+@pytest.mark.slow
 def test_an_unknown_rival_is_refused_with_those_there_are(run, springs):
     result = run(
         "propose", springs, "--model", springs / "model.py", "--rivals", "linear_stifness", "-q"

@@ -232,6 +232,7 @@ def test_another_seed_draws_other_samples_of_the_same_posterior(closed, campaign
     assert schema.DISCOVERY in tree.children
 
 
+@pytest.mark.slow
 def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
     records = {schema.RECORDS, schema.CONSTANT_DATA, schema.NOISE}
     point = workflow.estimate(campaign, MODEL, SETTINGS, out=tmp_path / "estimate")

@@ -266,6 +266,7 @@ def test_how_much_is_drawn_has_no_say_in_what_is_missing(campaign, tmp_path, mon
     assert not any(text.startswith(("round", "start anew")) for text in said)
 
 
+@pytest.mark.slow
 def test_the_terminal_says_what_failed_and_the_status_is_its_own(campaign, tmp_path, monkeypatch):
     without_page(monkeypatch)
     monkeypatch.setattr(closing, "draw", broken)
