@@ -101,7 +101,7 @@ def bspline_values(t: Array) -> Array:
     """The cardinal cubic B-spline; see :class:`bayesoleo.model._expressions.bspline`."""
     size = np.abs(t)
     far, near = np.maximum(2.0 - size, 0.0), np.maximum(1.0 - size, 0.0)
-    # Products: a library's power takes ten times as long.
+    # Products: a library's power takes three times as long.
     found: Array = (far * far * far - 4.0 * near * near * near) / 6.0
     return found
 

@@ -294,10 +294,9 @@ class InitialState:
         work.u[: self.inputs.shape[0], 0] = self.inputs[:, 0]
         for most in (CALLED_BACK, MAXIMUM_ITERATIONS * MAXIMUM_HALVINGS):
             where = admissible.address if conditions else 0
-            with np.errstate(all="ignore"):
-                status = int(
-                    _rest(jacobian.address, where, conditions, most, z, p, rows, columns, work)
-                )
+            status = int(
+                _rest(jacobian.address, where, conditions, most, z, p, rows, columns, work)
+            )
             if status != UNFINISHED:
                 return status
             jacobian, admissible = jacobian.compiled, admissible.compiled

@@ -238,11 +238,10 @@ def _march(problem: Boundary, p: Array, start: Array) -> tuple[Array, int, int]:
     if n >= WORTH_COMPILING:
         jacobian, admissible = jacobian.compiled, admissible.compiled
     conditions = admissible.address if problem.conditions else 0
-    with np.errstate(all="ignore"):
-        done, iterations, outside = _steps(
-            jacobian.address, conditions, problem.conditions, x, problem.inputs,
-            scheme.lengths(n, problem.step(n)), p, method, table.b, table.b @ table.a, orders, work,
-        )  # fmt: skip
+    done, iterations, outside = _steps(
+        jacobian.address, conditions, problem.conditions, x, problem.inputs,
+        scheme.lengths(n, problem.step(n)), p, method, table.b, table.b @ table.a, orders, work,
+    )  # fmt: skip
     if done == n:
         return x, Status.CONVERGED.value, iterations
     status = Status.INADMISSIBLE if outside else Status.NO_CONVERGENCE

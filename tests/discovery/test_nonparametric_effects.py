@@ -51,6 +51,15 @@ def test_cardinal_splines_are_those_of_de_boor():
     np.testing.assert_allclose(bspline_values(t), np.nan_to_num(exact), atol=1e-15)
 
 
+def test_splines_of_an_axis_are_shifted_copies_of_one():
+    """Inside, at and beyond the ends; of a value that is not a number they are none either."""
+    axis, pieces = Axis("x", symbol("x"), "m", -1.0, 2.0), 7
+    values = np.array([-1.9, -1.0, -0.3, 0.5, 1.999, 2.0, 3.4, np.nan])
+    place = pieces * (values + 1.0) / 3.0
+    expected = bspline_values(place - np.arange(-1, pieces + 2)[:, None])
+    np.testing.assert_allclose(axis.basis(values, pieces), expected, atol=1e-14)
+
+
 def test_what_the_catalogue_lacks_ends_as_a_curve_without_a_name(strange):
     assert strange.effects == ("nonparametric_displacement",)
     assert strange.verdict == schema.EFFECT_ADDED
