@@ -26,10 +26,12 @@ from bayesoleo.discovery._structure_evidence import (
     Reduced,
     Remainders,
     effect_evidence,
+    exact_where_it_counts,
     fewer,
     log_difference,
     mean_of,
-    pair_evidence,
+    rough_evidence,
+    rough_pairs,
     sizes_between,
 )
 from bayesoleo.discovery._structures import StructurePrior
@@ -400,8 +402,9 @@ def _one_more(
     if not flat:
         return {}, {}
     own = [group for _, group in flat]
-    logs = np.stack(
-        [effect_evidence(p, at.likelihood, own, at.sizes) for p in at.parts(columns)], axis=1
+    labels = np.array([list(keys).index(key) for key, _ in flat])
+    logs = exact_where_it_counts(
+        [rough_evidence(p, at.likelihood, own, at.sizes) for p in at.parts(columns)], labels
     )  # (remainders, own sizes, groups, sizes)
     without, outside = at.remainders.split(logs)
     alike = at.remainders.similar(logs, at.sizes)
@@ -519,8 +522,9 @@ def _pairs(at: _At, best: Sequence[Added]) -> Evidences:
     for place, first in enumerate(able[:-1], 1):
         flat = [(second, group) for second in able[place:] for group in groups[second]]
         others = [group for _, group in flat]
-        logs = np.stack(
-            [pair_evidence(parts, at.likelihood, one, others, few) for one in groups[first]], axis=1
+        labels = np.array([able.index(second) for second, _ in flat], dtype=int)
+        logs = exact_where_it_counts(
+            [rough_pairs(parts, at.likelihood, one, others, few) for one in groups[first]], labels
         )  # (remainders, groups of the first, groups of others, sizes, sizes)
         for outside, value in zip((False, True), at.remainders.split(logs), strict=True):
             for second in able[place:]:

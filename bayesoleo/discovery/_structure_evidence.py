@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import erfcx, logsumexp
 
 from bayesoleo._types import Array, Integers
@@ -51,6 +52,9 @@ NEAR = 8.0
 FARTHEST = 30.0
 #: Standard deviations beyond which a tail is its first asymptotic term, to 5e-4 of it.
 FAR = 100.0
+#: Logarithm below an effect's largest evidence from which moments are taken as if there were no
+#: likely sides and no correlations, which changes them by less than e^10: to 1e-12 of the whole.
+SMALL_SHARE = 40.0
 _LOG_2 = float(np.log(2.0))
 
 
@@ -303,15 +307,15 @@ class Amplitudes:
         gain = self.gain[:, parts[:, None], columns]
         return Amplitudes(self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain)
 
-    def log_moment_beside(
+    def beside(
         self,
         columns: Integers,
         positive: Array | float,
         mean: Array,
         covariance: Array,
         noise: Array,
-    ) -> Array:
-        """Logarithm of the moment of these amplitudes and of those of one more effect.
+    ) -> Moments:
+        """Moment of these amplitudes and of those of one more effect, shape (P, S, T).
 
         Parameters
         ----------
@@ -324,10 +328,6 @@ class Amplitudes:
         covariance : ndarray, shape (n, n, P, S, T)
         noise : ndarray, shape (P, S, T)
             Variance of the noise over that measured.
-
-        Returns
-        -------
-        ndarray, shape (P, S, T)
         """
         own, more = range(len(self.mean)), range(len(mean))
         gain = self.gain[:, :, columns]  # (m, P, S, n)
@@ -345,7 +345,7 @@ class Amplitudes:
         upper += [list(covariance[k, k:]) for k in more]
         counts, sides = [*self.counts, len(more)], [*self.positive, positive]
         root = np.sqrt(noise)
-        return log_moments(counts, sides, [one / root for one in (*now, *mean)], upper)
+        return Moments(counts, sides, [one / root for one in (*now, *mean)], upper)
 
 
 @dataclass(frozen=True)
@@ -473,14 +473,26 @@ def effect_evidence(
     sizes : ndarray, shape (T,)
         ``tau``, in units of the columns.
     """
-    found = np.empty((len(parts.square), len(groups), sizes.size))
-    single = [k for k, group in enumerate(groups) if len(group.columns) == 1]
-    if single:
-        found[:, single] = _singly(parts, likelihood, [groups[k] for k in single], sizes)
-    for k, group in enumerate(groups):
-        if len(group.columns) > 1:
-            found[:, k] = _together(parts, likelihood, group, sizes)
-    return found
+    rough = rough_evidence(parts, likelihood, groups, sizes)
+    return rough.exact(np.ones(rough.value.shape, dtype=bool))
+
+
+def rough_evidence(
+    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
+) -> Rough:
+    """The same but for likely sides and correlations of moments."""
+    value = np.empty((len(parts.square), len(groups), sizes.size))
+    single = np.array([k for k, g in enumerate(groups) if len(g.columns) == 1], dtype=int)
+    several = [k for k, g in enumerate(groups) if len(g.columns) > 1]
+    found = []
+    if single.size:
+        found.append((single, _singly(parts, likelihood, [groups[k] for k in single], sizes)))
+    found += [(np.array([k]), _together(parts, likelihood, groups[k], sizes)) for k in several]
+    moments = []
+    for index, (density, moment) in found:
+        value[:, index] = density + moment.even()
+        moments.append((index, density, moment))
+    return Rough(value, moments)
 
 
 def moment_power(sizes: Array, columns: int | Array) -> Array:
@@ -520,6 +532,105 @@ def _uneven_moment(positive: Array, distance: Array) -> Array:
         here = np.log1p(size**2 - np.exp(beyond))
         found[both] = np.logaddexp(np.log(likely) + here, np.log1p(-likely) + beyond) + _LOG_2
     return np.asarray(found)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What the product of effects' moments follows from, see :func:`log_moments`."""
+
+    counts: Sequence[int]
+    positive: Sequence[Array | float]
+    mean: Sequence[Array]
+    upper: Sequence[Sequence[Array]]
+
+    def even(self) -> Array:
+        """Logarithm, if there were no likely sides and no correlations of effects."""
+        found, start = np.asarray(0.0), 0
+        for count in self.counts:
+            place = range(start, start + count)
+            found = found + np.log(sum(self.mean[c] ** 2 + self.upper[c][0] for c in place) / count)
+            start += count
+        return np.asarray(found)
+
+    def at(self, where: NDArray[np.bool_]) -> Array:
+        """Logarithm at some elements of the whole shape, in their order."""
+
+        def chosen(values: Array | float) -> Array | float:
+            if np.ndim(values) == 0:
+                return values
+            return np.asarray(np.broadcast_to(values, where.shape)[where])
+
+        mean = [np.asarray(chosen(one)) for one in self.mean]
+        upper = [[np.asarray(chosen(one)) for one in row] for row in self.upper]
+        return log_moments(self.counts, [chosen(one) for one in self.positive], mean, upper)
+
+
+@dataclass(frozen=True)
+class Rough:
+    """Log evidence of effects but for likely sides and correlations of their moments.
+
+    Parameters
+    ----------
+    value : ndarray, shape (P, groups, ...)
+    moments : sequence of (index, density, Moments)
+        Those of some of the groups, beside the density without them, of shape
+        (P, groups of the index, ...).
+    """
+
+    value: Array
+    moments: Sequence[tuple[Integers, Array, Moments]]
+
+    def exact(self, where: NDArray[np.bool_]) -> Array:
+        """The same, exact at some elements."""
+        found = self.value.copy()
+        for index, density, moments in self.moments:
+            here = where[:, index]
+            if here.any():
+                some = found[:, index]
+                some[here] = density[here] + moments.at(here)
+                found[:, index] = some
+        return found
+
+
+def exact_where_it_counts(rough: Sequence[Rough], labels: Integers) -> Array:
+    """Log evidence of effects, with rough values where they are nothing of the whole.
+
+    Parameters
+    ----------
+    rough : sequence of Rough, length m
+        Of the same groups, for instance by size of an anchor's own effects.
+    labels : ndarray of int, shape (groups,)
+        Effect of each group; each effect counts by itself, and without and with something outside.
+
+    Returns
+    -------
+    ndarray, shape (P, m, groups, ...)
+    """
+    each = np.stack([one.value for one in rough], axis=1)
+    best = _best_of(each, labels)
+    # Where a side is impossible the best of the rough values may be nothing: look once more.
+    found, done = each, np.zeros(each.shape, dtype=bool)
+    for _ in range(2):
+        near = (each > best - SMALL_SHARE) & ~done
+        if near.any():
+            exact = np.stack([one.exact(near[:, k]) for k, one in enumerate(rough)], axis=1)
+            found, done = np.where(near, exact, found), done | near
+        best = _best_of(np.where(done, found, -np.inf), labels)
+    return found
+
+
+def _best_of(values: Array, labels: Integers) -> Array:
+    """Largest of each effect's values, without and with something outside, to be compared."""
+    rest = tuple(range(3, values.ndim))
+    by_group = values.max(axis=(1, *rest))  # (P, groups)
+    found = np.empty_like(by_group)
+    for part in (slice(0, 1), slice(1, None)):
+        if not by_group[part].size:
+            continue
+        top = by_group[part].max(axis=0)
+        for label in np.unique(labels):
+            found[part, labels == label] = top[labels == label].max()
+    return np.expand_dims(found, (1, *rest))
 
 
 def log_moments(
@@ -639,8 +750,10 @@ def _half_moments(distance: Array) -> tuple[Array, Array, Array]:
     )
 
 
-def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array) -> Array:
-    """Log evidence of effects with one unknown each, shape (P, groups, sizes)."""
+def _singly(
+    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
+) -> tuple[Array, Moments]:
+    """Log density of effects with one unknown each, shape (P, groups, sizes), and its moments."""
     index = np.array([group.columns[0] for group in groups], dtype=int)
     positive = np.array([group.positive for group in groups])[:, None]
     power = moment_power(sizes, 1)
@@ -652,15 +765,17 @@ def _singly(parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], siz
     value, noise = likelihood(square, logs), likelihood.noise(square)
     mean, variance = power * slope / grown, power / grown
     if parts.own is None:
-        moment = np.log(variance) + log_moment(positive, mean / np.sqrt(variance * noise))
+        moment = Moments([1], [positive], [mean / np.sqrt(noise)], [[variance]])
     else:
         posterior = mean[None], variance[None, None], noise
-        moment = parts.own.log_moment_beside(index[:, None], positive, *posterior)
-    return np.asarray(value + moment - np.log(power))
+        moment = parts.own.beside(index[:, None], positive, *posterior)
+    return np.asarray(value - np.log(power)), moment
 
 
-def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array) -> Array:
-    """Log evidence of an effect with several unknowns, shape (P, sizes)."""
+def _together(
+    parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
+) -> tuple[Array, Moments]:
+    """Log density of an effect with several unknowns, shape (P, 1, sizes), and its moments."""
     index = np.array(group.columns)
     values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
     turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0]
@@ -671,12 +786,14 @@ def _together(parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
     square = parts.square[:, None] - gain
     value, noise = likelihood(square, logs) - np.log(power[:, 0]), likelihood.noise(square)
     if parts.own is None:
-        squares = (spread * turned) ** 2 / noise[:, :, None] + spread
-        return np.asarray(value + np.log(squares.mean(axis=2)))
+        # Turned amplitudes are independent; the mean of their squares is that of the others.
+        means = np.moveaxis(spread * turned / np.sqrt(noise[:, :, None]), 2, 0)[:, :, None]
+        upper = [[row[:, None]] for row in np.moveaxis(spread, 2, 0)]
+        return value[:, None], Moments([index.size], [0.5], list(means), upper)
     mean = np.einsum("pab,ptb->apt", vectors, spread * turned)
     covariance = np.einsum("pab,ptb,pcb->acpt", vectors, spread, vectors)
     posterior = mean[:, :, None], covariance[:, :, :, None], noise[:, None]
-    return np.asarray(value + parts.own.log_moment_beside(index[None], 0.5, *posterior)[:, 0])
+    return value[:, None], parts.own.beside(index[None], 0.5, *posterior)
 
 
 def pair_evidence(
@@ -688,6 +805,14 @@ def pair_evidence(
     -------
     ndarray, shape (P, others, sizes, sizes)
     """
+    rough = rough_pairs(parts, likelihood, one, others, sizes)
+    return rough.exact(np.ones(rough.value.shape, dtype=bool))
+
+
+def rough_pairs(
+    parts: Reduced, likelihood: Likelihood, one: Group, others: Sequence[Group], sizes: Array
+) -> Rough:
+    """The same but for likely sides and correlations of moments."""
     (i,), index = one.columns, np.array([group.columns[0] for group in others], dtype=int)
     root = np.sqrt(moment_power(sizes, 1))
 
@@ -709,8 +834,8 @@ def pair_evidence(
     means = (its * first - mixed * second) / det, (own * second - mixed * first) / det
     upper = [[its / det, -mixed / det], [own / det]]
     positive = np.array([group.positive for group in others])[:, None, None]
-    moments = log_moments([1, 1], [one.positive, positive], [m / noise for m in means], upper)
-    return np.asarray(found + moments)
+    moments = Moments([1, 1], [one.positive, positive], [m / noise for m in means], upper)
+    return Rough(found + moments.even(), [(np.arange(len(others)), found, moments)])
 
 
 def mean_of(logs: Array) -> float:

@@ -17,10 +17,12 @@ from bayesoleo.discovery._structure_evidence import (
     Reduced,
     Remainders,
     effect_evidence,
+    exact_where_it_counts,
     log_moment,
     log_moments,
     mean_of,
     pair_evidence,
+    rough_evidence,
 )
 from bayesoleo.discovery._structures import StructurePrior
 
@@ -384,3 +386,26 @@ def test_coefficients_on_all_lines_have_the_signal_s_square(size):
     lines = RunLines(record, np.arange(size // 2 + 1))
     signal = np.random.default_rng(0).standard_normal(size) + (-1.0) ** np.arange(size)
     assert np.sum(lines.transformed(signal) ** 2) == pytest.approx(signal @ signal)
+
+
+@pytest.mark.parametrize("side", [0.5, 0.9, 0.0])
+def test_moments_are_exact_wherever_they_count(side):
+    """Also where the most probable side is impossible, so that the best rough value is nothing."""
+    rng, likelihood = np.random.default_rng(8), Likelihood(400, 1e4)
+    columns = rng.standard_normal((6, 400)) * np.geomspace(0.2, 2.0, 6)[:, None]
+    rows = np.concatenate(
+        [(rng.standard_normal(400) + 0.4 * columns[1:4].sum(axis=0))[None], columns]
+    )
+    levels = [rows @ rows.T / level for level in (1.0, 1.5, 3.0)]
+    logs = np.array([0.0, 400 * np.log(1.5), 400 * np.log(3.0)])
+    part = Reduced.of(np.array(levels), logs, 0, np.zeros(0))
+    beside = [part.with_effects([Group((1,), side)], [size]) for size in SIZES]
+    groups = [Group((0,)), Group((1,), side), Group((2,), 0.9), Group((3, 4))]
+    labels = np.array([0, 1, 1, 2])
+    rough = [rough_evidence(one, likelihood, groups, SIZES) for one in beside]
+    found = exact_where_it_counts(rough, labels)
+    whole = np.stack([effect_evidence(b, likelihood, groups, SIZES) for b in beside], axis=1)
+    for label in range(3):
+        for some in (slice(0, 1), slice(1, None)):
+            ours, theirs = (logs[some][:, :, labels == label] for logs in (found, whole))
+            assert mean_of(ours) == pytest.approx(mean_of(theirs), abs=1e-9)
