@@ -22,16 +22,15 @@ from bayesoleo.discovery._spectral_data import EstimatedModel, SpectralData, lin
 from bayesoleo.discovery._structure_evidence import (
     Covariances,
     Group,
+    Largest,
     Likelihood,
     Reduced,
     Remainders,
     effect_evidence,
-    exact_where_it_counts,
     fewer,
     log_difference,
     mean_of,
-    rough_evidence,
-    rough_pairs,
+    pair_evidence,
     sizes_between,
 )
 from bayesoleo.discovery._structures import StructurePrior
@@ -267,9 +266,22 @@ class _At:
 
     def parts(self, columns: Sequence[int]) -> list[Reduced]:
         """Some columns by remainder, once for each set of sizes of the anchor's own effects."""
-        own = [c for group in self.own for c in group.columns]
-        parts = self.remainders.parts(self.reduced, [*own, *columns], self.law)
-        if not own:
+        return self._by_size(
+            self.remainders.parts(self.reduced, [*self._own_columns, *columns], self.law)
+        )
+
+    def alone(self, columns: Sequence[int]) -> list[Reduced]:
+        """The same without anything outside the catalogue: of noise alone."""
+        return self._by_size(self.reduced.of_some([0], [*self._own_columns, *columns]))
+
+    @property
+    def _own_columns(self) -> list[int]:
+        """Columns of the anchor's effects."""
+        return [c for group in self.own for c in group.columns]
+
+    def _by_size(self, parts: Reduced) -> list[Reduced]:
+        """With the anchor's own effects, whose columns come first, in the covariance."""
+        if not self.own:
             return [parts]
         return [parts.with_effects(self.own, sizes) for sizes in self._own_sizes()]
 
@@ -353,7 +365,7 @@ def _curve(at: _At, groups: Sequence[Group]) -> Array:
     values = []
     for group in groups:
         local = Group(tuple(range(len(group.columns))))
-        noise = [part.of_some([0], local.columns) for part in at.parts(group.columns)]
+        noise = at.alone(group.columns)
         found = [effect_evidence(part, at.likelihood, [local], at.sizes) for part in noise]
         values.append([logs[0, 0] for logs in found])
     return np.array(values)
@@ -402,10 +414,12 @@ def _one_more(
     if not flat:
         return {}, {}
     own = [group for _, group in flat]
-    labels = np.array([list(keys).index(key) for key, _ in flat])
-    logs = exact_where_it_counts(
-        [rough_evidence(p, at.likelihood, own, at.sizes) for p in at.parts(columns)], labels
-    )  # (remainders, own sizes, groups, sizes)
+    labels, largest = [list(keys).index(key) for key, _ in flat], Largest.of(len(keys))
+    each = [
+        effect_evidence(part, at.likelihood, own, at.sizes, labels, largest)
+        for part in at.parts(columns)
+    ]
+    logs = np.stack(each, axis=1)  # (remainders, own sizes, groups, sizes)
     without, outside = at.remainders.split(logs)
     alike = at.remainders.similar(logs, at.sizes)
     found, similar = {}, {}
@@ -522,10 +536,13 @@ def _pairs(at: _At, best: Sequence[Added]) -> Evidences:
     for place, first in enumerate(able[:-1], 1):
         flat = [(second, group) for second in able[place:] for group in groups[second]]
         others = [group for _, group in flat]
-        labels = np.array([able.index(second) for second, _ in flat], dtype=int)
-        logs = exact_where_it_counts(
-            [rough_pairs(parts, at.likelihood, one, others, few) for one in groups[first]], labels
-        )  # (remainders, groups of the first, groups of others, sizes, sizes)
+        labels, largest = [able.index(second) for second, _ in flat], Largest.of(len(able))
+        each = [
+            pair_evidence(parts, at.likelihood, one, others, few, labels, largest)
+            for one in groups[first]
+        ]
+        # (remainders, groups of the first, groups of others, sizes, sizes)
+        logs = np.stack(each, axis=1)
         for outside, value in zip((False, True), at.remainders.split(logs), strict=True):
             for second in able[place:]:
                 index = [k for k, (key, _) in enumerate(flat) if key == second]

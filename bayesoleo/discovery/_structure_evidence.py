@@ -30,13 +30,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import erfcx, logsumexp
+from scipy.special import logsumexp
 
 from bayesoleo._types import Array, Integers
+from bayesoleo.discovery._structure_moments import beside, log_moments, pairs, singles
 
 #: Sizes of one effect, of the law outside the catalogue, and of the remainder over phase.
 SIZES, LAW_SIZES, SMOOTH_SIZES = 10, 5, 5
@@ -46,16 +45,6 @@ VISIBLE = 4.0
 #: Difference of a law from the effect that it resembles, as a part of the effect's size, and the
 #: spread of its logarithm.
 DIFFERENCE, DIFFERENCE_SPREAD = 0.25, 1.2
-#: Standard deviations beyond which the other side of zero has less than 1e-15 of a normal density.
-NEAR = 8.0
-#: Standard deviations at which moments of the far side have lost ten digits to cancellation.
-FARTHEST = 30.0
-#: Standard deviations beyond which a tail is its first asymptotic term, to 5e-4 of it.
-FAR = 100.0
-#: Logarithm below an effect's largest evidence from which moments are taken as if there were no
-#: likely sides and no correlations, which changes them by less than e^10: to 1e-12 of the whole.
-SMALL_SHARE = 40.0
-_LOG_2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True)
@@ -236,9 +225,8 @@ class Reduced:
         own = self.own
         if own is None:
             return np.zeros(len(self.square))
-        rows, noise = range(len(own.mean)), likelihood.noise(self.square)
-        upper = [[own.covariance[i, j] for j in rows[i:]] for i in rows]
-        return log_moments(own.counts, own.positive, list(own.mean / np.sqrt(noise)), upper)
+        mean = own.mean / np.sqrt(likelihood.noise(self.square))
+        return log_moments(own.counts, own.positive, mean, own.covariance)
 
     def with_columns(
         self, columns: Sequence[int], power: Array, keep: Sequence[int] | None = None
@@ -298,7 +286,7 @@ class Amplitudes:
         return [len(group.columns) for group in self.groups]
 
     @property
-    def positive(self) -> list[Array | float]:
+    def positive(self) -> list[float]:
         """Prior probabilities that their sizes are above zero."""
         return [group.positive for group in self.groups]
 
@@ -306,46 +294,6 @@ class Amplitudes:
         """The same for some covariances and further columns."""
         gain = self.gain[:, parts[:, None], columns]
         return Amplitudes(self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain)
-
-    def beside(
-        self,
-        columns: Integers,
-        positive: Array | float,
-        mean: Array,
-        covariance: Array,
-        noise: Array,
-    ) -> Moments:
-        """Moment of these amplitudes and of those of one more effect, shape (P, S, T).
-
-        Parameters
-        ----------
-        columns : ndarray of int, shape (S, n)
-            Of each of several further effects.
-        positive : float or ndarray
-            Prior probability that its size is above zero.
-        mean : ndarray, shape (n, P, S, T)
-            Of its amplitudes, by size.
-        covariance : ndarray, shape (n, n, P, S, T)
-        noise : ndarray, shape (P, S, T)
-            Variance of the noise over that measured.
-        """
-        own, more = range(len(self.mean)), range(len(mean))
-        gain = self.gain[:, :, columns]  # (m, P, S, n)
-
-        def moved(i: int, values: Sequence[Array] | Array) -> Array:
-            """Of an own amplitude, by one of each further amplitude."""
-            if len(values) == 1:  # of nearly all effects
-                return np.asarray(gain[i] * values[0])
-            return np.asarray(np.einsum("psn,npst->pst", gain[i], np.asarray(values)))
-
-        shared = [[-moved(i, covariance[:, k]) for k in more] for i in own]
-        now = [self.mean[i][:, None, None] - moved(i, mean) for i in own]
-        its = [self.covariance[i][:, :, None, None] for i in own]
-        upper = [[*(its[i][j] - moved(j, shared[i]) for j in own[i:]), *shared[i]] for i in own]
-        upper += [list(covariance[k, k:]) for k in more]
-        counts, sides = [*self.counts, len(more)], [*self.positive, positive]
-        root = np.sqrt(noise)
-        return Moments(counts, sides, [one / root for one in (*now, *mean)], upper)
 
 
 @dataclass(frozen=True)
@@ -399,9 +347,9 @@ class Remainders:
 
     def split(self, logs: Array) -> tuple[Array, Array]:
         """Log evidence without, and with something outside, from that of all parts (parts, ...)."""
-        weights = np.array([w for _, _, w in self.weights[1:]])
+        weights = np.log([w for _, _, w in self.weights[1:]])
         shape = (-1, *(1,) * (logs.ndim - 1))
-        return logs[0], logsumexp(logs[1:], axis=0, b=weights.reshape(shape))
+        return logs[0], log_sum(logs[1:] + weights.reshape(shape))
 
     def similar(self, logs: Array, sizes: Array) -> Array:
         """Log evidence of a law that resembles an effect, from that of all parts and sizes of the
@@ -410,7 +358,7 @@ class Remainders:
         share = share + log_difference(np.sqrt(self.power[1:, None]) / sizes)
         share = share - logsumexp(share, axis=0)
         shape = (len(share), *(1,) * (logs.ndim - 2), sizes.size)
-        return np.asarray(logsumexp(logs[1:] + share.reshape(shape), axis=0))
+        return log_sum(logs[1:] + share.reshape(shape))
 
 
 def log_difference(ratio: Array) -> Array:
@@ -459,8 +407,32 @@ class Group:
     positive: float = 0.5
 
 
+@dataclass(frozen=True)
+class Largest:
+    """Largest log evidence so far of each of some effects, without and with something outside.
+
+    What is far below it counts for nothing and need not be exact.
+
+    Parameters
+    ----------
+    value : ndarray, shape (2, effects)
+    """
+
+    value: Array
+
+    @classmethod
+    def of(cls, effects: int) -> Largest:
+        """Nothing so far."""
+        return cls(np.full((2, effects), -np.inf))
+
+
 def effect_evidence(
-    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
+    parts: Reduced,
+    likelihood: Likelihood,
+    groups: Sequence[Group],
+    sizes: Array,
+    labels: Sequence[int] | None = None,
+    largest: Largest | None = None,
 ) -> Array:
     """Log evidence of one effect at each size, shape (P, groups, sizes).
 
@@ -472,27 +444,22 @@ def effect_evidence(
         Effects, each as the only one.
     sizes : ndarray, shape (T,)
         ``tau``, in units of the columns.
+    labels : sequence of int, optional
+        Effect of each group; by default each is one.
+    largest : Largest, optional
+        Of these effects, of calls before and this one.
     """
-    rough = rough_evidence(parts, likelihood, groups, sizes)
-    return rough.exact(np.ones(rough.value.shape, dtype=bool))
-
-
-def rough_evidence(
-    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
-) -> Rough:
-    """The same but for likely sides and correlations of moments."""
-    value = np.empty((len(parts.square), len(groups), sizes.size))
+    of = np.arange(len(groups)) if labels is None else np.asarray(labels)
+    best = (largest or Largest.of(int(of.max(initial=-1)) + 1)).value
+    found = np.empty((len(parts.square), len(groups), sizes.size))
     single = np.array([k for k, g in enumerate(groups) if len(g.columns) == 1], dtype=int)
-    several = [k for k, g in enumerate(groups) if len(g.columns) > 1]
-    found = []
     if single.size:
-        found.append((single, _singly(parts, likelihood, [groups[k] for k in single], sizes)))
-    found += [(np.array([k]), _together(parts, likelihood, groups[k], sizes)) for k in several]
-    moments = []
-    for index, (density, moment) in found:
-        value[:, index] = density + moment.even()
-        moments.append((index, density, moment))
-    return Rough(value, moments)
+        some = [groups[k] for k in single]
+        found[:, single] = _singly(parts, likelihood, some, sizes, of[single], best)
+    for k, group in enumerate(groups):
+        if len(group.columns) > 1:
+            found[:, k] = _together(parts, likelihood, group, sizes, int(of[k]), best)
+    return found
 
 
 def moment_power(sizes: Array, columns: int | Array) -> Array:
@@ -501,347 +468,148 @@ def moment_power(sizes: Array, columns: int | Array) -> Array:
     return np.asarray(sizes**2 / (columns + 2))
 
 
-def log_moment(positive: Array | float, distance: Array | float) -> Array:
-    """Logarithm of the mean of ``(b / s)^2`` over a normal density of ``b`` with standard deviation
-    ``s``, where a prior is higher on one side of zero, by the distance of its mean from zero in
-    standard deviations."""
-    away = np.asarray(distance, dtype=float)
-    shares = np.broadcast_to(np.asarray(positive, dtype=float), away.shape)
-    # Both parts together, whatever the distance: most effects have no likely side.
-    found = np.array(np.log1p(away**2))
-    uneven = shares != 0.5
-    if uneven.any():
-        found[uneven] = _uneven_moment(shares[uneven], away[uneven])
-    return found
-
-
-def _uneven_moment(positive: Array, distance: Array) -> Array:
-    """The same with a likely side of zero."""
-    size = np.abs(distance)
-    likely = np.where(distance > 0, positive, 1.0 - positive)
-    with np.errstate(divide="ignore"):  # one side may be impossible
-        found = np.log1p(size**2) + np.log(2.0 * likely)
-        # The other side counts where it is near, or is the only one.
-        both = (size < NEAR) | (likely == 0.0)
-        size, likely = size[both], likely[both]
-        near = np.minimum(size, FAR)
-        # Its part is (d^2 + 1) Phi(-d) - d phi(d). Both terms nearly cancel: exp(-d^2 / 2) is taken
-        # out. Beyond, the first term of the series, 2 phi(d) / d^3.
-        scaled = 0.5 * (near**2 + 1.0) * erfcx(near / np.sqrt(2.0)) - near / np.sqrt(2.0 * np.pi)
-        beyond = np.log(scaled) - 0.5 * size**2 - 3.0 * np.log(np.maximum(size, FAR) / FAR)
-        here = np.log1p(size**2 - np.exp(beyond))
-        found[both] = np.logaddexp(np.log(likely) + here, np.log1p(-likely) + beyond) + _LOG_2
-    return np.asarray(found)
-
-
-@dataclass(frozen=True)
-class Moments:
-    """What the product of effects' moments follows from, see :func:`log_moments`."""
-
-    counts: Sequence[int]
-    positive: Sequence[Array | float]
-    mean: Sequence[Array]
-    upper: Sequence[Sequence[Array]]
-
-    def even(self) -> Array:
-        """Logarithm, if there were no likely sides and no correlations of effects."""
-        found, start = np.asarray(0.0), 0
-        for count in self.counts:
-            place = range(start, start + count)
-            found = found + np.log(sum(self.mean[c] ** 2 + self.upper[c][0] for c in place) / count)
-            start += count
-        return np.asarray(found)
-
-    def at(self, where: NDArray[np.bool_]) -> Array:
-        """Logarithm at some elements of the whole shape, in their order."""
-
-        def chosen(values: Array | float) -> Array | float:
-            if np.ndim(values) == 0:
-                return values
-            return np.asarray(np.broadcast_to(values, where.shape)[where])
-
-        mean = [np.asarray(chosen(one)) for one in self.mean]
-        upper = [[np.asarray(chosen(one)) for one in row] for row in self.upper]
-        return log_moments(self.counts, [chosen(one) for one in self.positive], mean, upper)
-
-
-@dataclass(frozen=True)
-class Rough:
-    """Log evidence of effects but for likely sides and correlations of their moments.
-
-    Parameters
-    ----------
-    value : ndarray, shape (P, groups, ...)
-    moments : sequence of (index, density, Moments)
-        Those of some of the groups, beside the density without them, of shape
-        (P, groups of the index, ...).
+def _beside(parts: Reduced, columns: Integers) -> tuple[list[int], Array, Array, Array]:
+    """An anchor's amplitudes with the parts first, as compiled loops take them: how many each of
+    its effects has, means (P, m), covariance (P, m, m), and what they lose by columns (P, ..., m).
     """
-
-    value: Array
-    moments: Sequence[tuple[Integers, Array, Moments]]
-
-    def exact(self, where: NDArray[np.bool_]) -> Array:
-        """The same, exact at some elements."""
-        found = self.value.copy()
-        for index, density, moments in self.moments:
-            here = where[:, index]
-            if here.any():
-                some = found[:, index]
-                some[here] = density[here] + moments.at(here)
-                found[:, index] = some
-        return found
-
-
-def exact_where_it_counts(rough: Sequence[Rough], labels: Integers) -> Array:
-    """Log evidence of effects, with rough values where they are nothing of the whole.
-
-    Parameters
-    ----------
-    rough : sequence of Rough, length m
-        Of the same groups, for instance by size of an anchor's own effects.
-    labels : ndarray of int, shape (groups,)
-        Effect of each group; each effect counts by itself, and without and with something outside.
-
-    Returns
-    -------
-    ndarray, shape (P, m, groups, ...)
-    """
-    each = np.stack([one.value for one in rough], axis=1)
-    best = _best_of(each, labels)
-    # Where a side is impossible the best of the rough values may be nothing: look once more.
-    found, done = each, np.zeros(each.shape, dtype=bool)
-    for _ in range(2):
-        near = (each > best - SMALL_SHARE) & ~done
-        if near.any():
-            exact = np.stack([one.exact(near[:, k]) for k, one in enumerate(rough)], axis=1)
-            found, done = np.where(near, exact, found), done | near
-        best = _best_of(np.where(done, found, -np.inf), labels)
-    return found
-
-
-def _best_of(values: Array, labels: Integers) -> Array:
-    """Largest of each effect's values, without and with something outside, to be compared."""
-    rest = tuple(range(3, values.ndim))
-    by_group = values.max(axis=(1, *rest))  # (P, groups)
-    found = np.empty_like(by_group)
-    for part in (slice(0, 1), slice(1, None)):
-        if not by_group[part].size:
-            continue
-        top = by_group[part].max(axis=0)
-        for label in np.unique(labels):
-            found[part, labels == label] = top[labels == label].max()
-    return np.expand_dims(found, (1, *rest))
-
-
-def log_moments(
-    counts: Sequence[int],
-    positive: Sequence[Array | float],
-    mean: Sequence[Array],
-    upper: Sequence[Sequence[Array]],
-) -> Array:
-    """Logarithm of the mean of the product of effects' moments, each the mean square of its
-    amplitudes.
-
-    That of two effects is exact where one of them at most has a likely side. Of more effects, and
-    of two likely sides, correlations count by pairs.
-
-    Parameters
-    ----------
-    counts : sequence of int
-        Amplitudes of each effect.
-    positive : sequence of float or ndarray
-        Prior probability that its size is above zero.
-    mean : sequence of ndarray
-        Of each amplitude.
-    upper : sequence of sequence of ndarray
-        Rows of their covariance, each from the diagonal on.
-    """
-    ends = np.cumsum(counts)
-    members = [range(end - count, end) for end, count in zip(ends, counts, strict=True)]
-    squares = [sum(mean[c] ** 2 + upper[c][0] for c in k) / len(k) for k in members]
-
-    def shared(a: int, b: int) -> Array:
-        return upper[min(a, b)][abs(a - b)]
-
-    product, sided = np.asarray(1.0), np.asarray(0.0)
-    distances: dict[int, Array] = {}  # of effects with a likely side
-    for k, (place, side, square) in enumerate(zip(members, positive, squares, strict=True)):
-        product = product * square
-        if len(place) == 1 and np.any(np.not_equal(side, 0.5)):
-            distances[k] = mean[place[0]] / np.sqrt(upper[place[0]][0])
-            sided = sided + log_moment(side, distances[k]) - np.log1p(distances[k] ** 2)
-    for i, j in combinations(range(len(counts)), 2):
-        likely = [(k, other) for k, other in ((i, j), (j, i)) if k in distances]
-        for k, other in likely:
-            (a,) = members[k]
-            root = np.sqrt(upper[a][0])
-            given = [(mean[b], shared(a, b) / root, upper[b][0]) for b in members[other]]
-            ratio = _square_given(positive[k], distances[k], given) / squares[other]
-            sided = sided + np.log(ratio) / len(likely)
-        if not likely:
-            # E[x^2 y^2] - E[x^2] E[y^2] of normal x and y.
-            between = sum(
-                shared(a, b) * (shared(a, b) + 2.0 * mean[a] * mean[b])
-                for a in members[i]
-                for b in members[j]
-            )
-            size = 0.5 * counts[i] * counts[j]
-            product = product * (1.0 + between / (size * squares[i] * squares[j]))
-    return np.asarray(np.log(product) + sided)
-
-
-def _square_given(
-    positive: Array | float, distance: Array, given: Sequence[tuple[Array, Array, Array]]
-) -> Array:
-    """Mean square of amplitudes under the moment of another one ``u``, which has a likely side.
-
-    An amplitude is a straight line in ``u`` but for a rest that is independent of it, so that the
-    means of ``u^3`` and ``u^4`` over that of ``u^2`` are all that is needed.
-
-    Parameters
-    ----------
-    positive : float or ndarray
-    distance : ndarray
-        Mean of ``u``, whose standard deviation is one.
-    given : sequence of (mean, slope, variance)
-        Of each amplitude; the slope is its covariance with ``u``.
-    """
-    third, fourth = _higher_moments(positive, distance)
-    total = np.asarray(0.0)
-    for mean, slope, variance in given:
-        start = mean - slope * distance
-        rest = np.maximum(variance - slope**2, 0.0)
-        total = total + start**2 + rest + 2.0 * start * slope * third + slope**2 * fourth
-    return np.asarray(total / len(given))
-
-
-def _higher_moments(positive: Array | float, distance: Array) -> tuple[Array, Array]:
-    """Means of ``u^3`` and ``u^4`` over that of ``u^2``, of a normal ``u`` with unit variance whose
-    sides of zero have different weights."""
-    square = distance**2
-    third = np.array(distance * (square + 3.0) / (square + 1.0))
-    fourth = np.array(((square + 6.0) * square + 3.0) / (square + 1.0))
-    above = np.broadcast_to(np.asarray(positive, dtype=float), distance.shape)
-    # The other side counts where it is near, or is the only one.
-    only = np.where(distance > 0, above, 1.0 - above) == 0.0
-    both = (above != 0.5) & ((np.abs(distance) < NEAR) | only)
-    if both.any():
-        up, down = (_half_moments(sign * distance[both]) for sign in (1.0, -1.0))
-        weight = above[both]
-        second, cube, power = (
-            weight * a + sign * (1.0 - weight) * b
-            for sign, a, b in zip((1.0, -1.0, 1.0), up, down, strict=True)
+    own = parts.own
+    if own is None:
+        number = len(parts.square)
+        return (
+            [],
+            np.empty((number, 0)),
+            np.empty((number, 0, 0)),
+            np.empty((number, *columns.shape, 0)),
         )
-        third[both], fourth[both] = cube / second, power / second
-    return third, fourth
-
-
-def _half_moments(distance: Array) -> tuple[Array, Array, Array]:
-    """Means of ``u^2``, ``u^3`` and ``u^4`` over ``u > 0``, divided by the normal density at the
-    distance of its mean from zero."""
-    # Beyond, the terms of the far side cancel; the ratios hardly depend on the distance there.
-    d = np.clip(distance, -FARTHEST, FARTHEST)
-    tail = np.sqrt(0.5 * np.pi) * erfcx(-d / np.sqrt(2.0))
-    square = d * d
+    gain = np.moveaxis(own.gain[:, :, columns], 0, -1)
     return (
-        (square + 1.0) * tail + d,
-        d * (square + 3.0) * tail + square + 2.0,
-        ((square + 6.0) * square + 3.0) * tail + d * (square + 5.0),
+        own.counts,
+        np.ascontiguousarray(own.mean.T),
+        np.ascontiguousarray(np.moveaxis(own.covariance, 2, 0)),
+        np.ascontiguousarray(gain),
     )
 
 
 def _singly(
-    parts: Reduced, likelihood: Likelihood, groups: Sequence[Group], sizes: Array
-) -> tuple[Array, Moments]:
-    """Log density of effects with one unknown each, shape (P, groups, sizes), and its moments."""
+    parts: Reduced,
+    likelihood: Likelihood,
+    groups: Sequence[Group],
+    sizes: Array,
+    labels: Integers,
+    best: Array,
+) -> Array:
+    """Log evidence of effects with one amplitude each, shape (P, groups, sizes)."""
     index = np.array([group.columns[0] for group in groups], dtype=int)
-    positive = np.array([group.positive for group in groups])[:, None]
-    power = moment_power(sizes, 1)
-    slope = parts.slope[:, index, None]
-    grown = 1.0 + power * np.maximum(parts.gram[:, index, index, None], 0.0)
-    gain = power * slope**2 / grown
-    logs = parts.log_det[:, None, None] + np.log(grown)
-    square = parts.square[:, None, None] - gain
-    value, noise = likelihood(square, logs), likelihood.noise(square)
-    mean, variance = power * slope / grown, power / grown
-    if parts.own is None:
-        moment = Moments([1], [positive], [mean / np.sqrt(noise)], [[variance]])
-    else:
-        posterior = mean[None], variance[None, None], noise
-        moment = parts.own.beside(index[:, None], positive, *posterior)
-    return np.asarray(value - np.log(power)), moment
+    counts, mean, covariance, gain = _beside(parts, index)
+    before = [] if parts.own is None else parts.own.positive
+    found = np.empty((len(parts.square), index.size, sizes.size))
+    singles(
+        np.array([*counts, 1], dtype=np.int64),
+        np.array([[*before, group.positive] for group in groups]),
+        mean,
+        covariance,
+        gain[..., None],
+        np.ascontiguousarray(parts.slope[:, index]),
+        np.ascontiguousarray(parts.gram[:, index, index]),
+        parts.square,
+        parts.log_det,
+        moment_power(sizes, 1),
+        likelihood.count,
+        float(likelihood.freedom),
+        labels,
+        best,
+        found,
+    )
+    return found
 
 
 def _together(
-    parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array
-) -> tuple[Array, Moments]:
-    """Log density of an effect with several unknowns, shape (P, 1, sizes), and its moments."""
+    parts: Reduced, likelihood: Likelihood, group: Group, sizes: Array, label: int, best: Array
+) -> Array:
+    """Log evidence of an effect with several amplitudes, shape (P, sizes)."""
     index = np.array(group.columns)
     values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
     turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0]
     power = moment_power(sizes, index.size)[:, None]
-    spread = power / (1.0 + power * np.maximum(values, 0.0)[:, None])  # (P, sizes, unknowns)
+    spread = power / (1.0 + power * np.maximum(values, 0.0)[:, None])  # (P, sizes, amplitudes)
     gain = np.sum(spread * turned**2, axis=2)
     logs = parts.log_det[:, None] - np.log(spread / power).sum(axis=2)
     square = parts.square[:, None] - gain
     value, noise = likelihood(square, logs) - np.log(power[:, 0]), likelihood.noise(square)
     if parts.own is None:
         # Turned amplitudes are independent; the mean of their squares is that of the others.
-        means = np.moveaxis(spread * turned / np.sqrt(noise[:, :, None]), 2, 0)[:, :, None]
-        upper = [[row[:, None]] for row in np.moveaxis(spread, 2, 0)]
-        return value[:, None], Moments([index.size], [0.5], list(means), upper)
-    mean = np.einsum("pab,ptb->apt", vectors, spread * turned)
-    covariance = np.einsum("pab,ptb,pcb->acpt", vectors, spread, vectors)
-    posterior = mean[:, :, None], covariance[:, :, :, None], noise[:, None]
-    return value[:, None], parts.own.beside(index[None], 0.5, *posterior)
+        squares = (spread * turned) ** 2 / noise[:, :, None] + spread
+        return np.asarray(value + np.log(np.mean(squares, axis=2)))
+    counts, own, covariance, lost = _beside(parts, index)
+    found = np.empty(value.shape)
+    beside(
+        np.array([*counts, index.size], dtype=np.int64),
+        np.array([*parts.own.positive, group.positive]),
+        own,
+        covariance,
+        np.ascontiguousarray(np.swapaxes(lost, 1, 2)),
+        np.einsum("pab,ptb->pta", vectors, spread * turned),
+        np.einsum("pab,ptb,pcb->ptac", vectors, spread, vectors),
+        noise,
+        value,
+        label,
+        best,
+        found,
+    )
+    return found
 
 
 def pair_evidence(
-    parts: Reduced, likelihood: Likelihood, one: Group, others: Sequence[Group], sizes: Array
+    parts: Reduced,
+    likelihood: Likelihood,
+    one: Group,
+    others: Sequence[Group],
+    sizes: Array,
+    labels: Sequence[int] | None = None,
+    largest: Largest | None = None,
 ) -> Array:
-    """Log evidence of an effect together with each of others, of one unknown each.
+    """Log evidence of an effect together with each of others, of one amplitude each.
+
+    Labels are those of the others, as of :func:`effect_evidence`.
 
     Returns
     -------
     ndarray, shape (P, others, sizes, sizes)
     """
-    rough = rough_pairs(parts, likelihood, one, others, sizes)
-    return rough.exact(np.ones(rough.value.shape, dtype=bool))
-
-
-def rough_pairs(
-    parts: Reduced, likelihood: Likelihood, one: Group, others: Sequence[Group], sizes: Array
-) -> Rough:
-    """The same but for likely sides and correlations of moments."""
     (i,), index = one.columns, np.array([group.columns[0] for group in others], dtype=int)
-    root = np.sqrt(moment_power(sizes, 1))
+    of = np.arange(index.size) if labels is None else np.asarray(labels)
+    found = np.empty((len(parts.square), index.size, sizes.size, sizes.size))
+    pairs(
+        np.array([[one.positive, group.positive] for group in others]),
+        np.ascontiguousarray(parts.slope[:, i]),
+        np.ascontiguousarray(parts.gram[:, i, i]),
+        np.ascontiguousarray(parts.slope[:, index]),
+        np.ascontiguousarray(parts.gram[:, index, index]),
+        np.ascontiguousarray(parts.gram[:, i, index]),
+        parts.square,
+        parts.log_det,
+        moment_power(sizes, 1),
+        likelihood.count,
+        float(likelihood.freedom),
+        of,
+        (largest or Largest.of(int(of.max(initial=-1)) + 1)).value,
+        found,
+    )
+    return found
 
-    def wide(values: Array) -> Array:
-        """With axes for the sizes of both."""
-        return np.asarray(values[..., None, None])
 
-    # Slopes and products in units of the prior: rows for the sizes of one, columns for the others.
-    first = root[:, None] * wide(parts.slope[:, i, None])
-    second = root * wide(parts.slope[:, index])
-    own = 1.0 + root[:, None] ** 2 * wide(np.maximum(parts.gram[:, i, i, None], 0.0))
-    its = 1.0 + root**2 * wide(np.maximum(parts.gram[:, index, index], 0.0))
-    mixed = np.multiply.outer(root, root) * wide(parts.gram[:, i, index])
-    det = np.maximum(own * its - mixed**2, 1e-12 * own * its)
-    gain = (its * first**2 + own * second**2 - 2.0 * mixed * first * second) / det
-    square = wide(parts.square[:, None]) - gain
-    found = likelihood(square, wide(parts.log_det[:, None]) + np.log(det))
-    noise = np.sqrt(likelihood.noise(square))
-    means = (its * first - mixed * second) / det, (own * second - mixed * first) / det
-    upper = [[its / det, -mixed / det], [own / det]]
-    positive = np.array([group.positive for group in others])[:, None, None]
-    moments = Moments([1, 1], [one.positive, positive], [m / noise for m in means], upper)
-    return Rough(found + moments.even(), [(np.arange(len(others)), found, moments)])
+def log_sum(logs: Array) -> Array:
+    """Logarithm of the sum over the first axis of what logarithms are given of; quicker than
+    SciPy's function, which also takes complex numbers."""
+    top = np.max(logs, axis=0)
+    top = np.where(np.isfinite(top), top, 0.0)
+    return np.asarray(np.log(np.sum(np.exp(logs - top), axis=0)) + top)
 
 
 def mean_of(logs: Array) -> float:
     """Logarithm of the mean of what logarithms are given of."""
     flat = np.ravel(logs)
-    return float(logsumexp(flat) - np.log(flat.size))
+    return float(log_sum(flat) - np.log(flat.size))
 
 
 def sizes_between(largest: float, samples: int, count: int = SIZES) -> Array:

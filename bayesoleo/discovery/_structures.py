@@ -9,10 +9,9 @@ family the laws that textbooks begin with weigh more than their refinements.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
@@ -118,7 +117,8 @@ class StructurePrior:
         """Logarithm of the probability of a set of effects, given that some act or are resembled,
         from those of its members; it comes about in any order."""
         number = self.numbers[min(len(weights), len(self.numbers)) - 1] / sum(self.numbers)
-        return float(np.log(number * np.prod(weights) * np.prod(np.arange(1, len(weights) + 1))))
+        share = number * math.prod(weights) * math.factorial(len(weights))
+        return math.log(share) if share > 0.0 else -math.inf
 
     def log_probability(
         self, effects: Sequence[Added], outside: bool, weights: Mapping[Added, float]
@@ -126,11 +126,13 @@ class StructurePrior:
         """Logarithm of the prior probability of a structure."""
         total = self.nothing + self.catalogue + self.outside
         if not effects:
-            return float(np.log((self.outside if outside else self.nothing) / total))
+            share = (self.outside if outside else self.nothing) / total
+            return math.log(share) if share > 0.0 else -math.inf
         rest = self.also_outside if outside else 1.0 - self.also_outside
-        return float(np.log(self.catalogue / total * rest)) + self.log_of_set(
-            [weights[key] for key in effects]
-        )
+        share = self.catalogue / total * rest
+        if share <= 0.0:
+            return -math.inf
+        return math.log(share) + self.log_of_set([weights[key] for key in effects])
 
 
 @dataclass(frozen=True)
