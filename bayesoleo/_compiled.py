@@ -1,4 +1,4 @@
-"""Generated source, its folder on disk, and the call of compiled kernels.
+"""Compiled functions and their files, and the call of compiled kernels.
 
 A kernel evaluates a block of points that are adjacent in memory: ``kernel(z, u, p, out, count)``
 with pointers to rows of :data:`BLOCK` numbers. All kernels share this signature, so their callers -
@@ -13,11 +13,9 @@ import ctypes
 import hashlib
 import importlib.util
 import marshal
-import os
 import pickle
 import sys
 import tempfile
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
@@ -28,7 +26,6 @@ from typing import Any, Protocol, cast
 
 import numba
 import numpy as np
-import platformdirs
 from llvmlite import ir
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
@@ -36,30 +33,15 @@ from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
+from bayesoleo._machine_code import (
+    COMPILING,
+    address_of,
+    cache_folder,
+    sealed,
+    unsealed,
+    write_durably,
+)
 from bayesoleo._types import Array, Integers
-
-
-def sealed(content: bytes) -> bytes:
-    """Content of a file with its checksum before it; see :func:`unsealed`."""
-    return hashlib.sha256(content).digest() + content
-
-
-def unsealed(path: str | os.PathLike[str]) -> bytes | None:
-    """Content of a file that was written by :func:`sealed`; None if it is not whole, or not there.
-
-    Code and pickles are read from the cache: a byte that is wrong there crashes or gives wrong
-    numbers.
-    """
-    try:
-        whole = Path(path).read_bytes()
-    except OSError:
-        return None
-    content = whole[_DIGEST:]
-    return content if sealed(content) == whole else None
-
-
-_DIGEST = hashlib.sha256().digest_size
-
 
 #: Their annotations lack too much for them to be called in checked code.
 _CacheFile: Any = IndexDataCacheFile
@@ -148,34 +130,34 @@ _POINTER = types.CPointer(types.float64)
 #: ``kernel(z (nz, BLOCK), u (nu, BLOCK), p (np,), out (rows, BLOCK), count)``.
 SIGNATURE = types.void(_POINTER, _POINTER, _POINTER, _POINTER, types.intp)
 
-#: Held while a function is compiled or loaded: threads that solve different runs ask for the same.
-COMPILING = threading.RLock()
-
 
 class BlockKernel:
     """A generated kernel, compiled when it is first needed.
 
     Parameters
     ----------
-    function : callable
-        Python source of the kernel, in a module that stands on disk.
+    source : str or callable
+        Its instructions, see :func:`~bayesoleo._machine_code.address_of`, or what makes them.
     rows : int
         Rows that it fills.
     """
 
-    def __init__(self, function: Callable[..., None], rows: int):
-        self.function, self.rows = function, rows
+    def __init__(self, source: str | Callable[[], str], rows: int):
+        self._given, self.rows = source, rows
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the address, which is of this process."""
+        return {"_given": self.source, "rows": self.rows}
 
     @cached_property
-    def pointer(self) -> Any:
-        """The compiled function, to be passed to compiled code."""
-        with COMPILING:
-            return cached_callback(SIGNATURE, self.function, error_model="numpy")
+    def source(self) -> str:
+        """Its instructions."""
+        return self._given if isinstance(self._given, str) else self._given()
 
-    @property
+    @cached_property
     def address(self) -> int:
         """Address of the compiled function, for :func:`caller`."""
-        return int(self.pointer.address)
+        return address_of(self.source)
 
     @property
     def compiled(self) -> BlockKernel:
@@ -227,14 +209,14 @@ class ArrayKernel:
             self.function(z[lane], u, p[lane], [row for result in flat for row in result[lane]])
 
     @cached_property
-    def pointer(self) -> Any:
+    def _callback(self) -> Any:
         """A callback into Python that compiled code takes for a compiled kernel."""
         return _Callback(self._block)
 
     @property
     def address(self) -> int:
         """Address of that callback."""
-        return int(self.pointer.__wrapper_address__())
+        return ctypes.cast(self._callback, ctypes.c_void_p).value or 0
 
     def _block(self, z: int, u: int, p: int, out: int, count: int) -> None:
         nz, nu, constants = self.sizes
@@ -272,19 +254,8 @@ class PiecewiseEquations(ImplicitEquations, Protocol):
     def output_jacobian(self) -> Any: ...
 
 
-class _Callback(types.WrapperAddressProtocol):
-    """A Python function of the kernels' signature at an address; it takes the interpreter lock."""
-
-    _TYPE = ctypes.CFUNCTYPE(None, *[ctypes.c_size_t] * 4, ctypes.c_ssize_t)
-
-    def __init__(self, function: Callable[[int, int, int, int, int], None]):
-        self._alive = self._TYPE(function)
-
-    def __wrapper_address__(self) -> int:
-        return ctypes.cast(self._alive, ctypes.c_void_p).value or 0
-
-    def signature(self) -> Any:
-        return SIGNATURE
+#: A Python function of the kernels' signature at an address; it takes the interpreter lock.
+_Callback = ctypes.CFUNCTYPE(None, *[ctypes.c_size_t] * 4, ctypes.c_ssize_t)
 
 
 def _numbers_at(address: int, count: int) -> Array:
@@ -438,30 +409,3 @@ def _code(path: Path, source: str) -> Any:
     with suppress(OSError):  # as above
         write_durably(kept, sealed(importlib.util.MAGIC_NUMBER + marshal.dumps(code)))
     return code
-
-
-def cache_folder() -> Path:
-    """Where generated kernels are kept: ``BAYESOLEO_CACHE`` or the user's cache folder."""
-    chosen = os.environ.get("BAYESOLEO_CACHE")
-    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
-    folder = folder / "kernels"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a read-only home must not stop a computation; only the cache is lost
-        folder = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-"))
-    return folder
-
-
-def write_durably(path: Path, content: bytes) -> None:
-    """Write a file of the cache as a whole: two processes may make the same at once."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise

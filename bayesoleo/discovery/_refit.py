@@ -369,8 +369,8 @@ def quick_fit(
     method : str
         Estimator that leads to the mode; BE goes there at once, from a start nearby.
     """
-    # NumPy's kernels need no compiler, and a comparison needs no higher accuracy than the data.
-    quick = replace(numerics, steps=base.fit.steps, backend="numpy", jobs=1)
+    # A comparison needs no higher accuracy than the data.
+    quick = replace(numerics, steps=base.fit.steps, jobs=1)
     return fit_model(
         model,
         base.fit.records,

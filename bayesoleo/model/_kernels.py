@@ -3,8 +3,8 @@
 All arrays have the points last, so that a loop over points runs through memory: states ``z (L, nz,
 N)``, inputs ``u (nu, N)`` shared by the lanes of a call, constants ``p (L, np)``. ``lanes`` lists
 the parameter vectors, of the ``L``, that are evaluated. The same generated source serves two back
-ends: NumPy (ready at once; for models evaluated a few times) and Numba (compiled, cached on disk by
-the source's hash).
+ends: NumPy (ready at once; for models evaluated a few times) and machine code for the loops that
+Numba compiles, which is kept on disk.
 
 Kernels are kept by a key that is equal for all models of the same expressions, whatever the values
 of their parameters. Computer algebra is the slowest part of a search that tries a hundred models on
@@ -15,14 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from types import ModuleType
-from typing import Any, cast
+from functools import cached_property, lru_cache, partial, reduce
+from typing import Any, NamedTuple, cast
 
+import numpy as np
 import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
 
-from bayesoleo._compiled import BLOCK, ArrayKernel, BlockKernel, Kernel, load
+from bayesoleo._compiled import BLOCK, ArrayKernel, BlockKernel, Kernel
+from bayesoleo._machine_code import C_FUNCTIONS, number
 from bayesoleo.model._derivatives import Derived, derive
 from bayesoleo.model._expressions import TIME, derivative_symbol, symbol
 from bayesoleo.model._model import Model
@@ -169,12 +170,12 @@ for _name, _target in _CALLS.items():
     setattr(_Printer, f"_print_{_name}", _print_function)
 
 
-def code(
-    expressions: Sequence[sp.Expr],
-    names: Mapping[sp.Symbol, str],
-    constant: set[sp.Symbol],
-) -> tuple[list[str], list[str], list[str]]:
-    """Statements that evaluate expressions with common subexpressions shared.
+def statements(
+    expressions: Sequence[sp.Expr], names: Mapping[sp.Symbol, str]
+) -> tuple[set[sp.Symbol], list[str], list[str]]:
+    """Statements that evaluate expressions, each subexpression in one of its own.
+
+    Common factors of products are not looked for: that pays only where a kernel is called often.
 
     Parameters
     ----------
@@ -182,47 +183,6 @@ def code(
         What to evaluate.
     names : mapping of sympy.Symbol to str
         What each symbol is called in the code.
-    constant : set of sympy.Symbol
-        Symbols that do not vary from node to node: what depends on them alone is computed once.
-
-    Returns
-    -------
-    outside, inside : list of str
-        Assignments for before and inside the loop over nodes.
-    results : list of str
-        One Python expression for each entry of ``expressions``.
-    """
-    renamed = [
-        _defined(expression).xreplace({s: sp.Symbol(n, real=True) for s, n in names.items()})
-        for expression in expressions
-    ]
-    fixed = {sp.Symbol(names[item], real=True) for item in constant}
-    counter = sp.numbered_symbols("w", real=True)
-    shared, reduced = sp.cse(renamed, symbols=counter, order="none")
-    printer = _Printer({"fully_qualified_modules": False})
-    outside, inside = [], []
-    for name, body in shared:
-        line = f"{name} = {printer.doprint(body)}"
-        if body.free_symbols <= fixed:
-            fixed.add(name)
-            outside.append(line)
-        else:
-            inside.append(line)
-    return outside, inside, [printer.doprint(expression) for expression in reduced]
-
-
-def statements(
-    expressions: Sequence[sp.Expr], names: Mapping[sp.Symbol, str]
-) -> tuple[set[sp.Symbol], list[str], list[str]]:
-    """Statements that evaluate expressions, each subexpression in one of its own.
-
-    A third of the time of :func:`code`, which looks for common factors and for what is constant;
-    that pays where a kernel is compiled and called often.
-
-    Parameters
-    ----------
-    expressions, names
-        As for :func:`code`.
 
     Returns
     -------
@@ -238,28 +198,147 @@ def statements(
     return printer.used, printer.lines, results
 
 
-#: Rational arctangent after Moshier (Cephes), good to 2e-16, without branches and calls, so that
-#: loops over points become vector instructions: 20 times faster than the library's. In every
-#: kernel's source, so that the hash it is cached under covers it.
-ARCTAN = """
+class _Instructions:
+    """Instructions of a kernel's machine code, each value made once.
 
-@numba.njit(error_model="numpy")
-def arctan(x):
-    size = abs(x)
-    far = size > 2.414213562373095
-    middle = size > 0.66
-    above = -1.0 if far else (size - 1.0 if middle else size)
-    below = size if far else (size + 1.0 if middle else 1.0)
-    base = 1.5707963267948966 if far else (0.7853981633974483 if middle else 0.0)
-    rest = 6.123233995736766e-17 if far else (3.061616997868383e-17 if middle else 0.0)
-    t = above / below
-    s = t * t
-    top = (-8.750608600031904e-1 * s - 1.615753718733365e1) * s - 7.500855792314705e1
-    top = (top * s - 1.2288666844901361e2) * s - 6.485021904942025e1
-    bottom = ((s + 2.485846490142306e1) * s + 1.650270098316988e2) * s + 4.328810604912903e2
-    bottom = (bottom * s + 4.853903996359137e2) * s + 1.945506571482614e2
-    value = base + (t + (t * (s * top / bottom) + rest))
-    return -value if x < 0.0 else value"""
+    Parameters
+    ----------
+    rows : mapping of sympy.Symbol to (str, int)
+        Array and row of each symbol.
+    """
+
+    def __init__(self, rows: Mapping[sp.Symbol, tuple[str, int]]):
+        self._rows = rows
+        self._values: dict[sp.Basic, _Value] = {}
+        self._operations: dict[tuple[str, ...], _Value] = {}
+        #: What depends on constants alone is computed once, outside the loop over points.
+        self.outside: list[str] = []
+        self.inside: list[str] = []
+
+    def define(self, name: sp.Symbol, expression: sp.Expr) -> None:
+        """Let a symbol stand for an expression."""
+        self._values[name] = self.value(expression)
+
+    def value(self, expression: sp.Basic) -> _Value:
+        """Where an expression's value stands."""
+        if expression not in self._values:
+            self._values[expression] = self._new_value(expression)
+        return self._values[expression]
+
+    def store(self, row: int, value: _Value) -> None:
+        """Write a value to a row of the result."""
+        self.inside.append(f"store double {value.name}, ptr {self._place('out', row)}")
+
+    def _new_value(self, expression: sp.Basic) -> _Value:
+        if expression.is_Symbol:
+            return self._loaded(*self._rows[expression])
+        if expression.is_Number or expression.is_NumberSymbol:
+            return _number(float(expression))
+        if expression.is_Pow:
+            return self._power(*expression.as_base_exp())
+        arguments = [self.value(item) for item in expression.args]
+        kind = type(expression).__name__
+        if kind in _FOLDED:
+            first, *rest = arguments
+            return reduce(lambda one, other: self._do(_FOLDED[kind], one, other), rest, first)
+        if kind in _CALLED:
+            return self._do(_CALLED[kind], *arguments)
+        return cast(_Value, getattr(self, f"_{kind}")(*arguments))
+
+    def _power(self, base: sp.Expr, exponent: sp.Expr) -> _Value:
+        if base is sp.E:
+            return self._do("c_exp", self.value(exponent))
+        value = self.value(base)
+        if exponent == sp.Rational(1, 2):
+            return self._do("llvm.sqrt.f64", value)
+        if exponent.is_Integer and 1 <= abs(int(exponent)) <= 4:
+            product = value
+            for _ in range(abs(int(exponent)) - 1):
+                product = self._do("fmul", product, value)
+            return product if exponent > 0 else self._do("fdiv", _number(1.0), product)
+        return self._do("c_pow", value, self.value(exponent))
+
+    def _Heaviside(self, value: _Value, *_: _Value) -> _Value:
+        half = _number(0.5)
+        return self._do("fadd", half, self._do("fmul", half, self._do("sign", value)))
+
+    # Every quantity is real, but a power of what might be negative is not known to be: the slope of
+    # its absolute value is then written with both parts.
+    def _re(self, value: _Value) -> _Value:
+        return value
+
+    _conjugate = _re
+
+    def _im(self, _: _Value) -> _Value:
+        return _number(0.0)
+
+    def _bspline(self, place: _Value) -> _Value:
+        far, near = self._reaches(place)
+        far = self._do("fmul", self._do("fmul", far, far), far)
+        near = self._do("fmul", self._do("fmul", near, near), near)
+        over = self._do("fsub", far, self._do("fmul", _number(4.0), near))
+        return self._do("fdiv", over, _number(6.0))
+
+    def _bspline_slope(self, place: _Value) -> _Value:
+        far, near = (self._do("fmul", one, one) for one in self._reaches(place))
+        over = self._do("fsub", far, self._do("fmul", _number(4.0), near))
+        side = self._do("fmul", _number(-0.5), self._do("sign", place))
+        return self._do("fmul", side, over)
+
+    def _reaches(self, place: _Value) -> tuple[_Value, _Value]:
+        """How far inside its supports of two and of one a B-spline's argument lies."""
+        size = self._do("llvm.fabs.f64", place)
+        far, near = (
+            self._do("maximum", self._do("fsub", _number(edge), size), _number(0.0))
+            for edge in (2.0, 1.0)
+        )
+        return far, near
+
+    def _do(self, operation: str, *arguments: _Value) -> _Value:
+        key = (operation, *(item.name for item in arguments))
+        if key not in self._operations:
+            given = ", ".join(f"double {item.name}" for item in arguments)
+            text = f"call double @{operation}({given})"
+            if operation in _ARITHMETIC:
+                text = f"{operation} double {', '.join(item.name for item in arguments)}"
+            fixed = all(item.fixed for item in arguments)
+            self._operations[key] = _Value(self._add(text, fixed), fixed)
+        return self._operations[key]
+
+    def _loaded(self, array: str, row: int) -> _Value:
+        fixed = array == "p"
+        return _Value(self._add(f"load double, ptr {self._place(array, row)}", fixed), fixed)
+
+    def _place(self, array: str, row: int) -> str:
+        """Pointer to a constant, or to a row's present point."""
+        if array == "p":
+            return self._add(f"getelementptr double, ptr %p, i64 {row}", True)
+        at = self._add(f"add nuw nsw i64 %i, {row * BLOCK}", False)
+        return self._add(f"getelementptr double, ptr %{array}, i64 {at}", False)
+
+    def _add(self, text: str, fixed: bool) -> str:
+        name = f"%v{len(self.outside) + len(self.inside)}"
+        (self.outside if fixed else self.inside).append(f"{name} = {text}")
+        return name
+
+
+class _Value(NamedTuple):
+    """A value in machine code, and whether it is the same at all points."""
+
+    name: str
+    fixed: bool
+
+
+def _number(value: float) -> _Value:
+    return _Value(number(value), True)
+
+
+_ARITHMETIC = frozenset({"fadd", "fsub", "fmul", "fdiv"})
+#: Of several arguments, one after the other; and of one.
+_FOLDED = {"Add": "fadd", "Mul": "fmul", "Max": "maximum", "Min": "minimum"}
+_CALLED = {name: f"c_{name}" for name in C_FUNCTIONS} | {
+    "Abs": "llvm.fabs.f64", "atan": "arctan", "sign": "sign"
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,8 +386,6 @@ class Kernels:
         rows.
     output_inputs : callable
         ``(z, u, p, lanes, yu)`` with ``yu (L, ny, nu, N)``.
-    source : str
-        The generated code; empty where kernels are generated one by one when they are called.
     """
 
     derived: Derived
@@ -320,20 +397,17 @@ class Kernels:
     admissible: Kernel
     inputs: Kernel
     output_inputs: Kernel
-    source: str
 
 
 @lru_cache(maxsize=512)  # a search over the catalogue makes some two hundred
 def _cached(like: Structured, active: tuple[str, ...], backend: str) -> Kernels:
     derived = derive(like.model, active)
     if backend == "numba":
-        results = {name: make() for name, make in _results(derived).items()}
-        source = _module(results, derived, backend)
-        module = load(source)
-        functions: dict[str, Kernel] = {
-            name: BlockKernel(getattr(module, name), len(items)) for name, items in results.items()
+        blocks: dict[str, Kernel] = {
+            name: BlockKernel(partial(_machine_code_of, derived, name), rows)
+            for name, rows in _counts(derived).items()
         }
-        return Kernels(derived, source=source, **functions)
+        return Kernels(derived, **blocks)
     # A search evaluates many models once, and few of their kernels: each is made when it is asked.
     sizes = (len(derived.states), len(derived.inputs), len(derived.constants))
     made = {name: _Later(derived, name) for name in _counts(derived)}
@@ -341,7 +415,7 @@ def _cached(like: Structured, active: tuple[str, ...], backend: str) -> Kernels:
         name: ArrayKernel(made[name], rows, sizes, made[name].compiled)
         for name, rows in _counts(derived).items()
     }
-    return Kernels(derived, source="", **later)
+    return Kernels(derived, **later)
 
 
 class _Later:
@@ -356,20 +430,18 @@ class _Later:
     @cached_property
     def _made(self) -> Callable[..., None]:
         items = _results(self._derived)[self._name]()
-        module = ModuleType("kernels")
-        source = _module({self._name: items}, self._derived, "numpy")
-        exec(compile(source, "<kernels>", "exec"), module.__dict__)
-        made: Callable[..., None] = getattr(module, self._name)
-        return made
+        scope: dict[str, Any] = {"np": np}
+        body = "\n    ".join(_on_rows(items, self._derived))
+        exec(compile(f"def made(z, u, p, out):\n    {body}\n", "<kernels>", "exec"), scope)
+        return cast(Callable[..., None], scope["made"])
 
     def __call__(self, *arguments: Any) -> None:
         self._made(*arguments)
 
     def compiled(self) -> BlockKernel:
         """The same kernel for blocks of points, by itself."""
-        items = _results(self._derived)[self._name]()
-        module = load(_module({self._name: items}, self._derived, "numba"))
-        return BlockKernel(getattr(module, self._name), len(items))
+        rows = _counts(self._derived)[self._name]
+        return BlockKernel(partial(_machine_code_of, self._derived, self._name), rows)
 
 
 def _counts(derived: Derived) -> dict[str, int]:
@@ -427,26 +499,6 @@ def _results(derived: Derived) -> dict[str, Callable[[], list[sp.Expr]]]:
     }
 
 
-def generate(derived: Derived, backend: str) -> str:
-    """Source of a module with all kernels of a model."""
-    return _module({name: make() for name, make in _results(derived).items()}, derived, backend)
-
-
-def _module(results: Mapping[str, Sequence[sp.Expr]], derived: Derived, backend: str) -> str:
-    head = ["import numpy as np"]
-    if backend == "numba":
-        head += ["import numba", ARCTAN]
-    parts = [_function(name, items, derived, backend) for name, items in results.items()]
-    return "\n".join(head) + "\n\n\n" + "\n\n\n".join(parts) + "\n"
-
-
-def _function(name: str, items: Sequence[sp.Expr], derived: Derived, backend: str) -> str:
-    """One kernel: a loop over the points of a block (Numba) or operations on rows (NumPy)."""
-    body = (_looped if backend == "numba" else _on_rows)(items, derived)
-    count = ", count" if backend == "numba" else ""
-    return "\n".join([f"def {name}(z, u, p, out{count}):", *(f"    {line}" for line in body)])
-
-
 def _on_rows(items: Sequence[sp.Expr], derived: Derived) -> list[str]:
     rows = _rows(derived)
     used, lines, results = statements(items, {item: f"{a}{k}" for item, (a, k) in rows.items()})
@@ -455,25 +507,42 @@ def _on_rows(items: Sequence[sp.Expr], derived: Derived) -> list[str]:
     return [*loads, *lines, *stores]
 
 
-def _looped(items: Sequence[sp.Expr], derived: Derived) -> list[str]:
-    free = set().union(*(e.free_symbols for e in items)) if items else set()
-    rows = {item: place for item, place in _rows(derived).items() if item in free}
-    names = {item: f"{array}{k}" for item, (array, k) in rows.items()}
-    constants = {item for item, (array, _) in rows.items() if array == "p"}
-    outside, inside, results = code(items, names, constants)
-    sizes = {
-        "z": len(derived.states) * BLOCK,
-        "u": len(derived.inputs) * BLOCK,
-        "p": len(derived.constants),
-        "out": len(items) * BLOCK,
-    }
-    lines = [f"{key} = numba.carray({key}, ({size},))" for key, size in sizes.items() if size]
-    lines += [f"p{k} = p[{k}]" for array, k in rows.values() if array == "p"]
-    lines += [*outside, "for i in range(count):"]
-    loads = [f"{a}{k} = {a}[{k * BLOCK} + i]" for a, k in rows.values() if a != "p"]
-    stores = [f"out[{k * BLOCK} + i] = {result}" for k, result in enumerate(results)] or ["pass"]
-    lines += [f"    {line}" for line in [*loads, *inside, *stores]]
-    return [line.replace("np.arctan(", "arctan(") for line in lines]
+def _machine_code_of(derived: Derived, name: str) -> str:
+    return machine_code(_results(derived)[name](), derived)
+
+
+def machine_code(items: Sequence[sp.Expr], derived: Derived) -> str:
+    """Source of a kernel for blocks of points (:func:`~bayesoleo._machine_code.address_of`), with
+    common factors shared."""
+    whole = [_defined(sp.sympify(item)) for item in items]
+    names = sp.numbered_symbols("w", real=True, exclude=_rows(derived))
+    shared, reduced = sp.cse(whole, symbols=names, order="none")
+    made = _Instructions(_rows(derived))
+    for name, body in shared:
+        made.define(name, body)
+    for row, expression in enumerate(reduced):
+        made.store(row, made.value(expression))
+    return _LOOP.format(outside="\n  ".join(made.outside), inside="\n  ".join(made.inside))
+
+
+#: The arrays of a call do not overlap.
+_LOOP = """
+define void @kernel(ptr noalias readonly %z, ptr noalias readonly %u, ptr noalias readonly %p,
+                    ptr noalias %out, i64 %count) {{
+entry:
+  {outside}
+  %any = icmp sgt i64 %count, 0
+  br i1 %any, label %loop, label %end
+loop:
+  %i = phi i64 [ 0, %entry ], [ %next, %loop ]
+  {inside}
+  %next = add nuw nsw i64 %i, 1
+  %more = icmp slt i64 %next, %count
+  br i1 %more, label %loop, label %end
+end:
+  ret void
+}}
+"""
 
 
 def _rows(derived: Derived) -> dict[sp.Symbol, tuple[str, int]]:

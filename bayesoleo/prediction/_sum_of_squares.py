@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._compiled import BLOCK, BlockKernel, jit, pointer
+from bayesoleo._compiled import BLOCK, BlockKernel, call_kernel, jit, pointer
 from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.model._derivatives import Derived
 from bayesoleo.model._kernels import Kernels
@@ -107,7 +107,7 @@ class FusedSquares:
         sums = np.full((len(p), len(derived.outputs)), np.nan)
         inside, defined = np.ones(len(p), dtype=np.bool_), np.ones(len(p), dtype=np.bool_)
         _compare(
-            self.kernels.output.pointer, self.kernels.admissible.pointer, len(derived.admissible),
+            self.kernels.output.address, self.kernels.admissible.address, len(derived.admissible),
             self.order, self.inputs, self.places, self.orders, self.needed,
             np.ascontiguousarray(measured), np.ascontiguousarray(x), np.ascontiguousarray(p),
             step, lanes, sums, inside, defined,
@@ -151,7 +151,7 @@ def _places(plan: SamplePlan, order: Integers) -> Places:
 
 @jit
 def _compare(
-    output: Any, admissible: Any, conditions: int, order: Integers, inputs: Array, places: Places,
+    output: int, admissible: int, conditions: int, order: Integers, inputs: Array, places: Places,
     orders: Integers, needed: Flags, measured: Array, x: Array, p: Array, step: float,
     lanes: Integers, sums: Array, inside: Flags, defined: Flags,
 ) -> None:  # fmt: skip
@@ -176,13 +176,13 @@ def _compare(
                 x, lane, b, places.index, places.position, places.w0, places.w1, places.w2,
                 step, orders, needed, z,
             )  # fmt: skip
-            output(rows, u, constants, to, size)
+            call_kernel(output, (rows, u, constants, to, size))
             for k in range(ny):
                 for i in range(size):
                     error = data[k, i] - out[k, i]
                     partial[place, k, i] += error * error
             if conditions > 0:
-                admissible(rows, u, constants, to, size)
+                call_kernel(admissible, (rows, u, constants, to, size))
                 broken = odd = 0
                 for k in range(conditions):
                     for i in range(size):

@@ -30,6 +30,9 @@ LAST_STEP = 1e-7
 #: Without quadratic contraction (at a kink) a step this small is taken as converged.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
+#: A residual of this size, in units of the equations' terms, cannot fall any more. The motion of
+#: what is at rest has no scale of its own by which a step could be seen to be small.
+ROUND_OFF = 1e-14
 FIRST_STEP = 0.25
 SMALLEST_STEP = 1.0 / 512
 
@@ -305,8 +308,8 @@ class _Newton:
         return lanes[good]
 
     def _reduces(self, lanes: Integers, squares: Array, terms: Array) -> Flags:
-        """Whether the residual fell, in units of the equations' terms: the larger of those before
-        and after.
+        """Whether the residual fell, or is round-off, in units of the equations' terms: the larger
+        of those before and after.
 
         Terms before alone would be nothing for an equation that a start at rest fulfils, and forbid
         to leave it.
@@ -318,7 +321,7 @@ class _Newton:
             own = self.trial.squares[lanes] / (self.trial.terms[lanes] + 1e-300)
         # An iteration that comes back from far away has a small residual against what it left.
         self.merit[lanes] = np.sqrt(np.sum(own, axis=1))
-        return after < before
+        return (after < before) | (after < ROUND_OFF)
 
     def _finish(self, lanes: Integers, dx: Array, size: Array, least: Array) -> Integers:
         """Take the last step where it is small enough that what it leaves is round-off."""
@@ -360,7 +363,7 @@ class _Newton:
         kept[pending] = False
         lanes = lanes[kept]
         # A linear problem is solved by its first step.
-        done = (self.merit[lanes] < 1e-14) & (self.iterations[lanes] > 1)
+        done = (self.merit[lanes] < ROUND_OFF) & (self.iterations[lanes] > 1)
         self.status[lanes[done]] = Status.CONVERGED.value
         return lanes[~done]
 

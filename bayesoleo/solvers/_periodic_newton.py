@@ -59,6 +59,9 @@ LAST_STEP = 1e-7
 #: The same without quadratic contraction (at a kink), where a small step is all there is to see.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
+#: A residual of this size, in units of the equations' terms, cannot fall any more. The motion of
+#: what is at rest has no scale of its own by which a step could be seen to be small.
+ROUND_OFF = 1e-14
 #: Old derivatives are tried only below this relative step.
 CHORD_FROM = 0.1
 #: Steps with old derivatives, half as expensive, before there are new ones.
@@ -344,7 +347,7 @@ def _iterate(
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
         last = size if fraction == 1.0 else np.inf
         # A linear problem is solved by its first step.
-        if outcome == CONVERGED and merit < 1e-14 and iteration > 1:
+        if outcome == CONVERGED and merit < ROUND_OFF and iteration > 1:
             return CONVERGED, iteration
     return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
 
@@ -462,7 +465,8 @@ def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
 
 @jit
 def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
-    """Whether the residual fell, in units of the equations' terms, and its size in its own.
+    """Whether the residual fell, in units of the equations' terms, or is round-off, and its size in
+    its own.
 
     It falls in the larger of the terms before and after: terms before alone would be nothing for an
     equation that a start at rest fulfils, and forbid to leave it. It is small against its own terms
@@ -474,7 +478,8 @@ def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
         old += before[e] / larger
         new += after[e] / larger
         left += after[e] / (after[d + e] + 1e-300)
-    return np.sqrt(new) < np.sqrt(old), np.sqrt(left)
+    falls = np.sqrt(new) < max(np.sqrt(old), ROUND_OFF)
+    return falls, np.sqrt(left)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,8 @@ def rows_before(orders: Sequence[int]) -> list[int]:
 class Source:
     """Lines of one function over pointers."""
 
-    def __init__(self, name: str, arguments: str, sizes: dict[str, int]):
+    def __init__(self, name: str, arguments: str):
         self.lines = [f"def {name}({arguments}):"]
-        self.lines += [f"    {key} = numba.carray({key}, ({n},))" for key, n in sizes.items()]
         self.indent = "    "
 
     def add(self, line: str) -> None:
@@ -123,11 +122,7 @@ def chain(
     """Recursion of the chunks; the history is ``(t, new, D + 1, WIDTH)``, oldest first."""
     past = len(order)
     columns = past + 1
-    source = Source(
-        "follow" if constants_only else "chain",
-        "transfer, history, rows, width",
-        {"transfer": new * columns * steps, "history": 10**9},
-    )
+    source = Source("follow" if constants_only else "chain", "transfer, history, rows, width")
     source.loop("for t in range(rows):")
     source.add(f"base = t*{new * columns * WIDTH}")
     source.add(f"at = t*{WIDTH}")
@@ -151,9 +146,7 @@ def chain(
 def product(new: int, order: Sequence[int]) -> str:
     """Products of the chunks' matrices, ``(WIDTH + 1, D, COLUMNS)``, from the identity on."""
     D = len(order)
-    source = Source("product", "history, products, whole, rest, width", {
-        "history": 10**9, "products": (WIDTH + 1) * D * COLUMNS,
-    })  # fmt: skip
+    source = Source("product", "history, products, whole, rest, width")
     source.loop(f"for c in range({WIDTH}):")
     source.add(_end_of_chunk(new, D))
     source.add(f"at = c*{D * COLUMNS}")
@@ -172,9 +165,7 @@ def product(new: int, order: Sequence[int]) -> str:
 def begin(new: int, order: Sequence[int]) -> str:
     """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing."""
     D = len(order)
-    source = Source("begin", "history, inverse, start, whole, rest, closed", {
-        "history": 10**9, "inverse": D * D, "start": D * WIDTH,
-    })  # fmt: skip
+    source = Source("begin", "history, inverse, start, whole, rest, closed")
     states = range(D)
 
     def through_chunks(*before: str) -> None:
@@ -219,11 +210,7 @@ def _number(value: float) -> str:
 def rows(orders: Sequence[int], method: Tableau, steps: int) -> str:
     d, s, D = len(orders), method.stages, sum(orders)
     aa = method.a @ method.a
-    source = Source(
-        "rows",
-        "x, h, z, count",
-        {"x": (D + s * d) * REACH, "h": BLOCK, "z": (D + d) * BLOCK},
-    )
+    source = Source("rows", "x, h, z, count")
     source.loop("for i in range(count):")
     source.add("h1 = h[i]")
     state = 0
@@ -288,25 +275,9 @@ def _stage_squares(source: Source, orders: Sequence[int], first: int) -> None:
         add_squares(source, e, d, "g", terms)
 
 
-def _source(
-    name: str, orders: Sequence[int], method: Tableau, steps: int, *, squares: bool = False
-) -> Source:
-    d, s, D = len(orders), method.stages, sum(orders)
-    sizes = {
-        "out": d * (1 + D + d) * BLOCK,
-        "x": (D + s * d) * REACH,
-        "h": BLOCK,
-        "transfer": ((D + s * d) * (D + 1) + (s * d) ** 2) * steps,
-    }
-    if squares:
-        sizes |= {"z": (D + d) * BLOCK, "sums": 2 * d * BLOCK}
-    more = "z, sums, " if squares else ""
-    return Source(name, f"out, x, h, {more}transfer, count", sizes)
-
-
 def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     m, D = len(orders) * method.stages, sum(orders)
-    source = _source("eliminate", orders, method, steps, squares=True)
+    source = Source("eliminate", "out, x, h, z, sums, transfer, count")
     source.add("bad = 0")
     # In loops of their own: the elimination leaves no registers for more.
     for stage in range(method.stages):
@@ -328,7 +299,7 @@ def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
 
 def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     d, m, D = len(orders), len(orders) * method.stages, sum(orders)
-    source = _source("substitute", orders, method, steps)
+    source = Source("substitute", "out, x, h, transfer, count")
     source.loop("for i in range(count):")
     source.add("h1 = h[i]")
     source.add("h2 = h1*h1")
@@ -377,16 +348,7 @@ def _column(
 def update(orders: Sequence[int], stages: int, steps: int) -> str:
     d, D = len(orders), sum(orders)
     columns = D + 1
-    source = Source(
-        "update",
-        "transfer, history, start, dx, rows, width",
-        {
-            "transfer": (D + stages * d) * columns * steps,
-            "history": 10**9,
-            "start": D * WIDTH,
-            "dx": (D + stages * d) * BLOCK,
-        },
-    )
+    source = Source("update", "transfer, history, start, dx, rows, width")
     source.loop("for t in range(rows):")
     source.add(f"base = t*{D * columns * WIDTH}")
     source.add(f"at = t*{WIDTH}")

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import types
 
-from bayesoleo._compiled import BLOCK, COMPILING, cached_callback, load
+from bayesoleo._compiled import BLOCK
+from bayesoleo._machine_code import COMPILING, address_of
 from bayesoleo.solvers import _unrolled_collocation as collocation_code
+from bayesoleo.solvers._loop_instructions import instructions
 from bayesoleo.solvers._mesh import Tableau
 from bayesoleo.solvers._unrolled_collocation import (
     REACH,
@@ -51,8 +52,10 @@ SIGNATURES = {
     "begin": types.void(_P, _P, _P, _I, _I, _I),
     "update": types.void(_P, _P, _P, _P, _I, _I),
 }
-#: An address does not keep what stands there.
-_ALIVE: list[Any] = []
+#: Their arguments that are arrays; the others are whole numbers.
+ARRAYS = frozenset(
+    {"x", "h", "z", "out", "sums", "transfer", "history", "products", "inverse", "start", "dx"}
+)
 _PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
 
 
@@ -62,12 +65,7 @@ def past_nodes(orders: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def rows(orders: Sequence[int], first: Sequence[float], second: Sequence[float]) -> str:
-    nz = sum(orders) + len(orders)
-    source = Source(
-        "rows",
-        "x, h, z, count",
-        {"x": len(orders) * REACH, "h": BLOCK, "z": nz * BLOCK},
-    )
+    source = Source("rows", "x, h, z, count")
     source.add("once = 1.0/h[0]")
     source.add("twice = once*once")
     source.loop("for i in range(count):")
@@ -88,17 +86,7 @@ def elimination(
 ) -> str:
     d, nz, columns = len(orders), sum(orders) + len(orders), len(past_nodes(orders)) + 1
     factors = Factors(d * columns, d, steps)
-    source = Source(
-        "eliminate",
-        "out, x, h, z, sums, transfer, count",
-        {
-            "out": d * (1 + nz) * BLOCK,
-            "h": BLOCK,
-            "z": nz * BLOCK,
-            "sums": 2 * d * BLOCK,
-            "transfer": (d * columns + d * d) * steps,
-        },
-    )
+    source = Source("eliminate", "out, x, h, z, sums, transfer, count")
     source.add("bad = 0")
     source.add("once = 1.0/h[0]")
     source.add("twice = once*once")
@@ -136,11 +124,7 @@ def elimination(
 def substitution(orders: Sequence[int], steps: int) -> str:
     d, columns = len(orders), len(past_nodes(orders)) + 1
     factors = Factors(d * columns, d, steps)
-    source = Source(
-        "substitute",
-        "out, x, h, transfer, count",
-        {"out": d * BLOCK, "transfer": (d * columns + d * d) * steps},
-    )
+    source = Source("substitute", "out, x, h, transfer, count")
     source.loop("for i in range(count):")
     solution = solve_again(source, [f"-out[{e * BLOCK} + i]" for e in range(d)], factors)
     for e in range(d):
@@ -151,11 +135,7 @@ def substitution(orders: Sequence[int], steps: int) -> str:
 def update(orders: Sequence[int]) -> str:
     d, past = len(orders), len(past_nodes(orders))
     columns, window = past + 1, 3 * d
-    source = Source(
-        "update",
-        "transfer, history, start, dx, rows, width",
-        {"history": 10**9, "start": past * WIDTH, "dx": d * BLOCK},
-    )
+    source = Source("update", "transfer, history, start, dx, rows, width")
     source.loop("for t in range(rows):")
     source.add(f"base = t*{d * columns * WIDTH}")
     source.add(f"at = t*{WIDTH}")
@@ -233,15 +213,13 @@ class Program:
 
 
 def _compile(parts: Sequence[str]) -> dict[str, int]:
-    source = "import numba\n\n\n" + "\n\n\n".join(parts) + "\n"
-    module = load(source)
-    addresses = {}
-    for name, signature in SIGNATURES.items():
-        options: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
-        function = cached_callback(signature, getattr(module, name), **options)
-        _ALIVE.append(function)
-        addresses[name] = int(function.address)
-    return addresses
+    """Addresses of the pieces, in their order."""
+    return {
+        name: address_of(
+            instructions(part, ARRAYS, returned="i64" if name == "eliminate" else "void")
+        )
+        for name, part in zip(SIGNATURES, parts, strict=True)
+    }
 
 
 def differences(

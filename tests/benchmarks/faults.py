@@ -35,7 +35,7 @@ import numpy as np
 from hostile import INPUTS
 
 from bayesoleo._cli import main
-from bayesoleo._compiled import cache_folder
+from bayesoleo._machine_code import cache_folder
 from bayesoleo._storage.result_files import read_tree
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "cli"))

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from bayesoleo._compiled import cache_folder
+from bayesoleo._machine_code import cache_folder
 
 pytestmark = [
     pytest.mark.skipif(os.name != "posix", reason="forks, and sends SIGKILL"),

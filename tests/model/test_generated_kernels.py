@@ -1,6 +1,7 @@
 """Generated kernels compute what SymPy does, in both back ends, on both sides of every kink."""
 
 import hashlib
+import pickle
 import shutil
 import sys
 
@@ -8,8 +9,11 @@ import numpy as np
 import pytest
 import sympy as sp
 from hypothesis import HealthCheck, assume, given, settings, strategies as st
+from llvmlite import binding as llvm
+from numba import types
 
-from bayesoleo._compiled import BlockKernel, cache_folder, load, unsealed
+from bayesoleo._compiled import BlockKernel, cached_callback, load
+from bayesoleo._machine_code import LIBRARY, _target_machine, address_of, cache_folder, unsealed
 from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._expressions import FUNCTIONS, symbol
@@ -218,8 +222,10 @@ def test_kernels_are_made_once_and_kept_where_the_environment_says(tmp_path, mon
     model = model_of("a*x + 0.123456789*b*w")
     first = kernels(model)
     assert kernels(model) is first
-    (source,) = (tmp_path / "kernels").glob("*.py")
-    assert source.read_text() == first.source
+    assert not list(tmp_path.rglob("*.o"))  # each is made when it is asked for
+    assert first.output.address == address_of(first.output.source)
+    (code,) = (tmp_path / "kernels").glob("*.o")
+    assert unsealed(code) is not None
     other = kernels(model, active=("b",))
     assert other.derived.active == ("b",)
 
@@ -285,16 +291,43 @@ def test_a_conjugate_of_what_is_real_is_itself():
     np.testing.assert_allclose(eval(result, scope), [1.0, 2.0**1.5], rtol=1e-15)
 
 
-SMALL = "def add(z, u, p, out, count):\n    for i in range(count):\n        out[i] = z[i] + p[0]\n"
+SMALL = """
+define void @kernel(ptr %z, ptr %u, ptr %p, ptr %out, i64 %count) {
+entry:
+  %constant = load double, ptr %p
+  br label %loop
+loop:
+  %i = phi i64 [ 0, %entry ], [ %next, %loop ]
+  %from = getelementptr double, ptr %z, i64 %i
+  %to = getelementptr double, ptr %out, i64 %i
+  %value = load double, ptr %from
+  %sum = fadd double %value, %constant
+  store double %sum, ptr %to
+  %next = add i64 %i, 1
+  %more = icmp slt i64 %next, %count
+  br i1 %more, label %loop, label %end
+end:
+  ret void
+}
+"""
+PYTHON = "def add(x):\n    return x + 1.0\n"
 
 
-def evaluate(source):
+def evaluate(source, monkeypatch):
     """A kernel of generated source, as a new process would load it."""
-    sys.modules.pop("bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24], None)
+    monkeypatch.setattr("bayesoleo._machine_code._ADDRESSES", {})
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
+    monkeypatch.setattr("bayesoleo._machine_code._engine", lambda: engine)
     out = np.zeros((1, 1, 3))
-    kernel = BlockKernel(load(source).add, 1)
+    kernel = BlockKernel(source, 1)
     kernel(np.array([[[1.0, 2.0, 3.0]]]), np.zeros((0, 3)), np.array([[0.5]]), np.array([0]), out)
     return out.ravel().tolist()
+
+
+def called(source):
+    """A function of generated Python, as a new process would compile it."""
+    sys.modules.pop("bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24], None)
+    return cached_callback(types.float64(types.float64), load(source).add).ctypes(2.0)
 
 
 def cut(content):
@@ -311,17 +344,19 @@ def test_a_damaged_file_of_the_cache_is_made_anew(tmp_path, monkeypatch, damage)
     monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
     # Numba's own setting would send its files elsewhere.
     monkeypatch.setattr("numba.config.CACHE_DIR", "")
-    assert evaluate(SMALL) == [1.5, 2.5, 3.5]
+    assert evaluate(SMALL, monkeypatch) == [1.5, 2.5, 3.5]
+    assert called(PYTHON) == 3.0
     whole = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     kinds = {"".join(path.suffixes[-1:]) for path in whole}
-    assert kinds == {".py", ".code", ".nbi", ".nbc"}, "all of these are damaged below"
+    assert kinds == {".o", ".py", ".code", ".nbi", ".nbc"}, "all of these are damaged below"
     for path, content in whole.items():
         path.write_bytes(damage(content))
-    assert evaluate(SMALL) == [1.5, 2.5, 3.5]
+    assert evaluate(SMALL, monkeypatch) == [1.5, 2.5, 3.5]
+    assert called(PYTHON) == 3.0
     for path in whole:
         assert path.suffix == ".py" or unsealed(path) is not None
     (source,) = tmp_path.rglob("*.py")
-    assert source.read_text() == SMALL
+    assert source.read_text() == PYTHON
     assert not list(tmp_path.rglob("*.tmp"))
 
 
@@ -331,16 +366,36 @@ def test_a_full_disk_costs_only_the_cache(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("bayesoleo._compiled.os.fsync", full)
-    assert evaluate(SMALL.replace("p[0]", "2.0*p[0]")) == [2.0, 3.0, 4.0]
+    monkeypatch.setattr("bayesoleo._machine_code.os.fsync", full)
+    assert evaluate(SMALL, monkeypatch) == [1.5, 2.5, 3.5]
+    assert called(PYTHON.replace("1.0", "2.0")) == 4.0
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_cache_that_was_moved_is_used_where_it_is(tmp_path, monkeypatch):
-    source = SMALL.replace("p[0]", "3.0*p[0]")
     monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "a"))
-    assert evaluate(source) == [2.5, 3.5, 4.5]
+    source = PYTHON.replace("1.0", "3.0")
+    assert (evaluate(SMALL, monkeypatch), called(source)) == ([1.5, 2.5, 3.5], 5.0)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     shutil.rmtree(tmp_path / "a")
     monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "b"))
-    assert evaluate(source) == [2.5, 3.5, 4.5]
+    assert (evaluate(SMALL, monkeypatch), called(source)) == ([1.5, 2.5, 3.5], 5.0)
+
+
+def test_a_kernel_is_pickled_with_its_instructions_and_without_its_address():
+    kernel = BlockKernel(lambda: SMALL, 1)
+    assert kernel.address == address_of(SMALL)
+    other = pickle.loads(pickle.dumps(kernel))
+    assert (other.source, other.rows) == (SMALL, 1)
+    assert "address" not in vars(other)
+
+
+def test_instructions_of_the_library_are_those_of_numpy():
+    """Of two numbers, also where one is none."""
+    numbers = np.array([-1.5, -0.0, 0.0, 2.0, np.inf, -np.inf, np.nan])
+    one, other = (part.ravel() for part in np.meshgrid(numbers, numbers))
+    model = model_of("max(x, w)", "min(x, w)", "sign(x)", "abs(x)")
+    y, _ = evaluated(model, "numba", one, other, np.array([[1.0, 1.0]]))
+    expected = [np.maximum(one, other), np.minimum(one, other), np.sign(one), np.abs(one)]
+    np.testing.assert_array_equal(y[0], expected)
+    assert "memory(none)" in LIBRARY  # what does not change from point to point is called once
