@@ -28,12 +28,20 @@ LONG = (
     "test_truth_benchmark.py",
     "test_structure_cases.py",
 )
+#: Modules of many quick tests that take minutes together, which one worker runs.
+MANY = (
+    "test_work_is_kept.py",
+    "test_close_results.py",
+    "test_closed_loop.py",
+    "test_examples.py",
+    "test_html_report.py",
+)
 #: Folders whose tests hardly need these; they are what the others run meanwhile.
 UNCOMPILED = ("data", "docs", "effects", "model", "plots", "posterior", "storage")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest slow tests first, then what compiles the most, then what compiles nothing."""
+    """The longest slow tests first, then what compiles the most, and what would end alone."""
     root = Path(__file__).parent
 
     def turn(item: pytest.Item) -> int:
@@ -41,7 +49,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             return LONG.index(item.path.name) - len(LONG)
         if item.path.name in COMPILING:
             return 0
-        return 1 if item.path.relative_to(root).parts[0] in UNCOMPILED else 2
+        if item.path.name in MANY:
+            return 1
+        return 2 if item.path.relative_to(root).parts[0] in UNCOMPILED else 3
 
     items.sort(key=turn)
 

@@ -258,7 +258,7 @@ def score_candidates(
     effects: Sequence[Effect] | None,
     jobs: int | None,
     *,
-    order: Callable[[Option, int], int | bool] = lambda option, place: 0,
+    order: Callable[[Option, int], int | bool] | None = None,
     callback: ProgressCallback = lambda _: None,
 ) -> tuple[list[Score], dict[str, str]]:
     """Score every effect at every place, each effect once.
@@ -274,15 +274,15 @@ def score_candidates(
     jobs : int or None
         Threads.
     order : callable (option, place in the catalogue) -> int, optional
-        Of equivalent effects the first in this order is kept; by default the one with the largest
-        share.
+        Of equivalent effects the first in this order is kept; by default the first of the
+        catalogue. Their shares are equal but for round-off, which differs between machines.
     callback : callable, optional
         Receives a message at each step.
 
     Returns
     -------
     scores : list of Score
-        In that order, and by falling share.
+        In that order, and by falling share; by default by falling share.
     failed : dict of str to str
         Reason by effect without a score.
     """
@@ -291,8 +291,11 @@ def score_candidates(
     callback(f"score {len(options)} candidates")
     scores, failed = score_all(base, options, jobs)
     places = {option.key: k for k, option in enumerate(options)}
-    scores.sort(key=lambda score: order(score.option, places[score.option.key]))
+    chosen = order or (lambda _, place: place)
+    scores.sort(key=lambda score: chosen(score.option, places[score.option.key]))
     kept, twins = without_twins(scores, policy=base.policy)
+    if order is None:
+        kept.sort(key=lambda score: -score.share)
     return kept, failed | twins
 
 

@@ -415,11 +415,14 @@ def _one_more(
         return {}, {}
     own = [group for _, group in flat]
     labels, largest = [list(keys).index(key) for key, _ in flat], Largest.of(len(keys))
-    each = [
-        effect_evidence(part, at.likelihood, own, at.sizes, labels, largest)
-        for part in at.parts(columns)
-    ]
-    logs = np.stack(each, axis=1)  # (remainders, own sizes, groups, sizes)
+    each: dict[int, Array] = {}
+    parts = at.parts(columns)
+    # Probable sizes of the anchor's own effects come first: beside them most others are small.
+    height = [at.likelihood(part.square, part.log_det).max() for part in parts]
+    for k in np.argsort(height)[::-1]:
+        each[k] = effect_evidence(parts[k], at.likelihood, own, at.sizes, labels, largest)
+    # (remainders, own sizes, groups, sizes)
+    logs = np.stack([each[k] for k in range(len(parts))], axis=1)
     without, outside = at.remainders.split(logs)
     alike = at.remainders.similar(logs, at.sizes)
     found, similar = {}, {}

@@ -284,7 +284,7 @@ def _joined(
 
 
 @jit
-def _student(square: float, log_det: float, count: int, freedom: float) -> float:
+def _student(square: float, log_det: float, count: float, freedom: float) -> float:
     """Log density but for a constant, as :class:`Likelihood` has it."""
     return -0.5 * log_det - 0.5 * (freedom + count) * math.log1p(max(square, 0.0) / freedom)
 
@@ -338,24 +338,54 @@ def singles(
     """
     size = own.shape[1] + 1
     moments, every, whole = np.empty((len(counts), 3)), np.empty(size), np.empty((size, size))
-    mean, variance = np.empty(1), np.empty((1, 1))
+    one = np.empty(1), np.empty((1, 1))
     for p in range(len(square)):
         top, before, around = best[min(p, 1)], own[p], spread[p]
         for s in range(slope.shape[1]):
-            lost, likely, label = gain[p, s], sides[s], labels[s]
+            lost, label = gain[p, s], labels[s]
+            data = slope[p, s], gram[p, s], square[p], log_det[p], float(count), freedom
+            first = 0
             for t in range(len(power)):
-                grown = 1.0 + power[t] * max(gram[p, s], 0.0)
-                left = square[p] - power[t] * slope[p, s] ** 2 / grown
-                mean[0], variance[0, 0] = power[t] * slope[p, s] / grown, power[t] / grown
-                noise = (freedom + max(left, 0.0)) / (freedom + count)
-                root = math.sqrt(noise)
-                _joined(before, around, lost, mean, variance, root, every, whole)
-                value = _student(left, log_det[p] + math.log(grown), count, freedom)
-                value += _log_squares(counts, every, whole, moments) - math.log(power[t])
-                if value > top[label] - SMALL_SHARE:
-                    value += _log_sides(counts, likely, every, whole, moments)
-                    top[label] = max(top[label], value)
-                found[p, s, t] = value
+                found[p, s, t] = _rough_single(
+                    data, power[t], counts, before, around, lost, one, every, whole, moments
+                )
+                if found[p, s, t] > found[p, s, first]:
+                    first = t
+            # The likely size comes first: beside it most of the others are small.
+            for n in range(-1, len(power)):
+                t = first if n < 0 else n
+                if n != first and found[p, s, t] > top[label] - SMALL_SHARE:
+                    _rough_single(
+                        data, power[t], counts, before, around, lost, one, every, whole, moments
+                    )
+                    found[p, s, t] += _log_sides(counts, sides[s], every, whole, moments)
+                    top[label] = max(top[label], found[p, s, t])
+
+
+@jit
+def _rough_single(
+    data: tuple[float, float, float, float, float, float],
+    power: float,
+    counts: Integers,
+    before: Array,
+    around: Array,
+    lost: Array,
+    one: tuple[Array, Array],
+    every: Array,
+    whole: Array,
+    moments: Array,
+) -> float:
+    """Log evidence but for likely sides and correlations; leaves the amplitudes' means, covariance
+    and mean squares in the last arrays."""
+    slope, gram, square, log_det, count, freedom = data
+    mean, variance = one
+    grown = 1.0 + power * max(gram, 0.0)
+    left = square - power * slope**2 / grown
+    mean[0], variance[0, 0] = power * slope / grown, power / grown
+    root = math.sqrt((freedom + max(left, 0.0)) / (freedom + count))
+    _joined(before, around, lost, mean, variance, root, every, whole)
+    value = _student(left, log_det + math.log(grown), count, freedom)
+    return value + _log_squares(counts, every, whole, moments) - math.log(power)
 
 
 @jit
@@ -467,7 +497,7 @@ def pairs(
                     mean[1] = (one * b - mixed * a) / det / root
                     covariance[0, 0], covariance[1, 1] = other / det, one / det
                     covariance[0, 1] = covariance[1, 0] = -mixed / det
-                    value = _student(left, log_det[p] + math.log(det), count, freedom)
+                    value = _student(left, log_det[p] + math.log(det), float(count), freedom)
                     value += _log_squares(counts, mean, covariance, moments)
                     if value > top[label] - SMALL_SHARE:
                         value += _log_sides(counts, likely, mean, covariance, moments)

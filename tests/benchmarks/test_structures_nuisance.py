@@ -23,12 +23,12 @@ def benchmark():
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_no_physics_is_named_where_there_is_a_disturbance_only(benchmark):
-    """Five kinds of system, the disturbances in turn; one false name in twenty-four has a chance
-    of two in five at the rate of 2 % that is asked for, three have one of 1 %."""
-    numbers = [n for n in range(9) if n % 8 != 3]
+    """Kinds of system and disturbances in turn; one false name in twelve has a chance of one in
+    five at the rate of 2 % that is asked for, two have one of 2 %."""
+    numbers = [0, 2, 4, 6]
     cases = [benchmark.run(word, n) for n in numbers for word in benchmark.TRUE]
     named = [(case.word, case.number, case.named) for case in cases if case.named]
-    assert len(named) <= 2, named
+    assert len(named) <= 1, named
 
 
 def test_disturbances_have_the_sizes_that_are_asked_for(benchmark):

@@ -272,7 +272,7 @@ def false_additions(folder, seeds, **options) -> int:
     "noise", [{}, {"coloured": 0.7}, {"input_noise": 2e-4}], ids=["white", "coloured", "input"]
 )
 def test_false_additions_are_no_more_frequent_than_stated(tmp_path, noise):
-    count, level = 40, 0.01
+    count, level = 20, 0.01
     added = false_additions(tmp_path, range(100, 100 + count), **noise)
     # More than this has a chance of less than one in a thousand at the stated level.
     assert added <= stats.binom.ppf(0.999, count, level)

@@ -329,3 +329,14 @@ def test_estimates_know_parameters_that_a_second_place_renames(two):
     # What another effect has brought already is not there a second time.
     bare = _named_as(score, replace(score.option, candidate=replace(renamed, shapes={})))
     assert bare.shapes == {}
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_one_law_of_two_names_has_the_first_whatever_round_off_says(plain, first):
+    """Both explain the same but for the last digits, which are other ones on other machines."""
+    names = ["compression_damping", "direction_dependent_damping"]
+    ordered = [names[first], names[1 - first]]
+    effects = [find_effect(name) for name in ordered]
+    scores, reasons = score_candidates(plain.base(), plain.assembly, effects, 1)
+    assert [score.option.key[0] for score in scores] == ordered[:1]
+    assert reasons[f"{ordered[1]} at force"] == f"the same as {ordered[0]} in other words"

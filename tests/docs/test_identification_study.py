@@ -1,4 +1,4 @@
-"""The identification study: what counts as right, its table, and a hundredth of its campaigns."""
+"""The identification study: what counts as right, its table, and a few of its campaigns."""
 
 from __future__ import annotations
 
@@ -105,11 +105,11 @@ def test_the_readme_says_what_the_stored_table_holds(load):
 
 
 @pytest.mark.statistical
-def test_a_hundredth_of_the_campaigns(load):
-    """An even sample: nothing is added where nothing lacks, and what is large is named."""
+def test_a_few_of_the_campaigns(load):
+    """Six, an even sample: nothing is added where nothing lacks, and what is large is named."""
     study, rows = load("identification"), load("identification_rows")
     campaigns = study.planned()
-    found = [study.run(one) for one in campaigns[: round(0.01 * len(campaigns))]]
+    found = [study.run(one) for one in campaigns[:6]]
     said = rows.summarise(found)
     assert said["failed"] == 0
     assert said["false_additions"] == 0

@@ -68,7 +68,7 @@ def test_moves_are_stationary(kind, dimension, scale):
 def test_moves_are_stationary_to_a_few_percent(kind, dimension, scale):
     groups = 1500 // dimension
     move = make(kind, dimension, scale, groups)
-    moment = second_moment(move, dimension, scale, groups=groups, steps=100)
+    moment = second_moment(move, dimension, scale, groups=groups, steps=60)
     assert moment == pytest.approx(1.0, abs=tolerance(dimension, groups))
 
 

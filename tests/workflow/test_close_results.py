@@ -238,10 +238,11 @@ def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
     point = workflow.estimate(campaign, MODEL, SETTINGS, out=tmp_path / "estimate")
     # Something is missing in this model: the errors that are chosen have quantities of their own.
     assert set(point.children) == records | {schema.POINT, schema.ERROR_MODEL}
-    plain = replace(SETTINGS, error_model="independent")
-    assert set(workflow.estimate(campaign, MODEL, plain).children) == records | {schema.POINT}
     assert set(read_tree(tmp_path / "estimate" / "results.nc").children) == set(point.children)
-    sampled = workflow.sample(campaign, MODEL, SETTINGS, out=tmp_path / "sample")
+    plain = replace(SETTINGS, error_model="independent")
+    point = workflow.estimate(campaign, MODEL, plain)
+    assert set(point.children) == records | {schema.POINT}
+    sampled = workflow.sample(campaign, MODEL, plain, out=tmp_path / "sample")
     more = {schema.POSTERIOR, schema.PRIOR, schema.SAMPLE_STATS, schema.LOG_LIKELIHOOD}
     more |= {schema.LOG_PRIOR, schema.PREDICTION, schema.PERIOD_PREDICTIVE, schema.COMPARISON}
     more |= {schema.OBSERVED_DATA, schema.POSTERIOR_PREDICTIVE}
