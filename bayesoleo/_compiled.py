@@ -10,18 +10,12 @@ loop over points into vector instructions.
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import importlib.util
-import marshal
 import pickle
-import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Protocol, cast
 
 import numba
@@ -29,18 +23,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.ccallback import CFunc
-from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
-from bayesoleo._machine_code import (
-    COMPILING,
-    address_of,
-    cache_folder,
-    sealed,
-    unsealed,
-    write_durably,
-)
+from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
 from bayesoleo._types import Array, Integers
 
 #: Their annotations lack too much for them to be called in checked code.
@@ -112,14 +97,6 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
     return decorate
 
 
-def cached_callback(signature: Any, function: Callable[..., Any], **options: Any) -> Any:
-    """A function compiled at once for its address, as ``numba.cfunc`` does; kept on disk."""
-    made: Any = CFunc(function, normalize_signature(signature), locals={}, options=options)
-    made._cache = _CheckedCache(function)
-    made.compile()
-    return made
-
-
 #: Compiles a function for other compiled code and for Python, without the interpreter lock.
 jit = cached(error_model="numpy")
 
@@ -157,7 +134,8 @@ class BlockKernel:
     @cached_property
     def address(self) -> int:
         """Address of the compiled function, for :func:`caller`."""
-        return address_of(self.source)
+        with COMPILING:  # threads that ask for it at once do not all make its source
+            return address_of(self.source)
 
     @property
     def compiled(self) -> BlockKernel:
@@ -359,53 +337,3 @@ def _fill(
             for k in range(more):
                 for i in range(count):
                     second[lane, k, begin + i] = out[rows + k, i]
-
-
-def load(source: str) -> ModuleType:
-    """Import generated source from a file, beside which Numba keeps what it compiled of it.
-
-    The file is named by the source's hash: other source never meets another's compiled code.
-    """
-    name = "bayesoleo_" + hashlib.sha256(source.encode()).hexdigest()[:24]
-    with COMPILING:  # a module stands in the table of modules before it is whole
-        return sys.modules[name] if name in sys.modules else _import(name, source)
-
-
-def _import(name: str, source: str) -> ModuleType:
-    path = _source_file(name, source)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # Numba finds a cached function's globals by its module's name
-    exec(_code(path, source), module.__dict__)
-    return module
-
-
-def _source_file(name: str, source: str) -> Path:
-    """A file that holds the source; one that is empty, cut or changed is written anew."""
-    path = cache_folder() / f"{name}.py"
-    content = source.encode()
-    try:
-        if not path.is_file() or path.read_bytes() != content:
-            write_durably(path, content)
-    except OSError:  # a full disk
-        path = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-")) / path.name
-        path.write_bytes(content)
-    return path
-
-
-def _code(path: Path, source: str) -> Any:
-    """The byte code of a source, from a file beside it where that is whole.
-
-    Python's own cache of it has no checksum.
-    """
-    kept = path.with_name(f"{path.stem}.{sys.implementation.cache_tag}.code")
-    content = unsealed(kept)
-    if content is not None and content.startswith(importlib.util.MAGIC_NUMBER):
-        code = marshal.loads(content[len(importlib.util.MAGIC_NUMBER) :])
-        if code.co_filename == str(path):  # the folder may have been moved
-            return code
-    code = compile(source, str(path), "exec")
-    with suppress(OSError):  # as above
-        write_durably(kept, sealed(importlib.util.MAGIC_NUMBER + marshal.dumps(code)))
-    return code

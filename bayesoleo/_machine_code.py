@@ -2,7 +2,7 @@
 
 A generated kernel is straight-line arithmetic in one loop over points. Numba takes half a second
 for each, nearly all of it to find the types of what are all floating-point numbers. Here LLVM, the
-compiler behind Numba, is given its instructions as they are, which takes a twentieth of that.
+compiler behind Numba, is given its instructions as they are, which takes a tenth of that.
 
 The source is LLVM's text. It may call the functions of :data:`LIBRARY`; those of the C library have
 the prefix ``c_``. Machine code is kept on disk under the hash of the source and of the processor.
@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
-import numba.core.codegen  # noqa: F401 - it prepares LLVM for this processor
 import platformdirs
 from llvmlite import binding as llvm
+from numba import config
 
 #: What a source calls the one function that it defines.
 ENTRY = "@kernel("
@@ -132,19 +132,33 @@ define internal double @arctan(double %x) #1 {{
 _ADDRESSES: dict[str, int] = {}
 
 
+#: To be raised with every change of how a source is compiled.
+_WAY = 1
+#: Numba's settings, which are made at run time.
+_SETTINGS: Any = config
+
+
+def _target() -> tuple[str, str, str]:
+    """Triple, processor and its features; Numba's settings of them hold here too."""
+    features = _SETTINGS.CPU_FEATURES
+    if features is None:
+        features = llvm.get_host_cpu_features().flatten()
+    return llvm.get_process_triple(), _SETTINGS.CPU_NAME or llvm.get_host_cpu_name(), features
+
+
 def _target_machine() -> Any:
-    features = llvm.get_host_cpu_features().flatten()
-    target = llvm.Target.from_default_triple()
-    return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=features, opt=3, jit=True
-    )
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    triple, name, features = _target()
+    target = llvm.Target.from_triple(triple)
+    return target.create_target_machine(cpu=name, features=features, opt=3, jit=True)
 
 
 @cache
 def _engine() -> Any:
     """Where all machine code is loaded: it stays there for as long as the process lives."""
     # A Python that is linked statically has no such symbols that LLVM would find by itself.
-    library = ctypes.CDLL("msvcrt" if sys.platform == "win32" else None)
+    library = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else None)
     for name in (*C_FUNCTIONS, "pow"):
         address = ctypes.cast(getattr(library, name), ctypes.c_void_p).value
         llvm.add_symbol(f"c_{name}", address)
@@ -161,9 +175,8 @@ def _compiler() -> Any:
 @cache
 def _processor() -> str:
     """What machine code depends on besides its source."""
-    features = llvm.get_host_cpu_features().flatten()
-    versions = f"{llvmlite.__version__} {llvm.llvm_version_info}"
-    return f"{versions} {llvm.get_default_triple()} {llvm.get_host_cpu_name()} {features}"
+    versions = f"{_WAY} {llvmlite.__version__} {llvm.llvm_version_info}"
+    return f"{versions} {' '.join(_target())}"
 
 
 def address_of(source: str) -> int:
@@ -193,6 +206,8 @@ def address_of(source: str) -> int:
 def _compiled(source: str) -> bytes:
     """Machine code of a source."""
     module = llvm.parse_assembly(LIBRARY + source)
+    module.triple = _target()[0]
+    module.data_layout = str(_compiler().target_data)
     module.verify()
     tuning = llvm.create_pipeline_tuning_options(speed_level=3)
     tuning.loop_vectorization = tuning.slp_vectorization = True
@@ -212,8 +227,14 @@ def cache_folder() -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:  # a read-only home must not stop a computation; only the cache is lost
-        folder = Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-"))
+        return _another_folder()
     return folder
+
+
+@cache
+def _another_folder() -> Path:
+    """Where kernels are kept by a process that may not write to the cache."""
+    return Path(tempfile.mkdtemp(prefix="bayesoleo-kernels-"))
 
 
 def sealed(content: bytes) -> bytes:

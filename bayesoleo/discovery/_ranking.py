@@ -282,7 +282,7 @@ def score_candidates(
     Returns
     -------
     scores : list of Score
-        In that order, and by falling share; by default by falling share.
+        By falling share; with ``order``, by that first.
     failed : dict of str to str
         Reason by effect without a score.
     """

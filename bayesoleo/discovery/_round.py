@@ -98,14 +98,8 @@ def examine(
         return Round(state, (), {}, None, None, limit, 1.0)
     base, policy = state.base(), numerics.policy
     scores, failed = score_candidates(
-        base,
-        state.assembly,
-        effects,
-        numerics.jobs,
-        order=lambda _, place: place,
-        callback=callback,
+        base, state.assembly, effects, numerics.jobs, callback=callback
     )
-    scores.sort(key=lambda score: -score.share)
     tests = effective_tests(scores, seed, policy=policy)
     ranking = rank(scores, tests, {}, policy=policy)
     stop = _stopping_reason(state, ranking, tests, policy)

@@ -601,9 +601,10 @@ def pair_evidence(
 def log_sum(logs: Array) -> Array:
     """Logarithm of the sum over the first axis of what logarithms are given of; quicker than
     SciPy's function, which also takes complex numbers."""
-    top = np.max(logs, axis=0)
+    top = np.max(logs, axis=0, initial=-np.inf)
     top = np.where(np.isfinite(top), top, 0.0)
-    return np.asarray(np.log(np.sum(np.exp(logs - top), axis=0)) + top)
+    with np.errstate(divide="ignore"):  # there may be nothing
+        return np.asarray(np.log(np.sum(np.exp(logs - top), axis=0)) + top)
 
 
 def mean_of(logs: Array) -> float:

@@ -30,7 +30,8 @@ FARTHEST = 30.0
 #: Standard deviations beyond which a tail is its first asymptotic term, to 5e-4 of it.
 FAR = 100.0
 #: Logarithm below an effect's largest evidence from which a moment is taken as if there were no
-#: likely sides and no correlations, which makes it larger by e^10 at most: to 1e-12 of the whole.
+#: likely sides and no correlations. That makes it smaller by e^10 at most; it makes it larger where
+#: a side is impossible, but what is e^40 below the largest counts for nothing.
 SMALL_SHARE = 40.0
 #: Argument from which the continued fraction of the error function has all digits by so many terms.
 FRACTION, TERMS = 5.0, 20

@@ -2,9 +2,9 @@
 
 All arrays have the points last, so that a loop over points runs through memory: states ``z (L, nz,
 N)``, inputs ``u (nu, N)`` shared by the lanes of a call, constants ``p (L, np)``. ``lanes`` lists
-the parameter vectors, of the ``L``, that are evaluated. The same generated source serves two back
-ends: NumPy (ready at once; for models evaluated a few times) and machine code for the loops that
-Numba compiles, which is kept on disk.
+the parameter vectors, of the ``L``, that are evaluated. The same expressions serve two back ends:
+NumPy (ready at once; for models evaluated a few times) and machine code for the loops that Numba
+compiles, which is kept on disk.
 
 Kernels are kept by a key that is equal for all models of the same expressions, whatever the values
 of their parameters. Computer algebra is the slowest part of a search that tries a hundred models on
@@ -24,8 +24,9 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from bayesoleo._compiled import BLOCK, ArrayKernel, BlockKernel, Kernel
 from bayesoleo._machine_code import C_FUNCTIONS, number
+from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import Derived, derive
-from bayesoleo.model._expressions import TIME, derivative_symbol, symbol
+from bayesoleo.model._expressions import FUNCTIONS, TIME, derivative_symbol, symbol
 from bayesoleo.model._model import Model
 
 #: What a base that is never negative, such as ``positive(x)``, is at least in a negative power. The
@@ -49,7 +50,7 @@ def _defined(expression: sp.Expr) -> sp.Expr:
 
 
 class _Printer(PythonCodePrinter):  # type: ignore[misc] # SymPy has no types
-    """Prints NumPy functions, which Numba compiles for scalars, and small powers as products."""
+    """Prints NumPy functions, and small powers as products."""
 
     def _print_Pow(self, expr: sp.Pow, rational: bool = False) -> str:
         base, exponent = expr.as_base_exp()
@@ -236,14 +237,36 @@ class _Instructions:
             return _number(float(expression))
         if expression.is_Pow:
             return self._power(*expression.as_base_exp())
-        arguments = [self.value(item) for item in expression.args]
+        if expression.is_Mul:
+            return self._product(expression)
         kind = type(expression).__name__
+        if not (kind in _FOLDED or kind in _CALLED or hasattr(self, f"_{kind}")):
+            raise ModelError(
+                f"{expression} cannot be compiled: {kind} is not a function of equations",
+                hint=f"use {', '.join(FUNCTIONS)}",
+            )
+        arguments = [self.value(item) for item in expression.args]
         if kind in _FOLDED:
-            first, *rest = arguments
-            return reduce(lambda one, other: self._do(_FOLDED[kind], one, other), rest, first)
+            return self._folded(_FOLDED[kind], arguments)
         if kind in _CALLED:
             return self._do(_CALLED[kind], *arguments)
         return cast(_Value, getattr(self, f"_{kind}")(*arguments))
+
+    def _product(self, expression: sp.Mul) -> _Value:
+        """Numerator over denominator: a factor's inverse may be beyond all numbers where the ratio
+        is not."""
+        above, below = [], []
+        for factor in expression.args:
+            base, exponent = factor.as_base_exp()
+            if exponent.is_Number and exponent.is_negative:
+                below.append(self.value(sp.Pow(base, -exponent)))
+            else:
+                above.append(self.value(factor))
+        numerator = self._folded("fmul", above or [_number(1.0)])
+        return self._do("fdiv", numerator, self._folded("fmul", below)) if below else numerator
+
+    def _folded(self, operation: str, values: Sequence[_Value]) -> _Value:
+        return reduce(lambda one, other: self._do(operation, one, other), values)
 
     def _power(self, base: sp.Expr, exponent: sp.Expr) -> _Value:
         if base is sp.E:
@@ -261,6 +284,10 @@ class _Instructions:
     def _Heaviside(self, value: _Value, *_: _Value) -> _Value:
         half = _number(0.5)
         return self._do("fadd", half, self._do("fmul", half, self._do("sign", value)))
+
+    # Computer algebra writes a tangent that is shifted by a quarter of a turn so.
+    def _cot(self, value: _Value) -> _Value:
+        return self._do("fdiv", _number(1.0), self._do("c_tan", value))
 
     # Every quantity is real, but a power of what might be negative is not known to be: the slope of
     # its absolute value is then written with both parts.
@@ -335,7 +362,7 @@ def _number(value: float) -> _Value:
 
 _ARITHMETIC = frozenset({"fadd", "fsub", "fmul", "fdiv"})
 #: Of several arguments, one after the other; and of one.
-_FOLDED = {"Add": "fadd", "Mul": "fmul", "Max": "maximum", "Min": "minimum"}
+_FOLDED = {"Add": "fadd", "Max": "maximum", "Min": "minimum"}
 _CALLED = {name: f"c_{name}" for name in C_FUNCTIONS} | {
     "Abs": "llvm.fabs.f64", "atan": "arctan", "sign": "sign"
 }  # fmt: skip
@@ -470,7 +497,7 @@ def kernels(model: Model, active: Sequence[str] | None = None, backend: str = "n
     active : sequence of str, optional
         Parameters to differentiate by; by default those that are estimated.
     backend : {"numba", "numpy"}
-        Numba pays when a model is evaluated often.
+        ``numba`` stands for machine code, which pays when a model is evaluated often.
 
     Returns
     -------

@@ -87,7 +87,12 @@ class _Function:
                 case ast.AugAssign(target=target, op=op, value=value):
                     changed = self._operation(op, self._value(target), self._value(value))
                     self._store(target, changed)
-                case ast.For(target=ast.Name(id=name), iter=ast.Call(args=[end]), body=body):
+                case ast.For(
+                    target=ast.Name(id=name),
+                    iter=ast.Call(func=ast.Name(id="range"), args=[end]),
+                    body=body,
+                    orelse=[],
+                ):
                     self._loop(name, end, body)
                 case ast.If(test=test, body=body, orelse=[]):
                     self._if(test, body)
@@ -102,7 +107,9 @@ class _Function:
             self._assign(target.id, value)
         else:
             assert isinstance(target, ast.Subscript)
-            self._lines.append(f"store {value[1]} {value[0]}, ptr {self._place(target)}")
+            if value[1] != _FLOAT:
+                raise NotImplementedError(f"a whole number in {ast.unparse(target)}")
+            self._lines.append(f"store {_FLOAT} {value[0]}, ptr {self._place(target)}")
 
     def _assign(self, name: str, value: _Value) -> None:
         if name not in self._variables:
@@ -137,7 +144,7 @@ class _Function:
         match expression:
             case ast.Constant(value=float(value)):
                 return number(value), _FLOAT
-            case ast.Constant(value=int(value)):
+            case ast.Constant(value=int(value)) if not isinstance(value, bool):
                 return str(value), _WHOLE
             case ast.Name(id=name):
                 kind = self._variables[name]

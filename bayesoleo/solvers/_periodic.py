@@ -21,7 +21,7 @@ from bayesoleo.solvers import (
     _periodic_newton as newton,
 )
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic_newton import NEEDS_EXCHANGE, Extrapolation
+from bayesoleo.solvers._periodic_newton import NEEDS_EXCHANGE, ROUND_OFF, Extrapolation
 from bayesoleo.solvers._schemes import Scheme
 
 #: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
@@ -30,9 +30,6 @@ LAST_STEP = 1e-7
 #: Without quadratic contraction (at a kink) a step this small is taken as converged.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
-#: A residual of this size, in units of the equations' terms, cannot fall any more. The motion of
-#: what is at rest has no scale of its own by which a step could be seen to be small.
-ROUND_OFF = 1e-14
 FIRST_STEP = 0.25
 SMALLEST_STEP = 1.0 / 512
 

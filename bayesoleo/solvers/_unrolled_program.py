@@ -5,9 +5,9 @@ differences the unknowns are the dofs at the nodes, and the state those of past 
 
 A period is cut into :data:`WIDTH` chunks that are swept side by side. Step ``t`` of all chunks is
 one vector instruction, and the recursion along the period, which cannot run in parallel by itself,
-costs no more than the work at each node. Code is compiled once for a signature (scheme, orders),
-not once for a model. Rows of a block lie at constant distances, which lets the compiler prove that
-they do not overlap.
+costs no more than the work at each node. Code is compiled once for a scheme and the orders of the
+dofs, not once for a model. Rows of a block lie at constant distances, which lets the compiler prove
+that they do not overlap.
 """
 
 from __future__ import annotations

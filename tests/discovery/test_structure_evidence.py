@@ -13,6 +13,7 @@ from bayesoleo.discovery._spectral_data import RunLines
 from bayesoleo.discovery._structure_evidence import (
     Covariances,
     Group,
+    Largest,
     Likelihood,
     Reduced,
     Remainders,
@@ -407,3 +408,36 @@ def test_likely_sides_of_one_effect_say_nothing_of_another():
     for k, group in enumerate(groups):
         alone = effect_evidence(beside, likelihood, [group], SIZES)
         np.testing.assert_array_equal(found[:, [k]], alone)
+
+
+@pytest.mark.parametrize("side", [0.5, 0.9, 0.0])
+def test_evidence_is_exact_wherever_it_counts(side):
+    """One largest evidence for all calls, also where the most probable side is impossible; against
+    calls for each group by itself, which take nothing for small but what is so beside itself."""
+    rng, likelihood = np.random.default_rng(8), Likelihood(400, 1e4)
+    columns = rng.standard_normal((6, 400)) * np.geomspace(0.2, 2.0, 6)[:, None]
+    rows = np.concatenate(
+        [(rng.standard_normal(400) + 0.4 * columns[1:4].sum(axis=0))[None], columns]
+    )
+    levels = [rows @ rows.T / level for level in (1.0, 1.5, 3.0)]
+    logs = np.array([0.0, 400 * np.log(1.5), 400 * np.log(3.0)])
+    part = Reduced.of(np.array(levels), logs, 0, np.zeros(0))
+    beside = [part.with_effects([Group((1,), side)], [size]) for size in SIZES]
+    groups = [Group((0,)), Group((1,), side), Group((2,), 0.9), Group((3, 4))]
+    labels, largest = [0, 1, 1, 2], Largest.of(3)
+    found = np.stack(
+        [effect_evidence(b, likelihood, groups, SIZES, labels, largest) for b in beside], axis=1
+    )
+    each = [
+        effect_evidence(b.of_some([p], range(b.size)), likelihood, [group], SIZES[[t]])
+        for b in beside
+        for p in range(3)
+        for group in groups
+        for t in range(SIZES.size)
+    ]
+    exact = np.reshape(each, (SIZES.size, 3, len(groups), SIZES.size)).swapaxes(0, 1)
+    for label in range(3):
+        for some in (slice(0, 1), slice(1, None)):
+            chosen = np.array(labels) == label
+            ours, theirs = (logs[some][:, :, chosen] for logs in (found, exact))
+            assert mean_of(ours) == pytest.approx(mean_of(theirs), abs=1e-9)
