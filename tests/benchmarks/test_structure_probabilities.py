@@ -118,12 +118,12 @@ def test_stored_table_says_how_it_was_made():
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_a_sample_of_the_study(monkeypatch):
-    """Eight campaigns make about eight statements above 0.95. Of these, three would be wrong in one
-    of seven hundred samples at an error rate of 3 %."""
+    """Six campaigns make about six statements above 0.95. Of these, three would be wrong in one of
+    two thousand samples at an error rate of 3 %."""
     for name in ("PLAN", "FEWER", "NOISE", "LEAST", "MOST"):  # the study sets its own
         monkeypatch.setattr(truth_effects, name, getattr(truth_effects, name))
-    rows = [structure_probabilities.run(number) for number in range(8)]
+    rows = [structure_probabilities.run(number) for number in range(6)]
     found = structure_figures.figures(rows)
-    assert found["structure_campaigns"] >= 6
+    assert found["structure_campaigns"] >= 5
     assert found["sure_and_wrong"] * found["statements_0.95_to_1"] < 3
-    assert found["brier_ratio"] < 1.0
+    assert found["brier"] < 0.5  # twice that of the whole study
