@@ -4,8 +4,9 @@ import pytest
 from gallery_alone import PAGES, run_alone
 
 #: A quick page of each section whose pages are quick, those first that do something else alone than
-#: in the documentation, where data and ``studies`` are at hand. The documentation runs every page, and no page may import
-#: from ``studies`` (``tests/docs/test_studies.py``); ``gallery_alone.py`` runs all of them alone.
+#: in the documentation, where data and ``studies`` are at hand. The documentation runs every page,
+#: and no page may import from ``studies`` (``tests/docs/test_studies.py``); ``gallery_alone.py``
+#: runs all of them alone.
 SAMPLE = ("reduction", "friction", "end_stop")
 
 
