@@ -129,9 +129,8 @@ define internal double @arctan(double %x) #1 {{
 """
 )
 
+#: Of what is loaded, by name.
 _ADDRESSES: dict[str, int] = {}
-
-
 #: To be raised with every change of how a source is compiled.
 _WAY = 1
 #: Numba's settings, which are made at run time.
