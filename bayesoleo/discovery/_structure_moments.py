@@ -84,14 +84,15 @@ def _over(counts: Integers, sides: Array, mean: Array, covariance: Array, found:
             one[i] = mean[i, k]
             for j in range(size):
                 spread[i, j] = covariance[i, j, k]
-        found[k] = _log_squares(counts, one, spread, moments)
+        found[k] = math.log(_squares(counts, one, spread, moments))
         found[k] += _log_sides(counts, sides[:, k], one, spread, moments)
 
 
 @jit
-def _log_squares(counts: Integers, mean: Array, covariance: Array, moments: Array) -> float:
-    """Logarithm of the product of effects' mean squares, which go to the first column of
-    ``moments``: the moment, were there no likely sides and no correlations of effects."""
+def _squares(counts: Integers, mean: Array, covariance: Array, moments: Array) -> float:
+    """Product of effects' mean squares, which go to the first column of ``moments``: the moment,
+    were there no likely sides and no correlations of effects. Variances are all that it takes of
+    the covariance."""
     product, start = 1.0, 0
     for k in range(len(counts)):
         total = 0.0
@@ -100,14 +101,14 @@ def _log_squares(counts: Integers, mean: Array, covariance: Array, moments: Arra
         moments[k, 0] = total / counts[k]
         product *= moments[k, 0]
         start += counts[k]
-    return math.log(product)
+    return product
 
 
 @jit
 def _log_sides(
     counts: Integers, sides: Array, mean: Array, covariance: Array, moments: Array
 ) -> float:
-    """What likely sides and correlations add to :func:`_log_squares`."""
+    """What likely sides and correlations add to the logarithm of :func:`_squares`."""
     sided, start = 0.0, 0
     for k in range(len(counts)):
         if counts[k] == 1 and sides[k] != 0.5:
@@ -260,7 +261,8 @@ def _joined(
     noise, and their covariance ``whole``, from those of both by themselves.
 
     An amplitude that stood in for the further effect is smaller beside it. ``gain`` (m, n) is by
-    how much it falls with each further amplitude.
+    how much it falls with each further amplitude. Covariances of the anchor's amplitudes with each
+    other are left to :func:`_complete`, for most of these densities do without.
     """
     before, more = len(own), len(mean)
     for k in range(more):
@@ -276,8 +278,20 @@ def _joined(
                 shared -= gain[i, j] * covariance[j, k]
             whole[i, before + k] = whole[before + k, i] = shared
         every[i] = moved / root
+        value = spread[i, i]
+        for k in range(more):
+            value -= gain[i, k] * whole[i, before + k]
+        whole[i, i] = value
+
+
+@jit
+def _complete(spread: Array, gain: Array, whole: Array) -> None:
+    """Covariances that :func:`_joined` leaves."""
+    before, more = gain.shape
     for i in range(before):
         for j in range(before):
+            if i == j:
+                continue
             value = spread[i, j]
             for k in range(more):
                 value -= gain[j, k] * whole[i, before + k]
@@ -339,7 +353,6 @@ def singles(
     """
     size = own.shape[1] + 1
     moments, every, whole = np.empty((len(counts), 3)), np.empty(size), np.empty((size, size))
-    one = np.empty(1), np.empty((1, 1))
     for p in range(len(square)):
         top, before, around = best[min(p, 1)], own[p], spread[p]
         for s in range(slope.shape[1]):
@@ -348,7 +361,7 @@ def singles(
             first = 0
             for t in range(len(power)):
                 found[p, s, t] = _rough_single(
-                    data, power[t], counts, before, around, lost, one, every, whole, moments
+                    data, power[t], counts, before, around, lost, every, whole, moments
                 )
                 if found[p, s, t] > found[p, s, first]:
                     first = t
@@ -357,8 +370,9 @@ def singles(
                 t = first if n < 0 else n
                 if n != first and found[p, s, t] > top[label] - SMALL_SHARE:
                     _rough_single(
-                        data, power[t], counts, before, around, lost, one, every, whole, moments
+                        data, power[t], counts, before, around, lost, every, whole, moments
                     )
+                    _complete(around, lost, whole)
                     found[p, s, t] += _log_sides(counts, sides[s], every, whole, moments)
                     top[label] = max(top[label], found[p, s, t])
 
@@ -371,22 +385,31 @@ def _rough_single(
     before: Array,
     around: Array,
     lost: Array,
-    one: tuple[Array, Array],
     every: Array,
     whole: Array,
     moments: Array,
 ) -> float:
-    """Log evidence but for likely sides and correlations; leaves the amplitudes' means, covariance
-    and mean squares in the last arrays."""
+    """Log evidence but for likely sides and correlations; leaves the amplitudes' means, what
+    :func:`_joined` has of their covariance, and mean squares in the last arrays.
+
+    The loops of :func:`_joined` are written out for one further amplitude: most of all densities
+    are of this kind.
+    """
     slope, gram, square, log_det, count, freedom = data
-    mean, variance = one
     grown = 1.0 + power * max(gram, 0.0)
     left = square - power * slope**2 / grown
-    mean[0], variance[0, 0] = power * slope / grown, power / grown
+    mean, variance = power * slope / grown, power / grown
     root = math.sqrt((freedom + max(left, 0.0)) / (freedom + count))
-    _joined(before, around, lost, mean, variance, root, every, whole)
-    value = _student(left, log_det + math.log(grown), count, freedom)
-    return value + _log_squares(counts, every, whole, moments) - math.log(power)
+    last = len(before)
+    every[last], whole[last, last] = mean / root, variance
+    for i in range(last):
+        shared = -lost[i, 0] * variance
+        every[i] = (before[i] - lost[i, 0] * mean) / root
+        whole[i, last] = whole[last, i] = shared
+        whole[i, i] = around[i, i] - lost[i, 0] * shared
+    product = _squares(counts, every, whole, moments)
+    value = _student(left, log_det, count, freedom)
+    return value + math.log(product / (power * math.sqrt(grown)))
 
 
 @jit
@@ -433,9 +456,10 @@ def beside(
         for t in range(mean.shape[1]):
             root = math.sqrt(noise[p, t])
             _joined(own[p], spread[p], gain[p], mean[p, t], covariance[p, t], root, every, whole)
-            value = density[p, t] + _log_squares(counts, every, whole, moments)
+            value = density[p, t] + math.log(_squares(counts, every, whole, moments))
             top = best[min(p, 1)]
             if value > top[label] - SMALL_SHARE:
+                _complete(spread[p], gain[p], whole)
                 value += _log_sides(counts, sides, every, whole, moments)
                 top[label] = max(top[label], value)
             found[p, t] = value
@@ -499,7 +523,7 @@ def pairs(
                     covariance[0, 0], covariance[1, 1] = other / det, one / det
                     covariance[0, 1] = covariance[1, 0] = -mixed / det
                     value = _student(left, log_det[p] + math.log(det), float(count), freedom)
-                    value += _log_squares(counts, mean, covariance, moments)
+                    value += math.log(_squares(counts, mean, covariance, moments))
                     if value > top[label] - SMALL_SHARE:
                         value += _log_sides(counts, likely, mean, covariance, moments)
                         top[label] = max(top[label], value)

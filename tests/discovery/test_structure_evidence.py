@@ -205,6 +205,22 @@ def test_a_pair_has_the_same_evidence_by_every_way(truth, correlation, side):
     assert found[0] - nothing == pytest.approx(exact, abs=1e-4 if side == 0.5 else 0.01)
 
 
+def test_a_third_effect_has_the_same_evidence_by_every_way():
+    """Also where it changes what two effects of the model have to do with each other."""
+    gram = 100.0 * np.array([[1.0, 0.6, -0.5], [0.6, 1.0, 0.4], [-0.5, 0.4, 1.0]])
+    truth, sizes = np.array([0.4, -0.2, 0.3]), [0.5, 0.4, 0.6]
+    square = np.array([truth @ gram @ truth + 500.0])
+    part = Reduced(gram[None], (gram @ truth)[None], square, np.zeros(1))
+    likelihood, every = Likelihood(500, 1e10), [Group((k,)) for k in range(3)]
+    whole = part.with_effects(every, sizes)
+    expected = (likelihood(whole.square, whole.log_det) + whole.log_moment(likelihood))[0]
+    for last in range(3):
+        rest = [k for k in range(3) if k != last]
+        about = part.with_effects([every[k] for k in rest], [sizes[k] for k in rest])
+        found = effect_evidence(about, likelihood, [Group((0,))], np.array([sizes[last]]))[0, 0, 0]
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
 def test_an_effect_of_two_amplitudes_has_the_same_evidence_beside_another(problem):
     likelihood, part = Likelihood(SAMPLES, 1e6), reduced(problem)
     one, two = Group((1,)), Group((0, 3))

@@ -74,6 +74,9 @@ def fits(campaigns):
             model, _, part = CAMPAIGNS[name]
             records = reduce_campaign(load_campaign(campaigns[name])).records
             start = part * np.array([model.parameters[n].value for n in model.estimated()])
+            if solver == "library":  # takes seconds a motion: it begins three deviations away
+                shot = fit(name, "shooting").point
+                start = shot.theta + 3.0 * shot.sd
             # Of the equal steps the error is told by what it moves; the others choose their own.
             steps = None if solver == "collocation" else 128
             numerics = Numerics(solver=solver, steps=steps, jobs=1)
