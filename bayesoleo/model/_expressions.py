@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from functools import cache, lru_cache
 
 import sympy as sp
 from sympy.printing.str import StrPrinter
@@ -160,7 +160,19 @@ class _RealSign(sp.Function):  # type: ignore[misc] # SymPy has no types
 
 
 def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
-    """Partial derivative with impulses dropped."""
+    """Partial derivative with impulses dropped.
+
+    Models of a search share most of their terms: derivatives of terms are kept.
+    """
+    if not isinstance(expression, sp.Add):
+        return _partial_of_term(expression, item)
+    return sp.Add(*(_partial_of_term(term, item) for term in expression.args))
+
+
+@lru_cache(maxsize=20_000)
+def _partial_of_term(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
+    if item not in expression.free_symbols:
+        return sp.Integer(0)
     if all(kink.args[0].is_extended_real for kink in expression.atoms(sp.Abs, sp.sign)):
         return without_impulses(sp.diff(expression, item))
     # A quotient may be infinite, and SymPy then takes it for complex: its derivatives of a modulus

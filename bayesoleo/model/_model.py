@@ -376,7 +376,9 @@ class Model:
         """Add parameters, or replace those of the same name."""
         other = copy(self)  # expressions stay, and what was found out about them
         object.__setattr__(other, "parameters", {**self.parameters, **parameters})
-        other.__dict__.pop("_coordinates", None)  # their signs follow nominal values
+        known = self.parameters
+        if any(name in known and known[name].value != p.value for name, p in parameters.items()):
+            other.__dict__.pop("_coordinates", None)  # their signs follow nominal values
         if not self.parameters.keys() >= parameters.keys():
             other.__dict__.pop("structure", None)
         other._check_names()

@@ -102,6 +102,15 @@ def test_coordinates_know_where_forces_act():
     assert (place.kind, place.target, place.velocity) == ("output", "force", symbol("dot(x)"))
 
 
+def test_signs_of_coordinates_follow_the_values_of_parameters():
+    """Also where they were asked for before the value changed."""
+    model = declare()
+    assert model.coordinates()[0].sign == 1
+    other = model.with_parameters(m=Parameter(-1.0, "kg", fixed=True))
+    assert other.coordinates()[0].sign == -1
+    assert other.with_parameters(new=Parameter(1.0, "kg")).coordinates()[0].sign == -1
+
+
 def test_one_expression_becomes_numbered_terms():
     model = declare(equations={"q": "m*ddot(q) + k*q - force"})
     assert sorted(model.equations["q"]) == ["term 1", "term 2", "term 3"]
