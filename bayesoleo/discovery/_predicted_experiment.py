@@ -15,7 +15,7 @@ import numpy as np
 from bayesoleo._types import Array
 from bayesoleo.discovery._expected_information import PredictiveDistribution
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.discovery._structure_evidence import sizes_between
+from bayesoleo.discovery._structure_columns import sizes_between
 from bayesoleo.errors import InputError
 from bayesoleo.model._drive_and_start import START
 from bayesoleo.model._expressions import COSINE, SINE, WITHIN

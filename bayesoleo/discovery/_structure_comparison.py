@@ -19,20 +19,18 @@ from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._score_basis import Base, present_constants
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._spectral_data import EstimatedModel, SpectralData, linearised
-from bayesoleo.discovery._structure_evidence import (
+from bayesoleo.discovery._structure_columns import (
     Covariances,
     Group,
-    Largest,
     Likelihood,
     Reduced,
     Remainders,
-    effect_evidence,
     fewer,
     log_difference,
     mean_of,
-    pair_evidence,
     sizes_between,
 )
+from bayesoleo.discovery._structure_evidence import Largest, effect_evidence, pair_evidence
 from bayesoleo.discovery._structures import StructurePrior
 from bayesoleo.prediction._run_errors import errors_known, input_columns
 

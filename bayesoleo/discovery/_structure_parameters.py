@@ -26,19 +26,19 @@ from scipy.stats import qmc
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._spectral_data import EstimatedModel, linearised
+from bayesoleo.discovery._structure_columns import (
+    Group,
+    Likelihood,
+    Reduced,
+    fewer,
+    moment_power,
+)
 from bayesoleo.discovery._structure_comparison import (
     Columns,
     Comparison,
     grids_of,
     own_groups,
     visible,
-)
-from bayesoleo.discovery._structure_evidence import (
-    Group,
-    Likelihood,
-    Reduced,
-    fewer,
-    moment_power,
 )
 from bayesoleo.discovery._structures import AveragedParameter, Structure
 

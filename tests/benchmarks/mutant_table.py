@@ -499,7 +499,7 @@ DISCOVERY: Rows = {
          "here = moved + 0.0 * follow @ shift",
          "discovery/test_averaged_parameters.py"),
     ],
-    "discovery/_structure_evidence.py": [
+    "discovery/_structure_columns.py": [
         ("half the volume of what is integrated out",
          "self.log_det + 2.0 * logs,",
          "self.log_det + logs,",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesoleo.discovery._structure_evidence import Group, Likelihood
+from bayesoleo.discovery._structure_columns import Group, Likelihood
 from bayesoleo.discovery._structure_parameters import _Structure, _summary
 
 SAMPLES, SIZE = 400, 0.2

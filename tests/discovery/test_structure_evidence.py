@@ -10,17 +10,15 @@ from scipy import integrate, stats
 from scipy.special import erfcx, logsumexp
 
 from bayesoleo.discovery._spectral_data import RunLines
-from bayesoleo.discovery._structure_evidence import (
+from bayesoleo.discovery._structure_columns import (
     Covariances,
     Group,
-    Largest,
     Likelihood,
     Reduced,
     Remainders,
-    effect_evidence,
     mean_of,
-    pair_evidence,
 )
+from bayesoleo.discovery._structure_evidence import Largest, effect_evidence, pair_evidence
 from bayesoleo.discovery._structure_moments import _scaled_tail, log_moments
 from bayesoleo.discovery._structures import StructurePrior
 

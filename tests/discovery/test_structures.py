@@ -22,6 +22,12 @@ from bayesoleo.discovery import StructurePosterior, StructurePrior
 from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
+from bayesoleo.discovery._structure_columns import (
+    Group,
+    Likelihood,
+    Reduced,
+    fewer,
+)
 from bayesoleo.discovery._structure_comparison import (
     LEAST_SEEN,
     LIKELY_SIDE,
@@ -29,7 +35,6 @@ from bayesoleo.discovery._structure_comparison import (
     grids_of,
     visible,
 )
-from bayesoleo.discovery._structure_evidence import Group, Likelihood, Reduced, fewer
 from bayesoleo.discovery._structure_parameters import _summary
 from bayesoleo.discovery._structure_search import (
     Evidence,
