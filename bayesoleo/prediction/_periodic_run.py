@@ -242,7 +242,8 @@ class RunPredictor:
         """Periodic solution at constants ``p (np,)`` without an anchor."""
         guess = self.guess(p)
         solution = solve_from_guess(self.boundary, p[None], guess)
-        if solution.status[0] != Status.NO_CONVERGENCE.value:
+        # Equations of what lags behind a motion are singular at rest, wherever their answer is.
+        if solution.status[0] not in (Status.NO_CONVERGENCE.value, Status.SINGULAR.value):
             return solution
         if self.anchor is not None:
             guess = self.anchor.x[None]  # nearer, so that shooting takes fewer passes

@@ -168,8 +168,7 @@ class PeriodicSolver:
         """
         if self.name == "adaptive":
             return self._adaptive(p, start)
-        motion = start.motion if isinstance(start, AdaptiveStart) else start
-        state = motion(np.zeros(1))[state_rows(self.kernels.derived.orders), 0]
+        state = self._state_of(start)
         if self.name == "library":
             return self._by_library(p, state, judge)
         hybrid = self.name == "hybrid"
@@ -178,6 +177,11 @@ class PeriodicSolver:
         if hybrid and derivatives and orbit.status.solved:
             by_parameter = self._on_mesh_of(shot, p)
         return PeriodicMotion(orbit, shot.sample, by_parameter, shot)
+
+    def _state_of(self, start: PhaseFunction | AdaptiveStart) -> Array:
+        """The state at phase zero."""
+        motion = start.motion if isinstance(start, AdaptiveStart) else start
+        return motion(np.zeros(1))[state_rows(self.kernels.derived.orders), 0]
 
     # -- errors ----------------------------------------------------------------------------
 
@@ -210,10 +214,15 @@ class PeriodicSolver:
         solve: Callable[..., AdaptiveSolution] = solve_adaptive
         if self.stiffness is not None:
             solve = partial(solve_stiffening, index=self.stiffness)
-        found = solve(
-            self.compiled_problem, p, start,
-            tolerance=self.tolerance, method=self.scheme, max_steps=self.max_steps,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "tolerance": self.tolerance, "method": self.scheme, "max_steps": self.max_steps
+        }  # fmt: skip
+        found = solve(self.compiled_problem, p, start, **options)
+        if found.orbit.status is Status.SINGULAR:
+            # As equations of what lags behind a motion are at rest, wherever their answer is.
+            shot, _ = self._shot(p, self._state_of(start), by_parameter=False, judge=False)
+            if shot.status is Status.CONVERGED:
+                found = solve(self.compiled_problem, p, shot.sample, **options)
         return PeriodicMotion(found.orbit, found.motion, found.motion_by_parameter, found)
 
     # -- shooting --------------------------------------------------------------------------

@@ -289,7 +289,7 @@ def _clean_samples(
         status = Status(int(answer.status[0]))
     if not status.ok:
         raise InputError(
-            f"model {model.name!r} has no periodic answer to this motion: {status.message}",
+            f"model {model.name!r}: no periodic answer to this motion was found: {status.message}",
             run=plan.label,
             hint="change the motion, the conditions or the parameter values",
         )

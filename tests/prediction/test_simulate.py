@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from bayesoleo.errors import InputError
 from bayesoleo.estimation import estimate
 from bayesoleo.estimation._campaign_problem import CampaignProblem
-from bayesoleo.model import Condition, Model, Output, Parameter, driven_by
+from bayesoleo.model import Condition, Dof, Model, Output, Parameter, driven_by
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._simulate import RunPlan, motion, simulate_run
@@ -177,7 +177,7 @@ def test_a_plan_that_is_none(make, message):
 
 def test_a_motion_beyond_the_gas_volume_is_an_error():
     plan = RunPlan("far", 0.5, {"displacement": motion(0.2, [0.1])})
-    with pytest.raises(InputError, match=r"run far: model 'f16n2d2' has no periodic answer"):
+    with pytest.raises(InputError, match=r"run far: model 'f16n2d2': no periodic answer"):
         simulate_run(OLEO, plan)
 
 
@@ -191,3 +191,61 @@ def test_a_simulation_knows_the_error_of_its_motion():
     assert fine.error < 1e-5
     assert coarse.error > true / np.ptp(fine.samples["displacement"])
     assert coarse.error > 0.01
+
+
+LAGGING = {
+    # Dahl (1968): the friction follows the motion within a length of 1/rate.
+    "dahl": ("dot(z) - rate*(dot(q) - abs(dot(q))*z)", "rub*z"),
+    # Bouc and Wen with the exponent two.
+    "bouc_wen": ("dot(z) - rate*dot(q) + rate*(abs(dot(q))*abs(z)*z + dot(q)*z**2)/2", "rub*z"),
+}
+
+
+def lagging(name: str) -> Model:
+    """An oscillator with friction that remembers the motion."""
+    memory, force = LAGGING[name]
+    return Model(
+        name,
+        inputs={"force": "N"},
+        dofs={"q": Dof("m"), "z": Dof("")},
+        parameters={
+            "m": Parameter(1.2, "kg", fixed=True),
+            "c": Parameter(12.0, "N*s/m", sd=6.0),
+            "k": Parameter(2e4, "N/m", sd=6e3),
+            "rub": Parameter(3.0, "N", sd=2.0),
+            "rate": Parameter(4e3, "1/m", sd=2e3),
+        },
+        equations={"q": f"m*ddot(q) + c*dot(q) + k*q + {force} - force", "z": memory},
+        outputs={"displacement": Output("q", "m")},
+    )
+
+
+@pytest.mark.parametrize("frequency", [5.0, 18.0])
+@pytest.mark.parametrize("solver", ["collocation", "adaptive", "hybrid"])
+@pytest.mark.parametrize("name", LAGGING)
+def test_a_state_that_stands_still_at_rest_is_solved_by_every_solver(name, solver, frequency):
+    """At rest, where guesses of an unknown motion begin, nothing determines the memory."""
+    plan = RunPlan("a", frequency, {"force": motion(0.0, [20.0])})
+    found, shot = (
+        simulate_run(lagging(name), plan, steps=512, solver=one).samples["displacement"]
+        for one in (solver, "shooting")
+    )
+    # What 512 equal steps leave at the kinks of each reversal.
+    np.testing.assert_allclose(found, shot, atol=1e-4 * np.abs(shot).max())
+
+
+@pytest.mark.parametrize("mean", [0.0, 1.0])
+@pytest.mark.parametrize("solver", ["collocation", "adaptive"])
+def test_a_free_mass_has_no_motion_that_can_be_found(solver, mean):
+    """Any position does, or none."""
+    free = Model(
+        "free mass",
+        inputs={"force": "N"},
+        dofs={"q": Dof("m")},
+        parameters={"m": Parameter(1.2, "kg", sd=0.1)},
+        equations={"q": "m*ddot(q) - force"},
+        outputs={"displacement": Output("q", "m")},
+    )
+    plan = RunPlan("a", 5.0, {"force": motion(mean, [20.0])})
+    with pytest.raises(InputError, match="no periodic answer to this motion was found"):
+        simulate_run(free, plan, steps=128, solver=solver)
