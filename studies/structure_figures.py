@@ -1,6 +1,6 @@
-"""Reliability of the probabilities of structures, from the stored table of a long study.
+"""Reliability of the probabilities of structures, from the stored tables of a long study.
 
-The table is written by ``structure_probabilities.py``, a row for each simulated campaign.
+The tables are written by ``structure_probabilities.py``, a row for each simulated campaign.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 OUTSIDE = "outside"
@@ -19,12 +20,16 @@ OUTSIDE = "outside"
 BANDS = ((0.5, 0.8), (0.8, 0.95), (0.95, 1.0001))
 #: Finer ones for the figure.
 FINE = (0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0001)
-TABLE = Path(__file__).resolve().parent / "tables" / "structures.json"
+#: How effects are drawn: from the whole catalogue by the default prior, or of sixteen usual ones.
+CATALOGUE, SIXTEEN = "catalogue", "sixteen"
+_FOLDER = Path(__file__).resolve().parent / "tables"
+TABLES = {draw: _FOLDER / f"structures-{draw}.json" for draw in (CATALOGUE, SIXTEEN)}
 
 
-def stored() -> dict[str, Any] | None:
+def stored(draw: str = CATALOGUE) -> dict[str, Any] | None:
     """The table of the last run; None if there is none."""
-    return json.loads(TABLE.read_text(encoding="utf-8")) if TABLE.is_file() else None
+    path = TABLES[draw]
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
 def statements(row: Mapping[str, Any]) -> list[tuple[float, bool]]:
@@ -98,14 +103,64 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return table
 
 
+def readme_rows() -> list[str]:
+    """Rows of the table in the README: what was said in each band, and what is true."""
+    said = "mean probability said; part that is true"
+    tables = {draw: table for draw in TABLES if (table := stored(draw)) is not None}
+    found = {draw: figures(table["rows"]) for draw, table in tables.items()}
+    rows = [
+        f"| statements about structures of probability 0.5–0.8, 0.8–0.95, above 0.95, {what}:"
+        f" {said} | {_cells(found[draw], mix)} | `calibration_error{end}` |"
+        for draw, what, end, mix in (
+            (CATALOGUE, "effects drawn from the whole catalogue", "", ""),
+            (SIXTEEN, "sixteen usual effects", "_sixteen", ""),
+            (SIXTEEN, "the same under a prior of the sixteen alone", "_by_mix", "_by_mix"),
+        )
+        if draw in found
+    ]
+    outside = [
+        [row["outside"] > 0.5 for row in table["rows"] if row["what"] == OUTSIDE]
+        for table in tables.values()
+    ]
+    shares = "; ".join(f"{sum(one)} of {len(one)}" for one in outside)
+    title = 'a law outside the catalogue: probability of "outside" above one half'
+    return [*rows, f"| {title} | {shares} | `outside_called_outside` |"]
+
+
+def _cells(found: Mapping[str, float], end: str) -> str:
+    keys = [f"{low:g}_to_{min(high, 1.0):g}{end}" for low, high in BANDS]
+    said, true = (
+        ", ".join(f"{found[f'{what}_{key}']:.2f}" for key in keys) for what in ("said", "true")
+    )
+    counts = ", ".join(f"{found[f'statements_{key}']}" for key in keys)
+    return f"{said}; {true} ({counts} statements)"
+
+
+#: What a table is of, and its colour.
+TITLES = {
+    CATALOGUE: ("effects drawn from the whole catalogue", "#0072b2"),
+    SIXTEEN: ("sixteen usual effects", "#d55e00"),
+}
+
+
 def reliability_figure() -> Figure | None:
     """How often statements are true, by the probability with which they were made."""
-    table = stored()
-    if table is None:
+    tables = {draw: table for draw in TABLES if (table := stored(draw)) is not None}
+    if not tables:
         return None
-    said = np.array([item for row in table["rows"] for item in statements(row)], dtype=float)
-    figure = Figure(figsize=(5, 4.2), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(4.4 * len(tables), 4.2), layout="constrained")
+    panels = figure.subplots(1, len(tables), squeeze=False, sharey=True)[0]
+    for axes, (draw, table) in zip(panels, tables.items(), strict=True):
+        title, colour = TITLES[draw]
+        _draw_reliability(axes, table["rows"], colour)
+        axes.set_title(f"{title}, {table['campaigns']} campaigns", fontsize=10)
+        axes.set_xlabel("probability that was stated")
+    panels[0].set_ylabel("part of the statements that is true")
+    return figure
+
+
+def _draw_reliability(axes: Axes, rows: Sequence[Mapping[str, Any]], colour: str) -> None:
+    said = np.array([item for row in rows for item in statements(row)], dtype=float)
     axes.plot([0, 1], [0, 1], color="0.6", lw=0.8)
     for low, high in pairwise(FINE):
         band = said[(said[:, 0] >= low) & (said[:, 0] < high)]
@@ -116,31 +171,34 @@ def reliability_figure() -> Figure | None:
         z, count = 1.645, len(band)
         centre = (true + z**2 / (2 * count)) / (1 + z**2 / count)
         half = z * np.sqrt(true * (1 - true) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
-        axes.plot([mean, mean], [centre - half, centre + half], color="#0072b2", lw=1.4)
-        axes.plot(mean, true, "o", color="#0072b2", ms=5)
+        axes.plot([mean, mean], [centre - half, centre + half], color=colour, lw=1.4)
+        axes.plot(mean, true, "o", color=colour, ms=5)
         axes.annotate(f"{count}", (mean, true), (6, -10), textcoords="offset points", fontsize=8)
-    axes.set(xlabel="probability that was stated", ylabel="part of the statements that is true")
     axes.set(xlim=(0, 1.02), ylim=(0, 1.02))
     axes.spines[["top", "right"]].set_visible(False)
-    return figure
 
 
 def print_figures() -> None:
     """Calibration error, scores, and what was wrong, with counts."""
-    table = stored()
-    if table is None:
-        return
-    found = figures(table["rows"])
-    print(f"{table['campaigns']} campaigns, {table['failed']} more could not be simulated")
-    for title, end in (("default prior", ""), ("study's own prior", "_by_mix")):
-        if f"calibration_error{end}" not in found:
+    for draw in TABLES:
+        table = stored(draw)
+        if table is None:
             continue
-        print(f"by the {title}")
-        for low, high in BANDS:
-            key = f"{low:g}_to_{min(high, 1.0):g}{end}"
-            count, said, true = (
-                found.get(f"{what}_{key}", float("nan")) for what in ("statements", "said", "true")
-            )
-            print(f"  said {said:.3f} on average: {count:4.0f} statements, {true:.3f} true")
-    for key in ("calibration_error", "sure_and_wrong", "brier_ratio", "outside_called_outside"):
-        print(f"{key.replace('_', ' '):24} {found[key]:.3f}")
+        found = figures(table["rows"])
+        failed = f"{table['failed']} more could not be simulated"
+        print(f"{TITLES[draw][0]}: {table['campaigns']} campaigns, {failed}")
+        _print_bands(found, "")
+        for key in ("calibration_error", "sure_and_wrong", "brier_ratio", "outside_called_outside"):
+            print(f"  {key.replace('_', ' '):24} {found[key]:.3f}")
+        if "calibration_error_by_mix" in found:
+            print("  the same evidence under a prior of these sixteen effects only")
+            _print_bands(found, "_by_mix")
+
+
+def _print_bands(found: Mapping[str, float], end: str) -> None:
+    for low, high in BANDS:
+        key = f"{low:g}_to_{min(high, 1.0):g}{end}"
+        count, said, true = (
+            found.get(f"{what}_{key}", float("nan")) for what in ("statements", "said", "true")
+        )
+        print(f"  said {said:.3f} on average: {count:4.0f} statements, {true:.3f} true")

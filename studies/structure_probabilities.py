@@ -1,11 +1,18 @@
 """How often a probability of a structure is right: simulated campaigns of six kinds of system.
 
-A quarter lacks nothing; the others lack one effect of the catalogue, two, or a law that the
-catalogue does not have, at one to ten times the detection limit. Systems, motions and noise are
-drawn by the benchmarks' own simulator, which shares no code with the package. An effect is true if
-it acts, or if its columns are exactly those of one that acts, so that the two are one effect in the
-catalogue. Of effects that only resemble each other one is true and the others are false. Rows go
-to a file as they come, so that a run that was stopped goes on:
+A quarter lacks nothing; the others lack one effect, two, or a law that the catalogue does not have,
+at one to ten times the detection limit. Systems, motions and noise are drawn by the benchmarks' own
+simulator, which shares no code with the package. Effects are drawn in one of two ways:
+
+``catalogue``
+    from the whole catalogue, as often as the default prior says (:mod:`structure_draws`);
+``sixteen``
+    sixteen usual ones in their places, which the same simulator computes. Of laws that are nearly
+    one it has one only; the prior has both, so that statements of the two say less than is true.
+
+An effect is true if it acts, or if its columns are exactly those of one that acts, so that the two
+are one effect in the catalogue. Of effects that only resemble each other one is true and the others
+are false. Rows go to a file as they come, so that a run that was stopped goes on:
 
     python studies/structure_probabilities.py rows.jsonl --campaigns 1000 --jobs 2
 
@@ -21,7 +28,8 @@ import multiprocessing
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,8 +37,9 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "benchmarks"))
+import structure_draws
 import truth_effects as truth
-from structure_figures import OUTSIDE, TABLE, figures
+from structure_figures import CATALOGUE, OUTSIDE, SIXTEEN, TABLES, figures
 from structure_mix import statements_by_mix
 from truth_systems import KINDS, Extra, Made, Noise, Plan, Sizes, make
 
@@ -43,6 +52,8 @@ from bayesoleo.errors import BayesoleoError
 
 #: What a campaign may lack, in turn.
 CLASSES = ("nothing", "one", "one", "two", "outside", "one", "nothing", "outside")
+#: Effects of the catalogue that a campaign of a class lacks.
+COUNTS = {"one": 1, "two": 2}
 #: Sizes in detection limits.
 LEAST, MOST = 1.0, 10.0
 #: Times of the largest size beyond which a campaign is left out.
@@ -99,19 +110,24 @@ def case_of(number: int, rng: np.random.Generator) -> tuple[str, truth.Case]:
     return what, cases[int(rng.integers(len(cases)))]
 
 
+def entered(rng: np.random.Generator) -> float:
+    """Relative noise of a measured input, which every other campaign has."""
+    return float(10 ** rng.uniform(-3.0, -2.0)) * int(rng.integers(2))
+
+
 def made_of(what: str, case: truth.Case, number: int, rng: Any) -> tuple[Made, np.ndarray]:
     """The campaign, and the sizes of what it lacks in detection limits.
 
     No run is held out, for probabilities use the fitted runs only. Every other campaign has a
     measured input with noise of its own.
     """
-    seed, entered = 120000 + number, float(10 ** rng.uniform(-3.0, -2.0)) * int(rng.integers(2))
+    seed, noise = 120000 + number, Noise(relative_input=entered(rng))
     if what == "nothing":
         transient, weak = bool(rng.integers(8) == 0), bool(rng.integers(2))
         plan = Plan(fitted=int(rng.integers(2, 4)), held_out=0, transient=transient, weak=weak)
-        return make(case.kind, seed, plan=plan, noise=Noise(relative_input=entered)), np.zeros(0)
+        return make(case.kind, seed, plan=plan, noise=noise), np.zeros(0)
     truth.PLAN, truth.FEWER = replace(PLAN, fitted=3), PLAN
-    truth.NOISE = Noise(relative=0.005, relative_input=entered)
+    truth.NOISE = replace(noise, relative=0.005)
     return sized(case, seed, rng)
 
 
@@ -133,16 +149,50 @@ def sized(case: truth.Case, seed: int, rng: Any) -> tuple[Made, np.ndarray]:
     return made, wanted
 
 
-def run(number: int) -> dict[str, Any]:
-    """Simulate one campaign and compare structures on it."""
+@dataclass(frozen=True)
+class Campaign:
+    """One campaign of the study.
+
+    Parameters
+    ----------
+    made : Made
+    names : sequence of str
+        Effects that it lacks, with their places.
+    sizes : ndarray
+        Of what it lacks, in detection limits.
+    """
+
+    made: Made
+    names: Sequence[str]
+    sizes: np.ndarray
+
+
+def campaign(number: int, draw: str) -> Campaign:
+    """Draw and simulate campaign ``number``."""
+    what = CLASSES[number % len(CLASSES)]
+    if draw == CATALOGUE and what in COUNTS:
+        rng = np.random.default_rng([number, SEED, 1])
+        truth.PLAN, truth.FEWER = replace(PLAN, fitted=3), PLAN
+        wanted = rng.uniform(LEAST, MOST, COUNTS[what])
+        noise = Noise(relative=0.005, relative_input=entered(rng))
+        kind = str(rng.choice(list(KINDS)))
+        return Campaign(*structure_draws.drawn(kind, 150000 + number, wanted, noise, rng))
     rng = np.random.default_rng([number, SEED])
     what, case = case_of(number, rng)
-    row: dict[str, Any] = {"number": number, "what": what, "case": case.name, "kind": case.kind}
+    made, sizes = made_of(what, case, number, rng)
+    names = [f"{item.effect} @ {item.target}" for item in case.missing if what != OUTSIDE]
+    return Campaign(made, names, sizes)
+
+
+def run(number: int, draw: str = CATALOGUE) -> dict[str, Any]:
+    """Simulate one campaign and compare structures on it."""
+    row: dict[str, Any] = {"number": number, "what": CLASSES[number % len(CLASSES)]}
     start = time.process_time()
     try:
-        made, sizes = made_of(what, case, number, rng)
+        lacks = campaign(number, draw)
     except (BayesoleoError, RuntimeError, np.linalg.LinAlgError) as error:
         return row | {"failed": str(error).splitlines()[0]}
+    made, sizes = lacks.made, lacks.sizes
     if np.any(sizes > BEYOND * MOST):
         return row | {"failed": "the effect is not nearly linear in its amplitude"}
     begin = time.process_time()
@@ -160,9 +210,9 @@ def run(number: int) -> dict[str, Any]:
             effect, target = name.split(" at ")
             other = reason.removeprefix("the same as ").removesuffix(" in other words")
             twins[f"{effect} @ {target}"] = f"{other} @ {target}"
-    names = [f"{item.effect} @ {item.target}" for item in case.missing if what != OUTSIDE]
     return row | {
-        "truth": [twins.get(name, name) for name in names],
+        "kind": made.kind,
+        "truth": [twins.get(name, name) for name in lacks.names],
         "sizes": [round(float(size), 2) for size in sizes],
         "nothing": found.nothing,
         "outside": found.outside,
@@ -184,21 +234,23 @@ def run(number: int) -> dict[str, Any]:
     }
 
 
-def store(rows: Sequence[Mapping[str, Any]], campaigns: int) -> None:
+def store(rows: Sequence[Mapping[str, Any]], campaigns: int, draw: str) -> None:
     """Write the compact table: a campaign a line."""
     kept = sorted((row for row in rows if "failed" not in row), key=lambda row: row["number"])
+    options = f"--draw {draw} --campaigns {campaigns} --store"
     head = {
-        "command": f"python {Path(__file__).name} FILE --campaigns {campaigns} --store",
+        "command": f"python {Path(__file__).name} FILE {options}",
         "version": version("bayesoleo"),
         "seed": SEED,
         "campaigns": len(kept),
         "failed": len(rows) - len(kept),
     }
-    kept = [_with_mix(row) for row in kept]
+    if draw == SIXTEEN:
+        kept = [_with_mix(row) for row in kept]
     kept = [{key: value for key, value in row.items() if key != "evidence"} for row in kept]
     lines = ",\n".join(json.dumps(_brief(row)) for row in kept)
     text = json.dumps(head)[:-1] + f', "rows": [\n{lines}\n]}}\n'
-    TABLE.write_text(text, encoding="utf-8")
+    TABLES[draw].write_text(text, encoding="utf-8")
 
 
 def _with_mix(row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -226,23 +278,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("results", type=Path, help="file of results, one JSON object a line")
     parser.add_argument("--campaigns", type=int, default=1000)
+    parser.add_argument("--draw", choices=list(TABLES), default=CATALOGUE, help="what is lacking")
     parser.add_argument("--jobs", type=int, default=1, help="campaigns at a time")
     parser.add_argument("--store", action="store_true", help="write the table of all rows")
     parser.add_argument("--from-stored", action="store_true", help="begin with the stored table")
     given = parser.parse_args()
     if given.from_stored and not given.results.exists():
-        stored = json.loads(TABLE.read_text(encoding="utf-8"))["rows"]
+        stored = json.loads(TABLES[given.draw].read_text(encoding="utf-8"))["rows"]
         given.results.write_text("".join(json.dumps(row) + "\n" for row in stored), "utf-8")
     done = {row["number"] for row in read(given.results)}
     numbers = [number for number in range(given.campaigns) if number not in done]
     with multiprocessing.Pool(given.jobs) as pool:
-        for row in pool.imap_unordered(run, numbers):
+        for row in pool.imap_unordered(partial(run, draw=given.draw), numbers):
             with given.results.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
     found = [row for row in read(given.results) if row["number"] < given.campaigns]
     if given.store:
-        store(found, given.campaigns)
-    print(json.dumps(figures([_with_mix(row) for row in found]), indent=1))
+        store(found, given.campaigns, given.draw)
+    if given.draw == SIXTEEN:
+        found = [dict(_with_mix(row)) for row in found]
+    print(json.dumps(figures(found), indent=1))
 
 
 if __name__ == "__main__":

@@ -35,6 +35,10 @@ example = bo.plots.structures(found.tree)
 # that the catalogue does not have, each at one to ten times the detection limit. In half of the
 # campaigns the measured input has noise of its own.
 #
+# Effects are drawn in two ways. One takes them from the whole catalogue, as often as the default
+# prior says. The other takes sixteen usual ones, which a simulator without any code of the package
+# computes.
+#
 # A statement about an effect is true if the effect acts. Effects whose changes of the outputs are
 # exactly equal count as one. Of effects that merely resemble each other only the one that acts is
 # true, so a probability that is shared between them is right if each gets its part.
@@ -49,10 +53,9 @@ if study.live:
 # intervals and the number of statements. Points below the line promise too much, points above it
 # too little.
 #
-# The default prior gives some sixty effects their share, of which the study draws sixteen. A part
-# of what effects keep back therefore goes to relatives that are never the cause here, such as
-# LuGre's model beside Dahl's. With the study's own prior in the place of the default one most
-# statements are sure, and as many of them are true as they say: these are the lines "by the
-# study's prior".
+# Of laws that are nearly one, such as Dahl's friction and LuGre's, the sixteen effects have one
+# only. The other keeps its share of the probability but is never the cause, so that statements
+# about the one promise too little. Under a prior of the sixteen effects alone most statements are
+# sure, and as many of them are true as they say.
 
 figure = study.run(lambda: figures.reliability_figure())

@@ -4,8 +4,8 @@ structures are right.
 Run with ``python tests/benchmarks/structures.py --json`` for one flat object, or without ``--json``
 for a table; the keys are explained in the files that measure them, :mod:`structures_coverage`,
 :mod:`structures_nuisance` and :mod:`structures_round`. Those of probabilities come from the stored
-table of ``studies/structure_probabilities.py``, with its command, seed and version. ``--count`` is
-the number of campaigns of each question, ``--only`` names keys.
+tables of ``studies/structure_probabilities.py``, with their commands, seeds and versions.
+``--count`` is the number of campaigns of each question, ``--only`` names keys.
 """
 
 from __future__ import annotations
@@ -69,20 +69,21 @@ PROBABILITIES = ("calibration_error", "brier_ratio", "sure_and_wrong", "outside_
 
 
 def probabilities(_: int) -> dict[str, float | str]:
-    """Reliability of probabilities of structures, from the stored table; empty without one."""
-    table = structure_figures.stored()
-    if table is None:
-        return {}
-    found = structure_figures.figures(table["rows"])
-    kept: dict[str, float | str] = {
-        key: value
-        for key, value in found.items()
-        if key in PROBABILITIES or key.startswith("statements_") or key.endswith("_by_mix")
-    }
-    return kept | {
-        f"structure_{key}": table[key]
-        for key in ("campaigns", "failed", "command", "seed", "version")
-    }
+    """Reliability of probabilities of structures, from the stored tables: of effects drawn from
+    the whole catalogue, and as ``..._sixteen`` of sixteen usual ones."""
+    kept: dict[str, float | str] = {}
+    for draw, end in ((structure_figures.CATALOGUE, ""), (structure_figures.SIXTEEN, "_sixteen")):
+        table = structure_figures.stored(draw)
+        if table is None:
+            continue
+        for key, value in structure_figures.figures(table["rows"]).items():
+            if key.endswith("_by_mix"):
+                kept[key] = value
+            elif key in PROBABILITIES or key.startswith(("statements_", "said_", "true_")):
+                kept[key + end] = value
+        for key in ("campaigns", "failed", "command", "seed", "version"):
+            kept[f"structure_{key}{end}"] = table[key]
+    return kept
 
 
 #: What is measured, by the keys that it gives.
