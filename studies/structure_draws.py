@@ -3,8 +3,9 @@
 The declared system, its motion and its noise come from the benchmarks' own simulator. What an
 effect changes is computed by the package, at the true parameters and with the true inputs, and
 added to what is measured. So every effect can be drawn, near copies of each other too, as often as
-the prior says: if marginal likelihoods are right, what is said of such campaigns is true as often
-as it says. Effects whose model takes a measured output for an input are not drawn.
+the prior says. Its sizes, and how many campaigns lack nothing, one effect, two, or something
+outside, are those of the study and not of the prior. Effects whose model takes a measured output
+for an input are not drawn.
 """
 
 from __future__ import annotations

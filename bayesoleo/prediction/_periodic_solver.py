@@ -12,6 +12,7 @@ later solutions start, and the basis of scores and of the response to input nois
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, cast
@@ -19,7 +20,7 @@ from typing import Any, cast
 import numpy as np
 
 from bayesoleo._types import Array, Integers
-from bayesoleo.errors import InputError, choose
+from bayesoleo.errors import InputError, ModelError, choose
 from bayesoleo.model._derivatives import analytic_pieces
 from bayesoleo.model._kernels import Kernels, kernels
 from bayesoleo.model._model import Model
@@ -220,8 +221,10 @@ class PeriodicSolver:
         found = solve(self.compiled_problem, p, start, **options)
         if found.orbit.status is Status.SINGULAR:
             # As equations of what lags behind a motion are at rest, wherever their answer is.
-            shot, _ = self._shot(p, self._state_of(start), by_parameter=False, judge=False)
-            if shot.status is Status.CONVERGED:
+            shot: Shot | None = None
+            with suppress(ModelError):  # where it cannot be integrated
+                shot, _ = self._shot(p, self._state_of(start), by_parameter=False, judge=False)
+            if shot is not None and shot.status is Status.CONVERGED:
                 found = solve(self.compiled_problem, p, shot.sample, **options)
         return PeriodicMotion(found.orbit, found.motion, found.motion_by_parameter, found)
 

@@ -134,7 +134,7 @@ def test_the_figure_has_a_panel_for_each_way_of_drawing():
     assert len(structure_figures.reliability_figure().axes) == len(structure_figures.TABLES)
 
 
-#: One detection limit in the amplitudes of the independent simulator.
+#: Amplitude of an effect, in units of the independent simulator.
 SMALL = 0.02
 
 

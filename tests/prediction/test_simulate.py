@@ -249,3 +249,19 @@ def test_a_free_mass_has_no_motion_that_can_be_found(solver, mean):
     plan = RunPlan("a", 5.0, {"force": motion(mean, [20.0])})
     with pytest.raises(InputError, match="no periodic answer to this motion was found"):
         simulate_run(free, plan, steps=128, solver=solver)
+
+
+@pytest.mark.parametrize("solver", ["collocation", "adaptive"])
+def test_what_cannot_be_shot_is_singular_still(solver):
+    """An output that needs a derivative beyond the equation's cannot be integrated."""
+    adrift = Model(
+        "adrift",
+        inputs={"force": "N"},
+        dofs={"q": Dof("m")},
+        parameters={"c": Parameter(1.2, "N*s/m", sd=0.1)},
+        equations={"q": "c*dot(q) + c*abs(dot(q))/9 - force"},
+        outputs={"acceleration": Output("ddot(q)", "m/s**2")},
+    )
+    plan = RunPlan("a", 5.0, {"force": motion(0.0, [20.0])})
+    with pytest.raises(InputError, match="no periodic answer to this motion was found"):
+        simulate_run(adrift, plan, steps=128, solver=solver)
