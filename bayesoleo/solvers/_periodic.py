@@ -396,10 +396,48 @@ def sensitivities(problem: Boundary, p: Array, solution: Solution) -> tuple[Solu
     problem.scheme.rows(solution.x, lanes, problem.step(n), z)
     problem.equations.jacobian(z, problem.inputs, p, lanes, g, gz)
     problem.equations.parameters(z, problem.inputs, p, lanes, gp)
-    x_theta, monodromy, ok = problem.scheme.linear(gz, gp, None, lanes, problem.step(n))
+    x_theta, monodromy, ok = linear_by_column(problem.scheme, gz, gp, lanes, problem.step(n))
     status = solution.status.copy()
     status[lanes[~ok[lanes]]] = Status.SINGULAR.value
     return replace(solution, status=status), x_theta, monodromy
+
+
+def linear_by_column(
+    scheme: Scheme, gz: Array, right: Array, lanes: Integers, step: float, *, initial: bool = False
+) -> tuple[Array, Array, Flags]:
+    """Solve ``G dx = -right`` where many columns may be zero.
+
+    Most parameters of a force law act on its outputs alone, and move no state: only columns with a
+    right-hand side are solved for.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    gz : ndarray, shape (L, d, nz, N)
+        Partial derivatives of the equations at the points.
+    right : ndarray, shape (L, d, k, N)
+        A column for each parameter.
+    lanes : ndarray of int
+        Which of the L to solve.
+    step : float
+        Mean length of a step, s.
+    initial : bool
+        Hold the first state instead of closing the period.
+
+    Returns
+    -------
+    dx, monodromy, ok : ndarray
+        As of :meth:`Scheme.linear`.
+    """
+    moves = right.any(axis=(0, 1, 3))
+    moves[:1] |= not moves.any()  # the monodromy and the status are asked for in any case
+    if moves.all():
+        return scheme.linear(gz, right, None, lanes, step, initial=initial)
+    few = np.ascontiguousarray(right[:, :, moves])
+    found, monodromy, ok = scheme.linear(gz, few, None, lanes, step, initial=initial)
+    dx = np.zeros((*found.shape[:3], right.shape[2]))
+    dx[..., moves] = found
+    return dx, monodromy, ok
 
 
 def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:

@@ -28,7 +28,14 @@ from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._initial_value import Dynamics, solve_initial_value
 from bayesoleo.solvers._mesh import Mesh, graded
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic import LAST_STEP, SMALL_STEP, Boundary, Solution, Trial
+from bayesoleo.solvers._periodic import (
+    LAST_STEP,
+    SMALL_STEP,
+    Boundary,
+    Solution,
+    Trial,
+    linear_by_column,
+)
 from bayesoleo.solvers._radau_step import (
     ROUND_OFF,
     Method,
@@ -463,14 +470,19 @@ def moved_from_start(
     ok : ndarray of bool, shape (L,)
     """
     # A motion that carries the initial derivative on without a force is known; what is left to
-    # solve for starts at zero.
-    base = _free_motion(problem, n, start_p)
-    rows = _free_rows(problem, n, start_p)
-    for k in range(gz.shape[2]):
-        right += gz[:, :, k, None, :] * rows[:, None, k]
+    # solve for starts at zero. Few columns move the start.
+    begins = start_p.any(axis=(0, 1))
+    own = start_p[:, :, begins]
+    if own.size:
+        rows, part = _free_rows(problem, n, own), right[:, :, begins]
+        for k in range(gz.shape[2]):
+            part += gz[:, :, k, None, :] * rows[:, None, k]
+        right[:, :, begins] = part
     step = problem.step(n)
-    x, transition, ok = problem.scheme.linear(gz, right, None, lanes, step, initial=True)
-    return x + base, transition, ok
+    x, transition, ok = linear_by_column(problem.scheme, gz, right, lanes, step, initial=True)
+    if own.size:
+        x[..., begins] += _free_motion(problem, n, own)
+    return x, transition, ok
 
 
 def _free_motion(problem: Boundary, n: int, start_p: Array) -> Array:

@@ -6,7 +6,7 @@ import pytest
 from periodic_problems import coupled, duffing, friction_oscillator, harmonics, problem, rest
 
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic import sensitivities, solve_periodic
+from bayesoleo.solvers._periodic import linear_by_column, sensitivities, solve_periodic
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 FREQUENCY = 0.2
@@ -78,3 +78,26 @@ def test_failed_solutions_have_no_sensitivities():
     judged, x_p, _ = sensitivities(boundary, p, solution)
     assert judged.status[0] == Status.NO_CONVERGENCE
     assert not x_p.any()
+
+
+@pytest.mark.parametrize("name", ["radau3", "thesis", "central"])
+@pytest.mark.parametrize("moved", [(), (1,), (0, 2)])
+def test_columns_that_move_nothing_are_left_out_and_change_no_other(name, moved):
+    """A parameter that acts on the outputs alone moves no state; with none at all the monodromy is
+    still there."""
+    n, model = 24, duffing()
+    boundary, p = problem(model, FORCE, FREQUENCY, name, n)
+    solution = solve_periodic(boundary, p, rest(boundary, n))
+    lanes, d, points = np.array([0]), len(boundary.scheme.orders), boundary.inputs.shape[1]
+    nz = boundary.scheme.state_size + d
+    z, g = np.zeros((1, nz, points)), np.zeros((1, d, points))
+    gz, right = np.zeros((1, d, nz, points)), np.zeros((1, d, 3, points))
+    boundary.scheme.rows(solution.x, lanes, boundary.step(n), z)
+    boundary.equations.jacobian(z, boundary.inputs, p, lanes, g, gz)
+    for k in moved:
+        right[:, :, k] = np.cos(k + np.arange(points))
+    expected = boundary.scheme.linear(gz, right, None, lanes, boundary.step(n))
+    found = linear_by_column(boundary.scheme, gz, right, lanes, boundary.step(n))
+    assert found[0].any(axis=(0, 1, 2)).tolist() == [k in moved for k in range(3)]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)  # the same arithmetic, column by column
