@@ -266,11 +266,7 @@ class _Course:
 
     def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
         """As a signal's; derivatives by differences."""
-        if derivative:
-            later = self.evaluate(phase + NEARBY, frequency, derivative - 1)
-            before = self.evaluate(phase - NEARBY, frequency, derivative - 1)
-            return (later - before) * frequency / (2 * NEARBY)
-        rows = self.courses(phase)
+        rows = self.courses.derivative(phase, frequency, derivative)
         return rows[self.k] if self.k < len(rows) else np.zeros(phase.size)
 
     def for_derivative(self, highest: int) -> _Course:
@@ -283,12 +279,28 @@ class _Remembered:
 
     def __init__(self, courses: Courses):
         self._courses, self._known = courses, dict[bytes, Array]()
+        self._last = dict[int, tuple[Array, Array]]()
 
     def __call__(self, phase: Array) -> Array:
         key = phase.tobytes()
         if key not in self._known:
             self._known[key] = self._courses(phase)
         return self._known[key]
+
+    def derivative(self, phase: Array, frequency: float, order: int) -> Array:
+        """A time derivative of all courses, by differences; of the last phases it is known."""
+        last = self._last.get(order)
+        if last is None or last[0] is not phase:
+            last = phase, self._differences(phase, frequency, order)
+            self._last[order] = last
+        return last[1]
+
+    def _differences(self, phase: Array, frequency: float, order: int) -> Array:
+        if order == 0:
+            return self(phase)
+        later = self._differences(phase + NEARBY, frequency, order - 1)
+        before = self._differences(phase - NEARBY, frequency, order - 1)
+        return (later - before) * frequency / (2 * NEARBY)
 
 
 class Forced:

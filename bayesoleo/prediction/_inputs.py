@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from bayesoleo.solvers._switching import InputSignal, periodic_signal
 #: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
 #: of the same run share them.
 RowCache = dict[tuple[str, str, int, int], Array]
+#: Curves that are cut off where another channel is, by the whole curve and the frequency, with the
+#: samples they are of. Every model that takes a channel so asks for the same.
+_CUT: WeakKeyDictionary[Smoothed, dict[float, tuple[Array, Smoothed]]] = WeakKeyDictionary()
 
 
 def harmonics_of(record: Record, channel: str) -> Harmonics:
@@ -118,8 +122,12 @@ def _in_band_of(record: Record, channel: str, other: str, highest: int) -> Signa
         return own
     if not np.isfinite(like.band.cut):
         return own
-    step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    return declared(record.samples[channel], step, like.band.cut)
+    values, cut = record.samples[channel], like.band.cut
+    kept = _CUT.setdefault(own, {}).get(cut)
+    if kept is None or kept[0] is not values:
+        step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
+        kept = _CUT[own][cut] = values, declared(values, step, cut)
+    return kept[1]
 
 
 def _turning(item: Harmonics, part: str) -> Harmonics | None:

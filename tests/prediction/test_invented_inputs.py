@@ -1,11 +1,14 @@
 """Inputs that a model turns into what was not measured are cut off; others are left alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.prediction._input_bandwidth import without_invented
+from bayesoleo.prediction._inputs import signal_of
 from bayesoleo.prediction._records import transient_record
 
 STEP = 1e-3
@@ -88,3 +91,17 @@ def test_a_system_that_does_not_follow_keeps_its_input():
     system = signal.TransferFunction([-1, 0, 0], [1, 20, 1e3])
     z = signal.lsim(system, x, TIME)[1]
     assert without_invented(oscillator(), [record(x, z_measured=z)])[1] == ()
+
+
+def test_a_channel_in_the_band_of_another_is_cut_off_once():
+    """Many candidates feed the force back; other samples of that name are another curve."""
+    x, bend = motion((1.0, 0.1))
+    _, hum = motion((80.0, 1e-4))
+    made = record(x, force=MASS * (bend + hum))
+    within = "force_within_x"
+    first = signal_of(made, within, 2)
+    assert first.band.cut < 60.0 < made.signals["force"].for_derivative(2).band.cut
+    assert signal_of(made, within, 2) is first
+    twice = replace(made, samples={**made.samples, "force": 2.0 * made.samples["force"]})
+    other, place = signal_of(twice, within, 2), np.array([0.4])
+    assert other.evaluate(place, made.rate) == pytest.approx(2 * first.evaluate(place, made.rate))
