@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 _limit: int | None = None
 
+#: What keeps libraries of linear algebra to one thread where they are loaded.
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
+
 
 def limit_threads(count: int | None) -> None:
     """Limit the number of threads of this process; None removes the limit.
@@ -64,7 +67,8 @@ def _libraries() -> ThreadpoolController:
 def single_blas_thread() -> AbstractContextManager[object]:
     """Keep linear algebra to the calling thread.
 
-    Small problems gain nothing from more, and on a busy machine wait for them.
+    Small problems gain nothing from more, and on a busy machine wait for them: up to thirty times
+    as long as one thread takes alone.
     """
     limit: AbstractContextManager[object] = _libraries().limit(limits=1, user_api="blas")
     return limit
@@ -350,8 +354,6 @@ def _call(token: str, payload: bytes, item: Any) -> Any:
 
 #: Seconds between two looks at a process, and how often it is seen whether it is to stop.
 LOOK = 0.1
-#: What keeps libraries of linear algebra to one thread where they are loaded.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
 _CALL, _VALUE, _PATHS, _SAID = "call.pickle", "value.pickle", "paths.json", "said.txt"
 #: It finds modules where its parent finds them. Unlike ``multiprocessing`` it does not run the
 #: script of the user again, which then needs no guard.
@@ -423,7 +425,7 @@ def in_own_process[R](
 
 def _await_process(folder: Path, stopped: Callable[[], bool]) -> None:
     """Run the call that a folder holds to its end."""
-    environment = os.environ | dict.fromkeys(_ONE_THREAD, "1")
+    environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
     command = [sys.executable, "-c", _CHILD, str(folder)]
     with (
         (folder / _SAID).open("wb") as said,

@@ -10,6 +10,11 @@ from typing import Any
 
 import pytest
 
+# Workers of pytest-xdist fill the cores. With threads of linear algebra besides, which wait for one
+# another in a loop, some tests take ten times as long. NumPy is not loaded yet.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 #: Modules that take turns over the compiled solvers, the integrator of shooting and the collocation
 #: of periodic motions. One worker runs them all, and first: a minute of compilation is done once,
 #: where workers that begin with an empty cache would each do it at the same time.

@@ -5,12 +5,14 @@ Commands import what they need when they run, so that ``--help`` comes at once.
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
 
 from bayesoleo._cli import assessing, closing, listing, records, steps
 from bayesoleo._cli.shell import Commands, flowing
+from bayesoleo._parallel import ONE_THREAD
 
 __all__ = ["app", "main"]
 
@@ -77,5 +79,11 @@ for _add in (
 
 
 def main() -> None:
-    """Entry point of the ``bayesoleo`` command."""
+    """Entry point of the ``bayesoleo`` command.
+
+    The work has threads of its own; those of linear algebra, unless the user asks for some, would
+    only crowd them. They are chosen where the library is loaded, which is later.
+    """
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     app()

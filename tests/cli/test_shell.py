@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -109,3 +110,24 @@ def test_probing_a_folder_leaves_nothing(tmp_path):
 def test_paragraphs_flow_but_for_marked_ones():
     text = "Head.\n\n    One\n    two.\n\n    \b\n    a\n      b\n    "
     assert shell.flowing(text) == "Head.\n\nOne two.\n\n\b\na\n  b"
+
+
+@pytest.mark.parametrize(("asked", "threads"), [(None, 1), ("2", 2)])
+def test_linear_algebra_has_one_thread_unless_asked_for_more(asked, threads, tmp_path):
+    """A command loads it after that."""
+    code = (
+        "import contextlib, json, sys; from bayesoleo._cli import main;"
+        " sys.argv = ['bayesoleo', '--version']\n"
+        "with contextlib.suppress(SystemExit): main()\n"
+        "import numpy, threadpoolctl; found = threadpoolctl.threadpool_info()\n"
+        "print(json.dumps([item['num_threads'] for item in found if item['user_api'] == 'blas']))"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    environment |= {} if asked is None else {"OPENBLAS_NUM_THREADS": asked}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    found = done.stdout.splitlines()[-1]
+    if found == "[]":
+        pytest.skip("no library of linear algebra that is known")
+    assert set(json.loads(found)) == {min(threads, os.cpu_count() or 1)}

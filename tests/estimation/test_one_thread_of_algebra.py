@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from bayesoleo._session.display import kept
 from bayesoleo.estimation import FunctionProblem, estimate
 from bayesoleo.model._priors import Normal
 
@@ -40,3 +41,18 @@ def test_an_estimate_decomposes_in_the_calling_thread(seen):
         assert estimate(problem, "be").status.ok
     assert seen
     assert set(seen) == {1}
+
+
+def test_what_a_session_computes_has_one_thread_and_gives_the_others_back():
+    def threads():
+        return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
+
+    class Session:
+        @kept
+        def work(self):
+            return threads()
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        assert Session().work() == {1}
+        assert threads() == before
