@@ -341,13 +341,12 @@ class Arranged:
         count = -(-int(layout.lengths[0]) * WIDTH // steps)
         blocks = np.zeros((count, max(nu, 1), BLOCK))
         of_steps = np.ones((count, BLOCK))
-        for b in range(count):
-            begin = program.front * WIDTH + b * steps
-            chosen = layout.source[begin : begin + steps]
-            of_steps[b, :steps] = lengths[chosen]
-            for stage in range(s):
-                part = slice(stage * steps, (stage + 1) * steps)
-                blocks[b, :nu, part] = inputs[:, chosen * s + stage]
+        begin = program.front * WIDTH
+        chosen = layout.source[begin : begin + count * steps].reshape(count, steps)
+        of_steps[:, :steps] = lengths[chosen]
+        for stage in range(s):
+            part = slice(stage * steps, (stage + 1) * steps)
+            blocks[:, :nu, part] = np.moveaxis(inputs[:, chosen * s + stage], 0, 1)
         return Arranged(program, layout, blocks, of_steps)
 
     @cached_property

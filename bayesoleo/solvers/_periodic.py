@@ -226,6 +226,32 @@ def solve_extrapolated(
     )
 
 
+def solve_from_state(problem: Boundary, p: Array, start: Array, most: int) -> Solution | None:
+    """Solve an initial value problem on all steps at once, in one compiled call.
+
+    Parameters
+    ----------
+    problem : Boundary
+        Its period is the duration.
+    p : ndarray, shape (L, np)
+        Constants of each lane.
+    start : ndarray, shape (L, n, w)
+        Where each lane starts; the state of its first step stays.
+    most : int
+        Newton iterations, halved only where they cannot be evaluated: a step in the wrong
+        direction at late times is soon put right by the early ones.
+
+    Returns
+    -------
+    Solution or None
+        None where there is no compiled code; a lane that did not converge has no solution, and
+        may have one by other means.
+    """
+    if problem.arranged is None:
+        return None
+    return _compiled(problem, problem.arranged, p, start.copy(), most, False, initial=True)
+
+
 def _with_exchange(
     problem: Boundary,
     p: Array,
@@ -251,8 +277,10 @@ def _compiled(
     max_iterations: int,
     monotone: bool,
     line: arrangement.LinearStart = arrangement.NO_LINE,
+    initial: bool = False,
 ) -> Solution:
-    """The same iteration, lane by lane, in one compiled call, in place."""
+    """The same iteration, lane by lane, in one compiled call, in place; ``initial`` holds the first
+    state instead of closing the period."""
     equations, program = problem.equations, arranged.program
     status = np.empty(x.shape[0], dtype=np.int64)
     iterations = np.zeros(x.shape[0], dtype=np.int64)
@@ -265,7 +293,7 @@ def _compiled(
     sweep = arranged.sweep
     newton.solve_lanes(
         pieces, sizes, sweep, arrangement.work_space(sizes, sweep),
-        arrangement.Options(max_iterations, monotone, False), p, x, line, status, iterations,
+        arrangement.Options(max_iterations, monotone, initial), p, x, line, status, iterations,
     )  # fmt: skip
     return Solution(x, status, iterations)
 

@@ -35,6 +35,7 @@ from bayesoleo.solvers._periodic import (
     Solution,
     Trial,
     linear_by_column,
+    solve_from_state,
 )
 from bayesoleo.solvers._radau_step import (
     ROUND_OFF,
@@ -59,6 +60,8 @@ FEWEST_STEPS, MOST_STEPS = 64, 65_536
 #: Newton iterations on the whole time at once, before it is solved step by step: compiled code
 #: takes as long for four of them as for all steps, arrays much longer for the steps.
 MAXIMUM_ITERATIONS, ITERATIONS_OF_ARRAYS = 6, 12
+#: The same of straight-line code, a tenth as long each.
+ITERATIONS_OF_SWEEPS = 12
 MAXIMUM_HALVINGS = 8
 #: Newton iterations on one step.
 STEP_ITERATIONS = 16
@@ -144,9 +147,11 @@ def solve_transient(problem: Boundary, p: Array, start: Array) -> Solution:
     -------
     Solution
     """
-    compiled = isinstance(problem.equations.jacobian, BlockKernel)
-    most = MAXIMUM_ITERATIONS if compiled else ITERATIONS_OF_ARRAYS
-    solution = newton(problem, p, start, most)
+    solution = solve_from_state(problem, p, start, ITERATIONS_OF_SWEEPS)
+    if solution is None:
+        compiled = isinstance(problem.equations.jacobian, BlockKernel)
+        most = MAXIMUM_ITERATIONS if compiled else ITERATIONS_OF_ARRAYS
+        solution = newton(problem, p, start, most)
     failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
     if failed.size == 0:
         return solution

@@ -81,6 +81,16 @@ SOLVERS: Rows = {
          "falls = np.sqrt(new) > max(np.sqrt(old), ROUND_OFF)",
          "solvers/test_compiled_sweep.py::test_a_residual_falls_in_the_larger_of_its_terms"),
     ],
+    "solvers/_periodic.py": [
+        ("a transient begins where a period would close",
+         "start.copy(), most, False, initial=True)",
+         "start.copy(), most, False, initial=False)",
+         "solvers/test_swept_transients.py"),
+        ("columns that move something are left out as well",
+         "dx[..., moves] = found",
+         "dx[..., moves] = 0.0 * found",
+         "solvers/test_sensitivities.py::test_columns_that_move_nothing_are_left_out_and_change_no_other"),
+    ],
     "solvers/_transient.py": [
         ("a transient ends at any step ten times shorter than the last",
          "small = (size < LAST_STEP) & (size < 0.1 * last) | (size < SMALL_STEP)",
