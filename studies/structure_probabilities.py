@@ -56,7 +56,8 @@ CLASSES = ("nothing", "one", "one", "two", "outside", "one", "nothing", "outside
 COUNTS = {"one": 1, "two": 2}
 #: Sizes in detection limits.
 LEAST, MOST = 1.0, 10.0
-#: Times of the largest size beyond which a campaign is left out.
+#: How many times larger than the largest size, or smaller than the least, an effect may come out
+#: that is not linear in its amplitude. Beyond, the campaign is left out.
 BEYOND = 3.0
 #: Two runs are fitted, or three; none is held out.
 PLAN = Plan(fitted=2, held_out=0, periods=5, per_period=64.3)
@@ -193,7 +194,7 @@ def run(number: int, draw: str = CATALOGUE) -> dict[str, Any]:
     except (BayesoleoError, RuntimeError, np.linalg.LinAlgError) as error:
         return row | {"failed": str(error).splitlines()[0]}
     made, sizes = lacks.made, lacks.sizes
-    if np.any(sizes > BEYOND * MOST):
+    if np.any(sizes > BEYOND * MOST) or np.any(sizes < LEAST / BEYOND):
         return row | {"failed": "the effect is not nearly linear in its amplitude"}
     begin = time.process_time()
     task = prepare(made.campaign, made.model, Settings(jobs=1))

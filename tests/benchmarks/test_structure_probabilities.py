@@ -113,6 +113,18 @@ def test_figures_of_a_few_statements():
     assert found["brier_winner"] == 0.0
 
 
+@pytest.mark.parametrize(("size", "left_out"), [(0.1, True), (31.0, True), (0.5, False)])
+def test_an_effect_that_did_not_come_to_its_size_is_left_out(size, left_out, monkeypatch):
+    """It is not linear in its amplitude, so that what was asked for says little of what came."""
+    made = structure_probabilities.Campaign(None, [], np.array([size]))
+    monkeypatch.setattr(structure_probabilities, "campaign", lambda number, draw: made)
+    if left_out:
+        assert "amplitude" in structure_probabilities.run(4)["failed"]
+    else:
+        with pytest.raises(AttributeError, match="campaign"):  # it goes on, and there is none
+            structure_probabilities.run(4)
+
+
 @pytest.mark.parametrize("draw", list(structure_figures.TABLES))
 def test_stored_table_says_how_it_was_made(draw):
     table = structure_figures.stored(draw)
@@ -127,7 +139,8 @@ def test_the_readme_says_what_the_stored_tables_hold():
     for row in structure_figures.readme_rows():
         assert row in readme
     for draw in structure_figures.TABLES:
-        assert str(structure_figures.stored(draw)["campaigns"]) in readme
+        campaigns = structure_figures.stored(draw)["campaigns"]
+        assert f"{campaigns:,} ".replace(",", " ") in readme
 
 
 def test_the_figure_has_a_panel_for_each_way_of_drawing():
