@@ -21,7 +21,7 @@ import uuid
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed, wait
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _limit: int | None = None
+_COUNTING = threading.Lock()
+#: The limit of linear algebra, once for each that is inside of :func:`single_blas_thread`.
+_inside: list[Any] = []
 
 #: What keeps libraries of linear algebra to one thread where they are loaded.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
@@ -64,14 +67,32 @@ def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def single_blas_thread() -> AbstractContextManager[object]:
+@contextmanager
+def single_blas_thread() -> Iterator[None]:
     """Keep linear algebra to the calling thread.
 
-    Small problems gain nothing from more, and on a busy machine wait for them: up to thirty times
-    as long as one thread takes alone.
+    Small problems gain nothing from more, and on a busy machine wait for them: filters of inputs
+    took twenty times as long. The limit is the whole process's; the first of several threads that
+    are inside sets it, and the last one gives back what there was.
     """
-    limit: AbstractContextManager[object] = _libraries().limit(limits=1, user_api="blas")
-    return limit
+    with _COUNTING:
+        if not _inside:
+            _inside.append(_libraries().limit(limits=1, user_api="blas"))
+        else:
+            _inside.append(_inside[0])
+    try:
+        yield
+    finally:
+        with _COUNTING:
+            limit = _inside.pop()
+            if not _inside:
+                limit.restore_original_limits()
+
+
+def session_blas_threads() -> AbstractContextManager[None]:
+    """One thread of linear algebra, unless the environment says how many there are to be."""
+    asked = any(name in os.environ for name in ONE_THREAD)
+    return nullcontext() if asked else single_blas_thread()
 
 
 def thread_map[T, R](

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 # Workers of pytest-xdist fill the cores. With threads of linear algebra besides, which wait for one
-# another in a loop, some tests take ten times as long. NumPy is not loaded yet.
+# another in a loop, some tests take ten times as long. The environment is for workers and commands,
+# the limit for this process, where a plugin has loaded NumPy before.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+threadpool_limits(1, user_api="blas")
 
 #: Modules that take turns over the compiled solvers, the integrator of shooting and the collocation
 #: of periodic motions. One worker runs them all, and first: a minute of compilation is done once,

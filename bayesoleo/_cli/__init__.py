@@ -81,9 +81,9 @@ for _add in (
 def main() -> None:
     """Entry point of the ``bayesoleo`` command.
 
-    The work has threads of its own; those of linear algebra, unless the user asks for some, would
-    only crowd them. They are chosen where the library is loaded, which is later.
+    The work has threads of its own. Linear algebra gets one, unless the environment says
+    otherwise; how many is read where the library is loaded, which is later.
     """
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
+    if not any(name in os.environ for name in ONE_THREAD):
+        os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     app()

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema, plots
-from bayesoleo._parallel import single_blas_thread
+from bayesoleo._parallel import session_blas_threads
 from bayesoleo._report import structures
 from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._storage.resume import digest
@@ -381,7 +381,7 @@ def kept[**Arguments, Value](method: Callable[Arguments, Value]) -> Callable[Arg
         store: dict[str, Any] = self.__dict__.setdefault("_kept", {})
         key = f"{method.__name__} {digest(named)}"
         if key not in store:
-            with single_blas_thread():
+            with session_blas_threads():
                 store[key] = method(*args, **kwargs)
         found: Value = store[key]
         return found

@@ -266,8 +266,10 @@ class _Course:
 
     def evaluate(self, phase: Array, frequency: float, derivative: int = 0) -> Array:
         """As a signal's; derivatives by differences."""
-        rows = self.courses.derivative(phase, frequency, derivative)
-        return rows[self.k] if self.k < len(rows) else np.zeros(phase.size)
+        rows = self.courses.derivative(phase, derivative)
+        if self.k >= len(rows):
+            return np.zeros(phase.size)
+        return np.asarray(rows[self.k] * frequency**derivative)
 
     def for_derivative(self, highest: int) -> _Course:
         """The same: it is computed, not measured."""
@@ -287,20 +289,20 @@ class _Remembered:
             self._known[key] = self._courses(phase)
         return self._known[key]
 
-    def derivative(self, phase: Array, frequency: float, order: int) -> Array:
-        """A time derivative of all courses, by differences; of the last phases it is known."""
+    def derivative(self, phase: Array, order: int) -> Array:
+        """Derivative of all courses by the phase, from differences. The result for the last array
+        of phases is kept: every course is asked for with the same one."""
         last = self._last.get(order)
         if last is None or last[0] is not phase:
-            last = phase, self._differences(phase, frequency, order)
-            self._last[order] = last
+            last = self._last[order] = phase, self._differences(phase, order)
         return last[1]
 
-    def _differences(self, phase: Array, frequency: float, order: int) -> Array:
+    def _differences(self, phase: Array, order: int) -> Array:
         if order == 0:
             return self(phase)
-        later = self._differences(phase + NEARBY, frequency, order - 1)
-        before = self._differences(phase - NEARBY, frequency, order - 1)
-        return (later - before) * frequency / (2 * NEARBY)
+        later = self._differences(phase + NEARBY, order - 1)
+        before = self._differences(phase - NEARBY, order - 1)
+        return (later - before) / (2 * NEARBY)
 
 
 class Forced:

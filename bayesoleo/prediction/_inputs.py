@@ -23,7 +23,7 @@ from bayesoleo.solvers._switching import InputSignal, periodic_signal
 #: of the same run share them.
 RowCache = dict[tuple[str, str, int, int], Array]
 #: Curves that are cut off where another channel is, by the whole curve and the frequency, with the
-#: samples they are of. Every model that takes a channel so asks for the same.
+#: samples they are of. Candidates that feed the same channel back share the curve.
 _CUT: WeakKeyDictionary[Smoothed, dict[float, tuple[Array, Smoothed]]] = WeakKeyDictionary()
 
 

@@ -245,7 +245,8 @@ def solve_from_state(problem: Boundary, p: Array, start: Array, most: int) -> So
     -------
     Solution or None
         None where there is no compiled code; a lane that did not converge has no solution, and
-        may have one by other means.
+        may have one by other means. Its status may be -1, for an elimination that would have to
+        exchange rows.
     """
     if problem.arranged is None:
         return None

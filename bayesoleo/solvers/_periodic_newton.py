@@ -178,13 +178,13 @@ def _gather(now: Any, row: int, x: Any, unknowns: int, reach: int) -> None:
 
 @jit
 def _outside(a: Any, sizes: Sizes, count: int) -> int:
-    """How many points break a condition; one that is not a number shows in the equations."""
+    """How many points break a condition, which one does that is not a number."""
     outside = 0
     for k in range(sizes.conditions):
         for stage in range(sizes.stages):
             values = carray(after(a, k * BLOCK + stage * sizes.block), (count,))
             for i in range(count):
-                outside += values[i] <= 0.0
+                outside += not values[i] > 0.0
     return outside
 
 
@@ -346,8 +346,9 @@ def _iterate(
             continue
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
         last = size if fraction == 1.0 else np.inf
-        # A linear problem is solved by its first step.
-        if outcome == CONVERGED and merit < ROUND_OFF and iteration > 1:
+        # A linear problem is solved by its first step. In a motion that grows from a given state
+        # late terms are so large that errors of early ones do not show in this.
+        if outcome == CONVERGED and merit < ROUND_OFF and iteration > 1 and not options.initial:
             return CONVERGED, iteration
     return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
 

@@ -475,18 +475,18 @@ def moved_from_start(
     ok : ndarray of bool, shape (L,)
     """
     # A motion that carries the initial derivative on without a force is known; what is left to
-    # solve for starts at zero. Few columns move the start.
-    begins = start_p.any(axis=(0, 1))
-    own = start_p[:, :, begins]
-    if own.size:
-        rows, part = _free_rows(problem, n, own), right[:, :, begins]
+    # solve for starts at zero. Columns that do not move the start have no such motion.
+    moves_start = start_p.any(axis=(0, 1))
+    moved = start_p[:, :, moves_start]
+    if moved.size:
+        rows, part = _free_rows(problem, n, moved), right[:, :, moves_start]
         for k in range(gz.shape[2]):
             part += gz[:, :, k, None, :] * rows[:, None, k]
-        right[:, :, begins] = part
+        right[:, :, moves_start] = part
     step = problem.step(n)
     x, transition, ok = linear_by_column(problem.scheme, gz, right, lanes, step, initial=True)
-    if own.size:
-        x[..., begins] += _free_motion(problem, n, own)
+    if moved.size:
+        x[..., moves_start] += _free_motion(problem, n, moved)
     return x, transition, ok
 
 

@@ -37,6 +37,8 @@ def test_all_courses_are_computed_at_once():
     for item in items:
         item.evaluate(PHASE, 1 / PERIOD, 1)
     assert len(asked) == 2  # on either side
+    remembered = items[0].courses
+    assert remembered.derivative(PHASE, 1) is remembered.derivative(PHASE, 1)
     items[0].evaluate(PHASE.copy(), 1 / PERIOD, 1)
     assert len(asked) == 2  # phases are known by their values
     items[0].evaluate(PHASE + 0.01, 1 / PERIOD, 1)

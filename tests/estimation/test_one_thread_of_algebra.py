@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from bayesoleo._parallel import ONE_THREAD, single_blas_thread
 from bayesoleo._session.display import kept
 from bayesoleo.estimation import FunctionProblem, estimate
 from bayesoleo.model._priors import Normal
@@ -43,9 +44,16 @@ def test_an_estimate_decomposes_in_the_calling_thread(seen):
     assert set(seen) == {1}
 
 
-def test_what_a_session_computes_has_one_thread_and_gives_the_others_back():
-    def threads():
-        return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
+def threads():
+    return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_what_a_session_computes_has_one_thread_unless_asked_for_more(asked, monkeypatch):
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    if asked:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
 
     class Session:
         @kept
@@ -54,5 +62,17 @@ def test_what_a_session_computes_has_one_thread_and_gives_the_others_back():
 
     with threadpool_limits(2, user_api="blas"):
         before = threads()
-        assert Session().work() == {1}
+        assert Session().work() == (before if asked else {1})
+        assert threads() == before
+
+
+def test_the_last_of_several_threads_gives_the_others_back():
+    first, second = single_blas_thread(), single_blas_thread()
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert threads() == {1}
+        second.__exit__(None, None, None)
         assert threads() == before

@@ -18,6 +18,7 @@ RATES = {"a": Parameter(1.3, sd=0.1), "b": Parameter(0.4, sd=0.1)}
 MODELS = {
     "first order": ({"x": "1"}, {"x": "dot(x) + a*x + b*x**3 - u"}),
     "second order": ({"x": "1"}, {"x": "ddot(x) + b*dot(x) + a*sin(x) - u"}),
+    "leaving": ({"x": "1"}, {"x": "dot(x) - a*x + 3*b*x/(1 + x**2) - u"}),
     "a mass and a store": (
         {"x": "1", "z": "1"},
         {"x": "ddot(x) + b*dot(x) + a*x - z", "z": "dot(z) + 2*z - u*x - u"},
@@ -25,7 +26,7 @@ MODELS = {
 }
 
 
-def problem(name, steps, time=TIME, backend="numba"):
+def problem(name, steps, time=TIME, backend="numba", admissible=()):
     """A problem on unequal steps, its constants, and a start from rest."""
     dofs, equations = MODELS[name]
     model = Model(
@@ -35,12 +36,13 @@ def problem(name, steps, time=TIME, backend="numba"):
         parameters=RATES,
         equations=equations,
         outputs={"y": "x"},
+        admissible=list(admissible),
     )
     made = kernels(model, backend=backend)
     edges = np.linspace(0.0, 1.0, steps + 1) ** 1.5
     scheme = Collocation(tableau("radau3"), made.derived.orders, Mesh(edges))
     u = np.sin(2.0 * time * scheme.phases(steps))
-    boundary = Boundary(made, scheme, time, u[None], 0, len(made.derived.active))
+    boundary = Boundary(made, scheme, time, u[None], len(admissible), len(made.derived.active))
     nominal = {str(item): value for item, value in model.nominal().items()}
     p = np.array([[nominal[item] for item in made.derived.constants]])
     return boundary, p, np.zeros((1, steps, scheme.width))
@@ -87,3 +89,34 @@ def test_arrays_have_no_straight_line_code():
     boundary, p, start = problem("first order", 20, backend="numpy")
     assert solve_from_state(boundary, p, start, 12) is None
     assert solve_transient(boundary, p, start).status[0] == Status.CONVERGED.value
+
+
+@pytest.mark.parametrize("time", [5.0, 20.0, 40.0])
+def test_early_errors_of_what_grows_are_not_hidden_by_late_terms(time):
+    """They are carried to the end, in proportion."""
+    boundary, p, start = problem("leaving", 400, time=time)
+    start[:, :, 0] = 2.0
+    found, expected = solve_from_state(boundary, p, start, 12), newton(boundary, p, start)
+    assert found.status[0] == expected.status[0] == Status.CONVERGED.value
+    np.testing.assert_allclose(found.x[0, :, 0], expected.x[0, :, 0], rtol=1e-9)
+
+
+def test_a_condition_that_is_not_a_number_is_broken():
+    """The equations themselves go on beyond it."""
+    boundary, p, start = problem("second order", 100, admissible=["sqrt(x + 1/100) + 1"])
+    found = solve_from_state(boundary, p, start, 12)
+    assert found.status[0] == Status.INADMISSIBLE.value
+    assert solve_transient(boundary, p, start).status[0] == Status.INADMISSIBLE.value
+
+
+def test_a_lane_that_is_given_up_is_solved_step_by_step_and_alone():
+    boundary, p, start = problem("second order", 200)
+    wild = 1e3 * np.random.default_rng(1).standard_normal(start.shape)
+    wild[:, 0, :2] = 0.0
+    both = np.concatenate([start, wild, start])
+    swept = solve_from_state(boundary, np.repeat(p, 3, axis=0), both, 2)
+    assert swept.status[1] != Status.CONVERGED.value
+    solved = solve_transient(boundary, np.repeat(p, 3, axis=0), both)
+    assert (solved.status == Status.CONVERGED.value).all()
+    np.testing.assert_array_equal(solved.x[0], solved.x[2])
+    np.testing.assert_allclose(solved.x[1], solved.x[0], atol=1e-9)
