@@ -30,7 +30,7 @@ from bayesoleo.effects._catalogue import called
 from bayesoleo.plots._discovery import chosen
 from bayesoleo.plots._style import engineering, format_number
 
-__all__ = ["Study", "print_before_after"]
+__all__ = ["Study", "print_added", "print_before_after"]
 
 DPI = 100
 #: Of an effect with more parameters than these only their number is printed.
@@ -207,7 +207,19 @@ def print_before_after(summary: Mapping[str, Any], unit: str, per_si: float) -> 
                 f"{value:{len(text) + 3}.3g}" for value, text in zip(cells, head, strict=False)
             )
             print(f"{f'{output}, {role}':26}{row}{ratio:>24}")
-    print(f"\n{'posterior of what was added':34}{'mean':>10}{'sd':>10}   95 % interval")
+    print()
+    print_added(summary)
+
+
+def print_added(summary: Mapping[str, Any]) -> None:
+    """Print the posterior of the effects that were added.
+
+    Parameters
+    ----------
+    summary : mapping
+        As in ``summary.json``.
+    """
+    print(f"{'posterior of what was added':34}{'mean':>10}{'sd':>10}   95 % interval")
     for effect, names in added_parameters(summary):
         print(effect)
         if len(names) > MOST_NAMES:  # such as the values of a spline
@@ -223,10 +235,18 @@ def title_of(summary: Mapping[str, Any], effect: str | None) -> str:
 
 
 def added_parameters(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
-    """Every effect that was added and stayed, with its parameters that were estimated."""
-    for entry in summary["rounds"]:
-        added = chosen(entry)
-        if added is None or added["effect"] not in summary["effects"]:
+    """Every effect that was added and stayed, with its parameters that were estimated.
+
+    One that was replaced and added again is told once, as it was added last.
+    """
+    stayed = set(zip(summary["effects"], summary["targets"], strict=True))
+    found = {
+        (added["effect"], added["target"]): added
+        for entry in summary["rounds"]
+        if (added := chosen(entry)) is not None
+    }
+    for key, added in found.items():
+        if key not in stayed:
             continue
         names = [name for name in added["expected"] if name in summary["parameters"]]
         yield title_of(summary, f"{added['effect']} @ {added['target']}"), names

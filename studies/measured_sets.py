@@ -15,7 +15,9 @@ explained in ``tests/benchmarks/measured.py``.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
+import io
 import json
 import os
 import resource
@@ -25,6 +27,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -32,6 +35,7 @@ import xarray as xr
 import bayesoleo as bo
 from bayesoleo._workflow.simulating import model_of
 from bayesoleo.effects import Scales, find_effect
+from bayesoleo.gallery import print_added
 from bayesoleo.model import Model
 from bayesoleo.prediction._predictor import Predictor
 
@@ -191,11 +195,22 @@ def measure(name: str, out: Path = OUT, jobs: int = 2) -> Figures:
         **found,
         f"{short}_first_effect": rounds[0]["accepted"] or "",
         f"{short}_effects": ", ".join(summary["effects"]),
+        f"{short}_found": found_in(summary),
         f"{short}_certainty": summary["certainty"] or "",
         f"{short}_seconds": seconds,
         f"{short}_cpu_seconds": cpu,
         f"{short}_memory_GB": peak,
     }
+
+
+def found_in(summary: Mapping[str, Any]) -> str:
+    """The effects that were added, with 95 % intervals of their parameters; empty for none."""
+    if not summary["effects"]:
+        return ""
+    caught = io.StringIO()
+    with contextlib.redirect_stdout(caught):
+        print_added(summary)
+    return caught.getvalue().rstrip()
 
 
 def version(name: str) -> str:

@@ -24,7 +24,7 @@ from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
 
 #: Names that a reader expects instead of base units.
-_USUAL = ("N", "Pa", "W", "J", "V", "N*m")
+_USUAL = ("N", "Pa", "W", "J", "V", "N*m", "V/s")
 
 
 @cache
@@ -145,9 +145,11 @@ class TargetUnits:
         composed = re.sub(r"\b(force|position|channel|parameter|quantity)\b", unit, text)
         if parse_unit(composed) == parse_unit(""):
             return ""
-        if "dimensionless" in composed:
-            return unit_text(parse_unit(composed))
-        return composed
+        simple = unit_text(parse_unit(composed))
+        # A unit that stands twice may cancel: a flow in V/s over a level in V is a rate.
+        names = re.findall(r"[^\W\d]+", composed)
+        cancels = len(set(names)) < len(names) and len(simple) < len(composed)
+        return simple if cancels or "dimensionless" in composed else composed
 
 
 def target_units(model: Model, target: str) -> TargetUnits:

@@ -10,6 +10,8 @@ Each set gives its errors, and
 
 ``<set>_first_effect``, ``<set>_effects``
     the effect that was added first, and all of the final model;
+``<set>_found``
+    these with 95 % intervals of their parameters, as lines of text;
 ``<set>_certainty``
     ``certain``, ``probable``, ``likeness`` or empty;
 ``<set>_seconds``

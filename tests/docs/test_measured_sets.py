@@ -29,6 +29,7 @@ def loaded(path: Path) -> ModuleType:
 
 
 measured_sets = loaded(ROOT / "studies" / "measured_sets.py")
+measured_pages = loaded(ROOT / "studies" / "measured_pages.py")
 CAMPAIGNS = sorted((ROOT / "studies" / "measured").rglob("campaign.toml"))
 
 
@@ -70,3 +71,38 @@ def test_a_set_that_fails_says_why_and_is_tried_again(tmp_path, monkeypatch):
     found = measured_sets.kept("cascaded_tanks", tmp_path, 1)
     assert found == {"tanks_failed": "InputError: no such file"}
     assert not list(tmp_path.iterdir())
+
+
+def test_a_set_in_which_nothing_was_found_says_nothing():
+    assert measured_sets.found_in({"effects": [], "rounds": []}) == ""
+
+
+def test_all_sets_are_told_also_one_that_failed(tmp_path, monkeypatch, capsys):
+    figures = {}
+    for short in measured_pages.SOURCES:
+        figures |= {f"{short}_certainty": "likeness", f"{short}_seconds": 61.4}
+        figures |= {f"{short}_found": f"an effect of {short}\n  c  1.0 … 2.0"}
+    del figures["emps_certainty"], figures["emps_found"]
+    figures |= {"emps_failed": "killed", "tanks_found": "", "tanks_certainty": ""}
+    (tmp_path / "measured.json").write_text(json.dumps({"figures": figures}))
+    monkeypatch.setattr(measured_pages, "TABLE", tmp_path / "measured.json")
+    measured_pages.print_all_found()
+    told = capsys.readouterr().out
+    assert "Silverbox: likeness, 61 s\n  an effect of silverbox\n    c  1.0 … 2.0\n" in told
+    assert "EMPS drive: killed\n" in told
+    assert "cascaded tanks: no name, 61 s\n  nothing was added\n" in told
+
+
+def test_errors_stand_beside_published_ones(tmp_path, monkeypatch, capsys):
+    figures = {"silverbox_arrow_mV": 0.5, "emps_position_mm": 0.4, "brfd_holdout_kip": 0.3}
+    (tmp_path / "measured.json").write_text(json.dumps({"figures": figures}))
+    monkeypatch.setattr(measured_pages, "TABLE", tmp_path / "measured.json")
+    measured_pages.print_all_errors()
+    told = capsys.readouterr().out
+    assert "0.5 mV   0.6 GP-NARX, 1.4 SUBNET" in told
+    assert "Vargas 2021" in told
+    (axes,) = measured_pages.beside_published().axes
+    assert [item.get_text() for item in axes.get_yticklabels()] == [
+        "Silverbox, arrow",
+        "EMPS, position on the pulses",
+    ]

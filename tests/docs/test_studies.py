@@ -167,3 +167,23 @@ def test_many_parameters_of_an_effect_are_counted_only(
     monkeypatch.setattr(stored, "added_parameters", lambda _: iter([("an offset by run", names)]))
     stored.print_before_after({"error_after": {}, "error_before": {}}, "N", 1.0)
     assert capsys.readouterr().out.endswith("an offset by run\n  8 parameters\n")
+
+
+def test_an_effect_that_was_added_again_is_told_once_and_by_its_place(stored: ModuleType) -> None:
+    def entry(effect: str, target: str, *names: str) -> dict[str, object]:
+        item = {"effect": effect, "target": target, "expected": dict.fromkeys(names, 1.0)}
+        return {"accepted": effect, "accepted_target": target, "candidates": [item]}
+
+    summary = {
+        "effects": ["leak", "overflow"],
+        "targets": ["upper", "lower"],
+        "titles": {},
+        "parameters": {"a": {}, "b": {}, "c": {}},
+        "rounds": [
+            entry("overflow", "upper", "gone"),
+            entry("leak", "upper", "a"),
+            entry("overflow", "lower", "b"),
+            entry("leak", "upper", "a", "c"),
+        ],
+    }
+    assert [names for _, names in stored.added_parameters(summary)] == [["a", "c"], ["b"]]

@@ -8,7 +8,7 @@ import sympy as sp
 from bayesoleo.effects import catalogue, find_effect
 from bayesoleo.effects._nonparametric import balance_places
 from bayesoleo.effects._parts import Scales
-from bayesoleo.effects._places import force_places
+from bayesoleo.effects._places import TargetUnits, force_places
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._expressions import derivative_symbol
 
@@ -187,3 +187,16 @@ def test_a_term_that_is_not_real_everywhere_says_nothing_of_the_sense():
         outputs={"force": Output("-stiffness*x - positive(contact*(x - 2)**1.5 + 0.1)", "N")},
     )
     assert [place.sign for place in law.coordinates()] == [-1]
+
+
+@pytest.mark.parametrize(
+    ("force", "position", "text", "expected"),
+    [
+        ("V/s", "V", "force/position", "1/s"),
+        ("m/s**2", "m", "force/position**3", "1/m**2/s**2"),
+        ("N", "m", "force/(position/s)", "N/(m/s)"),
+        ("N", "m", "force/position**3", "N/m**3"),
+    ],
+)
+def test_what_cancels_in_a_unit_is_left_out(force, position, text, expected):
+    assert TargetUnits({"force": force, "position": position}).resolve(text) == expected
