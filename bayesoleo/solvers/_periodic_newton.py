@@ -115,7 +115,7 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
     x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
     z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
     work.sums[:] = 0.0
-    bad, outside = 0, 0
+    bad, outside, odd = 0, 0, 0
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
@@ -123,7 +123,8 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
         _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
-            outside += _outside(out, sizes, count)
+            broken, undefined = _outside(out, sizes, count)
+            outside, odd = outside + broken, odd + undefined
         call_kernel(pieces.jacobian, (z, inputs, p, out, points))
         if b == u.shape[0] - 1:
             _silence(sizes, sweep.lengths, b, count, work.z, work.out)
@@ -134,7 +135,7 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
         _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
     if outside > 0:
         return INADMISSIBLE
-    finite = True
+    finite = odd == 0
     for k in range(2 * sizes.d):
         work.measures[k] = total(work.sums[k]) / (sizes.steps * stages)
         finite = finite and work.measures[k] < np.inf
@@ -152,7 +153,7 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
     points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
     x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
     z, out = pointer(work.z, 0), pointer(work.out, 0)
-    outside = 0
+    outside, odd = 0, 0
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
@@ -160,13 +161,14 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
         _call_rows(pieces.rows, (x, length, z, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
-            outside += _outside(out, sizes, count)
+            broken, undefined = _outside(out, sizes, count)
+            outside, odd = outside + broken, odd + undefined
         call_kernel(pieces.residual, (z, inputs, p, out, points))
         transfer = pointer(work.transfer, b * work.transfer.shape[1])
         _call_substitute(pieces.substitute, (out, x, length, transfer, count))
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
         _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
-    return outside == 0
+    return outside == 0 and odd == 0
 
 
 @jit
@@ -177,15 +179,16 @@ def _gather(now: Any, row: int, x: Any, unknowns: int, reach: int) -> None:
 
 
 @jit
-def _outside(a: Any, sizes: Sizes, count: int) -> int:
-    """How many points break a condition, which one does that is not a number."""
-    outside = 0
+def _outside(a: Any, sizes: Sizes, count: int) -> tuple[int, int]:
+    """At how many points a condition is broken, and at how many it is not a number."""
+    outside, odd = 0, 0
     for k in range(sizes.conditions):
         for stage in range(sizes.stages):
             values = carray(after(a, k * BLOCK + stage * sizes.block), (count,))
             for i in range(count):
-                outside += not values[i] > 0.0
-    return outside
+                outside += values[i] <= 0.0
+                odd += values[i] != values[i]
+    return outside, odd
 
 
 @jit
