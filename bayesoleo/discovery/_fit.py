@@ -22,6 +22,7 @@ from bayesoleo._types import Array
 from bayesoleo.data._noise import PeriodicAverage
 from bayesoleo.data._sample_quality import bridged
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.estimation._bayesian_estimators import method as step_of
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._least_squares import PriorScale
@@ -170,10 +171,8 @@ def promising(problem: CampaignProblem, theta: Array, policy: SearchPolicy) -> l
     for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
         if name in shared:
             draws[:, k] = prior.sample(rng, policy.prior_draws)
-    sums = problem.misfit(draws).sum_of_squares.sum(axis=1)
-    counts = problem.counts.sum(axis=0)
-    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
-    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf))[: policy.prior_starts]
+    cost = _cost(problem, draws)
+    order = np.argsort(cost)[: policy.prior_starts]
     return [draws[k] for k in order if np.isfinite(cost[k])]
 
 
@@ -317,6 +316,7 @@ def fit_model(
     max_iterations: int = 50,
     share: Predictor | None = None,
     check_mesh: bool = True,
+    damped: bool = False,
     method: str = "mbe",
     progress: Callable[[str], None] | None = None,
 ) -> ModelFit:
@@ -330,9 +330,10 @@ def fit_model(
         Runs, periodic or transient.
     numerics : Numerics
         Scheme, steps, threads.
-    start : ndarray, shape (l,), optional
+    start : ndarray, shape (l,) or (m, l), optional
         Where to start; by default at the nominal values, and from draws of the priors as well where
-        these lead to an estimate that the priors hardly allow.
+        these lead to an estimate that the priors hardly allow. Of several starts the likeliest is
+        taken, solved from the last of them.
     tolerance : float
         Relative step at which the estimators stop.
     max_iterations : int
@@ -342,6 +343,9 @@ def fit_model(
     check_mesh : bool
         Whether to find out what halving the steps would move. Of a model that is only compared
         with others on one mesh nobody asks that, and it costs as much as a third of the estimate.
+    damped : bool
+        Whether steps that halving does not help are damped. An effect's amplitude and its shape may
+        make up for each other, which makes a curved valley of the likelihood.
     method : str
         Estimator that leads to the posterior's mode, as in :func:`bayesoleo.estimation.estimate`.
     progress : callable, optional
@@ -360,10 +364,12 @@ def fit_model(
     steps, begun = numerics.steps or first_steps(model, records), None
     while True:
         problem = _problem(model, records, numerics, steps, share)
+        if start is not None and start.ndim == 2:
+            start = _likeliest(problem, start)
         callback(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
         mbe = estimate(
             problem,
-            method,
+            replace(step_of(method), damped=True) if damped else method,
             start=start,
             tolerance=tolerance,
             max_iterations=max_iterations,
@@ -373,6 +379,7 @@ def fit_model(
         point = polish(
             problem,
             mbe,
+            method=replace(step_of("be"), damped=damped),
             tolerance=tolerance,
             max_iterations=max_iterations,
             resolution=RESOLUTION,
@@ -408,6 +415,23 @@ def fit_model(
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         steps, start = 2 * steps, point.theta
+
+
+def _likeliest(problem: CampaignProblem, starts: Array) -> Array:
+    """Of starts ``(m, l)`` the one that makes the data most likely; the first where that cannot be
+    told."""
+    if problem.freeze(starts[-1]) is not Status.CONVERGED:
+        return cast(Array, starts[0])
+    cost = _cost(problem, starts)
+    return cast(Array, starts[int(np.argmin(cost)) if np.isfinite(cost).any() else 0])
+
+
+def _cost(problem: CampaignProblem, vectors: Array) -> Array:
+    """Twice the negative logarithm of the likelihood, variances eliminated, of vectors ``(L, l)``;
+    infinite for those that could not be solved."""
+    sums, counts = problem.misfit(vectors).sum_of_squares.sum(axis=1), problem.counts.sum(axis=0)
+    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
+    return np.where(np.isfinite(cost), cost, np.inf)
 
 
 def _problem(

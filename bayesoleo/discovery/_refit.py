@@ -32,6 +32,9 @@ from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._predictor import Layout, RunPrediction
 
+#: Parts of the values that a score expects, from which an estimate may start.
+STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
+
 
 def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[float, float]:
     """Variance of one estimate and its degrees of freedom.
@@ -219,8 +222,7 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = score.option.assembly.with_values(base.fit.shared)
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
-    expected = dict(zip(score.names, map(float, score.expected), strict=True))
-    fit = quick_fit(base, model, base.fit.values | expected, numerics)
+    fit = quick_fit(base, model, _starts(base, score, model), numerics)
     share, changes = compare(base, fit)
     contribution = np.concatenate(
         [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]
@@ -348,10 +350,29 @@ def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> di
     return changed
 
 
+def _starts(base: Base, score: Score, model: Model) -> list[dict[str, float]]:
+    """Where a candidate's estimate may start: what its score expects, and parts of that.
+
+    A score knows the slope alone. Over many swings of a free motion the values that it expects of
+    an effect and of the present unknowns may be far beyond where the motion follows its slope, and
+    an estimate from there ends anywhere. Near the present estimate a part of them improves.
+    """
+    new = dict(zip(score.names, map(float, score.expected), strict=True))
+    # The sign that an effect's amplitude must have is in the model.
+    new |= {name: model.parameters[name].value for name in new if name in model.parameters}
+    present = base.fit.values
+    moved = dict(zip(present, map(float, score.beside), strict=True)) if score.beside.size else {}
+    return [
+        {name: value + part * moved.get(name, 0.0) for name, value in present.items()}
+        | {name: part * value for name, value in new.items()}
+        for part in STARTS
+    ]
+
+
 def quick_fit(
     base: Base,
     model: Model,
-    known: Mapping[str, float],
+    known: Mapping[str, float] | Sequence[Mapping[str, float]],
     numerics: Numerics,
     method: str = "mbe",
 ) -> ModelFit:
@@ -362,9 +383,10 @@ def quick_fit(
     base : Base
         Residuals and sensitivities of the present model.
     model : Model
-        The driven model; shared unknowns start at its nominal values.
-    known : mapping of str to float
-        Starts of by-run unknowns, as far as known.
+        The driven model; unknowns start at its nominal values unless they are known.
+    known : mapping of str to float, or several
+        Starts of unknowns, as far as known. Of several the likeliest is taken; the solver starts
+        from the last, at which the motion should be known.
     numerics : Numerics
     method : str
         Estimator that leads to the mode; BE goes there at once, from a start nearby.
@@ -375,25 +397,27 @@ def quick_fit(
         model,
         base.fit.records,
         quick,
-        start=_start(base, known, model),
+        start=_start(base, known, model)
+        if isinstance(known, Mapping)
+        else np.array([_start(base, one, model) for one in known]),
         tolerance=1e-4,
         max_iterations=15,
         share=base.fit.predictor,
         check_mesh=False,
+        damped=True,
         method=method,
     )
 
 
 def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
-    """Nominal values, and the known values of by-run unknowns."""
+    """Known values inside the priors' support, and else nominal ones."""
     layout = Layout.of(model, [record.label for record in base.fit.records])
     start = layout.start(model)
-    for k, name in enumerate(layout.names):
-        if "[" in name and name in known:
-            start[k] = known[name]
     priors = layout.priors(model)
-    for k, prior in enumerate(priors):
-        low, high = prior.support
+    for k, name in enumerate(layout.names):
+        low, high = priors[k].support
+        if low < known.get(name, np.nan) < high:
+            start[k] = known[name]
         if not low < start[k] < high:
             start[k] = model.parameters[layout.parameters[k]].value
     return start

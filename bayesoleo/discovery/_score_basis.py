@@ -12,7 +12,7 @@ therefore detected and left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
@@ -363,6 +363,8 @@ class Base:
         By which scores and estimates are judged.
     data : SpectralData, optional
         Lines on which changes of the outputs are kept to compare structures.
+    units : ndarray, shape (l,)
+        Units of the unknowns, their priors' standard deviations, SI.
     """
 
     fit: ModelFit
@@ -374,6 +376,7 @@ class Base:
     doubt: float
     policy: SearchPolicy = SearchPolicy()
     data: SpectralData | None = None
+    units: Array = field(default_factory=lambda: np.ones(1))
 
     @property
     def fall_back(self) -> float:
@@ -414,7 +417,8 @@ def base_of(fit: ModelFit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         runs.append(run)
     doubt = float(np.sqrt(variance))
     data = SpectralData.of(fit)
-    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy, data)
+    units = _units_of(fit)
+    return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy, data, units)
 
 
 def _prior_terms(fit: ModelFit) -> tuple[Array, Array]:
@@ -444,8 +448,7 @@ def _run_base(
     run, record = fit.predictor.runs[r], fit.records[r]
     names = fit.predictor.layout.names
     free = [names.index(name) for name in fit.problem.names]
-    unit = np.array([prior.sd for prior in fit.problem.priors])
-    own = fit.predictions[r].sensitivity[:, free] * unit[:, None]
+    own = fit.predictions[r].sensitivity[:, free] * _units_of(fit)[:, None]
     return RunBase.of(
         np.outer(1.0 / np.array(sigma), weights(record)).ravel(),
         (run.measured - fit.predictions[r].y).ravel(),
@@ -454,6 +457,10 @@ def _run_base(
         np.tile(replicate(record, fit.policy), len(sigma)),
         spectra,
     )
+
+
+def _units_of(fit: ModelFit) -> Array:
+    return np.array([prior.sd for prior in fit.problem.priors])
 
 
 def _spectra(entries: Sequence[RunError]) -> tuple[NoiseSpectrum, ...]:

@@ -185,6 +185,8 @@ class Score:
     signature : ndarray, shape (shapes * k, lines)
         Change of the outputs per unit of each unknown on the lines of :class:`SpectralData`, SI,
         for one set of shapes after the other.
+    beside : ndarray, shape (l,)
+        How far the present unknowns move with the expected values, SI.
     """
 
     option: Option
@@ -201,6 +203,7 @@ class Score:
     freedom: int = 0
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
     signature: Array = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32))
+    beside: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def size(self) -> int:
@@ -327,6 +330,7 @@ def _evaluate(
         z=root * float(np.sign(expected[0])) if k == 1 else root,
         rank=int(rank),
         information=information,
+        beside=-base.units * (project @ expected),
     )
 
 

@@ -236,5 +236,12 @@ def fit_state(
     progress: Callable[[str], None] | None = None,
 ) -> State:
     """Fit an assembly and describe its state."""
-    fit = fit_model(assembly.model(), roles.fitted, numerics, start=start, progress=progress)
+    fit = fit_model(
+        assembly.model(),
+        roles.fitted,
+        numerics,
+        start=start,
+        damped=bool(assembly.steps),
+        progress=progress,
+    )
     return state_of(assembly, fit, roles)

@@ -407,7 +407,10 @@ def _extended(
                 # Beside others an effect has less to explain than alone.
                 part = LESS if near.effects else 1.0
                 grown = grown.with_parameters(_parameters(grown, score, part, base))
-                known |= dict(zip(score.names, map(float, part * score.expected), strict=True))
+                expected = zip(score.names, map(float, part * score.expected), strict=True)
+                known |= {
+                    name: value for name, value in expected if name not in grown.model().parameters
+                }
             present = grown.model().parameters
             shared = near.fit.shared
             grown = grown.with_values({name: shared[name] for name in shared if name in present})

@@ -27,19 +27,10 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from bayesoleo._types import Array
-from bayesoleo.error_models._fitting import RANK
 from bayesoleo.errors import InputError
+from bayesoleo.estimation._damping import GOOD, HALF, POOR, SHRINK, weight_within
 from bayesoleo.estimation._least_squares import WhitenedEquations
 
-# Relative tolerance on the radius, which saves iterations of the secular equation.
-_SLACK = 0.1
-_MAX_SECULAR = 20
-# Least radius: a shorter step changes nothing.
-_SMALLEST = 1e-100
-# Ratios of actual to predicted gain below which the radius shrinks, and from which it grows.
-_POOR, _GOOD = 0.25, 0.75
-# Factors on the radius after a refused step, and after one with little gain.
-_SHRINK, _HALF = 0.25, 0.5
 # Accepted spellings of the names.
 _SHORT = {"lm": "levenberg-marquardt", "gn": "gauss-newton"}
 
@@ -49,7 +40,16 @@ class Step[State]:
     """Step of an estimator: the rows that it adds to the least-squares equations.
 
     The state is carried from one iteration to the next.
+
+    Parameters
+    ----------
+    damped : bool
+        Whether a step that halving does not help is damped, see ``_damping.py``. A search that
+        compares many models wants their optima by few evaluations; the estimators as published only
+        halve.
     """
+
+    damped: bool = False
 
     #: name of the estimator
     name: ClassVar[str] = ""
@@ -234,7 +234,9 @@ class LevenbergMarquardtStep(Step[TrustRegion]):
         if np.isnan(radius):  # the first step is at most as long as the start vector
             radius = float(np.linalg.norm(length * equations.place)) or 1.0
         free = ~equations.held
-        weight = _weight((jacobian / length)[:, free], equations.noise * equations.residual, radius)
+        weight = weight_within(
+            (jacobian / length)[:, free], equations.noise * equations.residual, radius
+        )
         return TrustRegion(radius, length, np.sqrt(weight) / equations.noise)
 
     def rows(self, state: TrustRegion, jacobian: Array) -> Array:
@@ -246,49 +248,15 @@ class LevenbergMarquardtStep(Step[TrustRegion]):
         self, state: TrustRegion, jacobian: Array, ratio: float, taken: Array
     ) -> TrustRegion:
         size = float(np.linalg.norm(state.length * taken))
-        if ratio < _POOR:
-            return replace(state, radius=_HALF * size)
-        if ratio >= _GOOD or state.weight == 0:
+        if ratio < POOR:
+            return replace(state, radius=HALF * size)
+        if ratio >= GOOD or state.weight == 0:
             return replace(state, radius=max(state.radius, 2 * size))
         return state
 
     def refuse(self, state: TrustRegion, step: Array) -> TrustRegion:
         size = float(np.linalg.norm(state.length * step))
-        return replace(state, radius=_SHRINK * min(size, state.radius))
-
-
-def _weight(jacobian: Array, residual: Array, radius: float) -> float:
-    """Weight ``m`` for which ``|(J'J + m)^-1 J'e|`` is the radius; zero if none is needed."""
-    if jacobian.shape[1] == 0:
-        return 0.0
-    left, singular, _ = np.linalg.svd(jacobian, full_matrices=False)
-    turned = singular * (left.T @ residual)
-    squares = singular**2
-    kept = singular > RANK * singular[0]
-
-    def length(weight: float) -> tuple[float, float]:
-        """Length of the step and its derivative with respect to the weight."""
-        parts = turned[kept] / (squares[kept] + weight)
-        size = float(np.linalg.norm(parts))
-        slope = -float(np.sum(parts**2 / (squares[kept] + weight)))
-        return size, slope / size if size > 0 else 0.0
-
-    size, slope = length(0.0)
-    if size <= (1 + _SLACK) * radius:
-        return 0.0
-    radius = max(radius, _SMALLEST)
-    low, high = (size - radius) / -slope, float(np.linalg.norm(turned)) / radius
-    weight = max(low, 1e-3 * high)
-    for _ in range(_MAX_SECULAR):
-        size, slope = length(weight)
-        if abs(size - radius) <= _SLACK * radius:
-            break
-        low, high = (weight, high) if size > radius else (low, weight)
-        # Newton's method on 1/size, which is nearly linear in the weight
-        weight = weight - (size - radius) / radius * size / slope
-        if not low <= weight <= high:
-            weight = max(1e-3 * high, float(np.sqrt(low * high)))
-    return weight
+        return replace(state, radius=SHRINK * min(size, state.radius))
 
 
 METHODS: dict[str, Step[Any]] = {

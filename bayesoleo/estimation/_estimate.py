@@ -312,6 +312,7 @@ def polish(
     problem: EstimationProblem,
     point: PointEstimate,
     *,
+    method: str | Step[Any] = "be",
     objective: str | Objective = "diagonal",
     error_covariance: object = None,
     tolerance: float = 1e-8,
@@ -329,6 +330,8 @@ def polish(
     problem : EstimationProblem
     point : PointEstimate
         Where to begin.
+    method : str or Step, optional
+        An estimator that goes to a mode.
     objective, error_covariance, tolerance, max_iterations, resolution, progress
         As in :func:`estimate`.
 
@@ -338,7 +341,7 @@ def polish(
     """
     return estimate(
         problem,
-        "be",
+        method,
         objective=objective,
         error_covariance=error_covariance,
         start=point.theta,

@@ -26,6 +26,7 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._independent import output_counts
 from bayesoleo.estimation._bayesian_estimators import Step
+from bayesoleo.estimation._damping import Damping
 from bayesoleo.estimation._least_squares import PriorScale, WhitenedEquations, is_cut
 from bayesoleo.estimation._objectives import Objective, log_prior, newton_equations
 from bayesoleo.estimation._problem import EstimationProblem, Evaluation
@@ -45,6 +46,8 @@ _LONGEST = 10.0
 _ON_ONE_LINE = 0.9
 # 2**-30 of a step is negligible.
 _MAX_HALVINGS = 30
+# A step is halved so often before it is damped: most need no more, and that costs no equations.
+_HALVED_FIRST = 2
 # Rounding of the merit function for each sample: smaller increases are ignored.
 _ROUNDING = 1e-13
 # Where not even a sixteenth of a step helps, or none: an expected gain of the log density below
@@ -265,6 +268,7 @@ class _Loop:
         self.counts: Integers = output_counts(problem.counts)
         self.scale = PriorScale.of(problem.priors, problem.names)
         self.state = step.begin(self.scale.root)
+        self.damping = Damping(np.zeros(len(self.scale.sd)))
         self.history: list[Iteration] = []
         self.evaluations, self.distance = 0, np.nan
         self.failures: Counter[str] = Counter()
@@ -304,12 +308,20 @@ class _Loop:
                 return Status.NOT_FINITE
             self.state = self.step.prepare(self.state, equations)
             weight = self.step.rows(self.state, equations.jacobian)
-            proposal = equations.solve(weight)
-            pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
+            whole = proposal = equations.solve(weight)
+            if self.step.damped:
+                self.damping = self.damping.at(equations, weight)
+                proposal = self.damping.shortened(whole, equations, weight)
+            if proposal is whole:
+                pace = pace.look(proposal, np.vstack((equations.jacobian, weight)))
+            else:
+                pace = Pace()  # damped steps do not compare
             part = self.part_of(proposal, pace, equations)
-            small = self.is_small(max(part, 1.0) * proposal, equations, tolerance, resolution)
+            small = self.is_small(max(part, 1.0) * whole, equations, tolerance, resolution)
             before = self.point
-            trial, halvings, taken = self.shorten(part * proposal, equations, variance, resolution)
+            trial, halvings, taken = self.shorten(
+                part * proposal, weight, equations, variance, resolution
+            )
             if halvings >= _MANY_HALVINGS:
                 gain = 0.5 * float(proposal @ equations.gradient)
                 small = small or gain <= _NEGLIGIBLE_GAIN
@@ -328,6 +340,7 @@ class _Loop:
             expected = equations.expected_gain(taken)
             ratio = won / expected if expected > 0 else 1.0
             self.state = self.step.accept(self.state, equations.jacobian, ratio, taken)
+            self.damping = self.damping.accepted(taken, ratio)
         return Status.NO_CONVERGENCE
 
     def part_of(self, proposal: Array, pace: Pace, equations: WhitenedEquations) -> float:
@@ -339,7 +352,12 @@ class _Loop:
         return pace.wanted
 
     def shorten(
-        self, proposal: Array, equations: WhitenedEquations, variance: Array, resolution: float
+        self,
+        proposal: Array,
+        weight: Array,
+        equations: WhitenedEquations,
+        variance: Array,
+        resolution: float,
     ) -> tuple[_Point, int, Array]:
         """First point along ever shorter steps that is not worse than the current one.
 
@@ -356,7 +374,10 @@ class _Loop:
             if np.linalg.norm(equations.jacobian @ proposal) < resolution:
                 break  # at a jump of the model no step helps, however short
             softer = self.step.refuse(self.state, proposal)
-            if softer is None:
+            if softer is None and self.step.damped and halvings >= _HALVED_FIRST:
+                self.damping = self.damping.refused(proposal)
+                proposal = self.damping.shortened(proposal, equations, weight)
+            elif softer is None:
                 proposal = proposal / 2
             else:
                 self.state = self.step.prepare(softer, equations)

@@ -300,15 +300,23 @@ class WhitenedEquations:
             (np.where(self.gradient < 0, down, np.inf), np.where(self.gradient > 0, up, np.inf))
         )
 
-    def solve(self, rows: Array) -> Array:
-        """Step, shape (l,), with the weight ``rows' rows`` added to ``A``."""
-        # only the fixed prior pulls, and it does so along its own rows: P'r is its slope
-        pulls = len(rows) == len(self.slope) and self.slope.any()
-        pull = solve_triangular(rows, self.slope, trans="T") if pulls else np.zeros(len(rows))
-        target = np.concatenate((self.residual, pull))
+    def solve(self, rows: Array, damping: Array | None = None) -> Array:
+        """Step, shape (l,), with the weight ``rows' rows`` added to ``A``, and rows ``(l, l)`` of
+        damping, which pull nowhere."""
+        target, stacked = np.concatenate((self.residual, self.pull(rows))), [self.jacobian, rows]
+        if damping is not None:
+            target = np.append(target, np.zeros(len(damping)))
+            stacked.append(damping)
         # without a weight, what the data leave open must not follow the derivatives' rounding
         rank = None if len(rows) else RANK
-        return bounded_step(np.vstack((self.jacobian, rows)), target, self.room, rank)
+        return bounded_step(np.vstack(stacked), target, self.room, rank)
+
+    def pull(self, rows: Array) -> Array:
+        """Right-hand side of a prior's rows: only the fixed prior pulls, and it does so along its
+        own rows, ``P'r`` is its slope."""
+        if len(rows) != len(self.slope) or not self.slope.any():
+            return np.zeros(len(rows))
+        return np.asarray(solve_triangular(rows, self.slope, trans="T"))
 
     def expected_gain(self, step: Array) -> float:
         """Rise of the merit function that the linearisation promises for a step, shape (l,)."""
