@@ -46,6 +46,9 @@ SUSPECT = 1e-9
 #: Relative change of the constants for the second look: far above round-off, and far too small for
 #: a real sensitivity to follow by more than ``REPEATS`` of its size.
 CHANGE, REPEATS = 1e-9, 1e-3
+#: Steps of all runs, times sets of shapes, from which a candidate's kernels are compiled: each step
+#: takes some ten microseconds in arrays, and to compile them a few tenths of a second.
+WORTH_COMPILING = 200_000
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.
 MOST_SAMPLES = 1500
@@ -201,7 +204,7 @@ def sensitivities_of(
         fit.records,
         steps=fit.steps,
         scheme=fit.numerics.scheme,
-        backend="numpy",
+        backend=_backend(fit, model, len(shapes)),
         jobs=1,
         share=fit.predictor,
     )
@@ -220,6 +223,12 @@ def sensitivities_of(
             full[:, layout.columns[r]] = y_p
             found[k].append(full)
     return [Block(layout.names, item) for item in found]
+
+
+def _backend(fit: ModelFit, model: Model, count: int) -> str:
+    """NumPy's kernels are ready at once; machine code is worth its making on long records."""
+    steps = sum(run.steps for run in fit.predictor.runs) if model.dofs else 0
+    return fit.numerics.backend if count * steps > WORTH_COMPILING else "numpy"
 
 
 def _constants(
