@@ -188,8 +188,7 @@ def _log_bayes_factors(rivals: Sequence[PredictiveDistribution]) -> Array:
     """Expected log Bayes factors of all pairs, shape (k, k)."""
     means, spreads = _reduced(rivals)
     size, count = means.shape[1], len(rivals)
-    covariances = [np.eye(size) + spread.T @ spread for spread in spreads]
-    roots = [np.linalg.cholesky(S) for S in covariances]
+    roots = [_root(spread) for spread in spreads]
     logs = [2.0 * float(np.log(np.diag(L)).sum()) for L in roots]
     factor = np.zeros((count, count))
     for i in range(count):
@@ -206,7 +205,7 @@ def _mutual_information(parts: Sequence[Component], weights: Array) -> float:
     """Mutual information of rival and outputs, in bits."""
     parts = [part for part in parts if weights[part.rival] * part.weight > 0]
     means, spreads = _reduced([part.predicted for part in parts])
-    roots = [np.linalg.cholesky(np.eye(means.shape[1]) + a.T @ a) for a in spreads]
+    roots = [_root(spread) for spread in spreads]
     logs = np.array([np.log(np.diag(root)).sum() for root in roots])[:, None]
     group = np.array([part.rival for part in parts])
     share = np.log([weights[part.rival] * part.weight for part in parts])[:, None]
@@ -227,6 +226,16 @@ def _mutual_information(parts: Sequence[Component], weights: Array) -> float:
         divergence = np.sum(np.exp(after) * (after - before), axis=0)
         total += float(np.exp(share[i, 0]) * divergence.mean())
     return min(max(total / _LOG_2, 0.0), entropy(weights))
+
+
+def _root(spread: Array) -> Array:
+    """Lower triangular root of ``I + A'A`` for a spread ``A (r, d)``.
+
+    By orthogonal rows: where a prediction is a hundred million times as uncertain as its noise, the
+    sum itself has lost the noise to round-off, and is not positive definite.
+    """
+    rows = np.linalg.qr(np.vstack((spread, np.eye(spread.shape[1]))), mode="r")
+    return np.asarray((rows * np.where(np.diag(rows) < 0, -1.0, 1.0)[:, None]).T)
 
 
 def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Array]]:

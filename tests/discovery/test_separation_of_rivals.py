@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 from scipy import stats
@@ -187,3 +188,28 @@ def test_gain_of_precision_is_that_of_a_linear_regression():
         assert found.information == pytest.approx(fall, rel=1e-9)
         ratios = np.sqrt(np.diag(after) / np.diag(before))[of]
         np.testing.assert_allclose(list(found.ratio.values()), ratios, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e3, 1e6, 1e9])
+def test_an_uncertainty_far_above_the_noise_leaves_the_noise(size):
+    """Against the divergence in fifty digits: in doubles the sum of both loses the noise."""
+    rng = np.random.default_rng(5)
+    spreads = [size * rng.standard_normal((2, SIZE)) for _ in range(2)]
+    moved = size * rng.standard_normal(SIZE)
+    items = [
+        PredictiveDistribution(np.zeros(SIZE), spreads[0]),
+        PredictiveDistribution(moved, spreads[1]),
+    ]
+    found = separate(items).log_bayes_factor[0, 1]
+    with mpmath.workdps(50):
+        wide = [
+            mpmath.eye(SIZE) + mpmath.matrix(a.tolist()).T * mpmath.matrix(a.tolist())
+            for a in spreads
+        ]
+        away = mpmath.matrix(moved.tolist())
+        inverse = wide[1] ** -1
+        product = inverse * wide[0]
+        trace = sum(product[k, k] for k in range(SIZE))
+        logs = mpmath.log(mpmath.det(wide[1])) - mpmath.log(mpmath.det(wide[0]))
+        expected = (trace + (away.T * inverse * away)[0] - SIZE + logs) / 2
+    assert found == pytest.approx(float(expected), rel=1e-5)
