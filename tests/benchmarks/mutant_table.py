@@ -166,6 +166,24 @@ SOLVERS: Rows = {
 }
 
 ESTIMATION: Rows = {
+    "estimation/_damping.py": [
+        ("a step within the radius is damped too",
+         "if self._size(step) <= self.radius:",
+         "if self._size(step) < 0.0:",
+         "estimation/test_damping.py"),
+        ("a damped step as long as its unwhitened radius",
+         "triangle[:, -1], self.radius / equations.noise",
+         "triangle[:, -1], self.radius",
+         "estimation/test_damping.py"),
+        ("damping forgets what pulls the fixed prior",
+         "target = np.concatenate((equations.residual, equations.pull(rows)))",
+         "target = np.concatenate((equations.residual, 0.0 * equations.pull(rows)))",
+         "estimation/test_damping.py"),
+        ("a refused step lengthens the next",
+         "radius=SHRINK * min(self._size(step), self.radius)",
+         "radius=4.0 * min(self._size(step), self.radius)",
+         "estimation/test_damping.py"),
+    ],
     "estimation/_iteration.py": [
         ("a small step is convergence however far the optimum",
          "if self.distance <= _NEAR:",
@@ -409,6 +427,18 @@ ERROR_MODELS: Rows = {
 }
 
 DISCOVERY: Rows = {
+    "discovery/_refit.py": [
+        ("present unknowns stay where an effect's estimate starts",
+         "value + part * moved.get(name, 0.0)",
+         "value",
+         "discovery/test_starts_of_refits.py"),
+    ],
+    "discovery/_expected_information.py": [
+        ("the root of noise and spread without the noise",
+         "np.vstack((spread, np.eye(spread.shape[1])))",
+         "np.vstack((spread, 0.0 * np.eye(spread.shape[1])))",
+         "discovery/test_separation_of_rivals.py"),
+    ],
     "discovery/_hold_out_confirmation.py": [
         ("variance of a fall without the square of two",
          "return fall, expected, 4.0 * (noise + float(np.sum(np.square(moved))) + remainder)",
