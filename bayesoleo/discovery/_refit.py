@@ -401,7 +401,7 @@ def quick_fit(
         if isinstance(known, Mapping)
         else np.array([_start(base, one, model) for one in known]),
         tolerance=1e-4,
-        max_iterations=30,
+        max_iterations=15,
         share=base.fit.predictor,
         check_mesh=False,
         damped=True,
