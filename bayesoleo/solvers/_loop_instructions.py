@@ -4,6 +4,9 @@ What the generators of straight-line code write is a small part of Python: assig
 range, sums and products of numbers in arrays. Its types are known from the arguments. So it is
 translated to LLVM's instructions here, one by one. Numba takes ten seconds for the code of two dofs
 and gives the same instructions in the end.
+
+A slice of :data:`WIDE` numbers is one vector, and what is computed from it is one instruction. Loops
+within loops need this: the compiler turns only innermost loops into vector instructions by itself.
 """
 
 from __future__ import annotations
@@ -13,18 +16,30 @@ from collections.abc import Collection
 
 from bayesoleo._machine_code import number
 
+#: Numbers in a vector: eight fill a register of AVX-512, and two of AVX2.
+WIDE = 8
 _FLOAT, _WHOLE = "double", "i64"
+_VECTOR = f"<{WIDE} x {_FLOAT}>"
+#: Truth of one comparison, and of those of a vector.
+_TRUE, _TRUTHS = "i1", f"<{WIDE} x i1>"
+#: What vectors need beyond the library.
+_DECLARED = f"""declare {_VECTOR} @llvm.fabs.v{WIDE}f64({_VECTOR})
+declare i1 @llvm.vector.reduce.or.v{WIDE}i1({_TRUTHS})
+declare i1 @llvm.vector.reduce.and.v{WIDE}i1({_TRUTHS})
+"""
 #: A product may be added without being rounded first.
 _OPERATIONS = {
     ast.Add: ("fadd contract", "add nsw"),
     ast.Sub: ("fsub contract", "sub nsw"),
     ast.Mult: ("fmul contract", "mul nsw"),
     ast.Div: ("fdiv", ""),
+    ast.FloorDiv: ("", "sdiv"),
 }
 _COMPARISONS = {
     ast.Gt: ("fcmp ogt", "icmp sgt"),
     ast.Lt: ("fcmp olt", "icmp slt"),
     ast.LtE: ("fcmp ole", "icmp sle"),
+    ast.NotEq: ("fcmp une", "icmp ne"),
 }
 
 #: A value's name in the instructions, and its type.
@@ -75,7 +90,8 @@ class _Function:
         if returned == "void":
             self._lines.append("ret void")
         head = f"define {returned} @kernel({', '.join(arguments)}) {{"
-        return "\n".join([head, "entry:", *self._first, *self._lines, "}", ""])
+        text = "\n".join([head, "entry:", *self._first, *self._lines, "}", ""])
+        return _DECLARED + text if _VECTOR in text else text
 
     # -- statements -----------------------------------------------------------------------
 
@@ -89,11 +105,11 @@ class _Function:
                     self._store(target, changed)
                 case ast.For(
                     target=ast.Name(id=name),
-                    iter=ast.Call(func=ast.Name(id="range"), args=[end]),
+                    iter=ast.Call(func=ast.Name(id="range"), args=[*first, end]),
                     body=body,
                     orelse=[],
-                ):
-                    self._loop(name, end, body)
+                ) if len(first) < 2:
+                    self._loop(name, first, end, body)
                 case ast.If(test=test, body=body, orelse=[]):
                     self._if(test, body)
                 case ast.Return(value=ast.expr() as value):
@@ -107,9 +123,12 @@ class _Function:
             self._assign(target.id, value)
         else:
             assert isinstance(target, ast.Subscript)
-            if value[1] != _FLOAT:
+            if value[1] == _WHOLE:
                 raise NotImplementedError(f"a whole number in {ast.unparse(target)}")
-            self._lines.append(f"store {_FLOAT} {value[0]}, ptr {self._place(target)}")
+            place, kind = self._place(target)
+            if value[1] != kind:
+                value = self._alike(value, (place, kind))[0]
+            self._lines.append(f"store {kind} {value[0]}, ptr {place}, align 8")
 
     def _assign(self, name: str, value: _Value) -> None:
         if name not in self._variables:
@@ -118,13 +137,15 @@ class _Function:
         assert self._variables[name] == value[1], name
         self._lines.append(f"store {value[1]} {value[0]}, ptr %at_{name}")
 
-    def _loop(self, name: str, end: ast.expr, body: list[ast.stmt]) -> None:
+    def _loop(
+        self, name: str, first: list[ast.expr], end: ast.expr, body: list[ast.stmt]
+    ) -> None:
         self._count += 1
         label = f"loop{self._count}"
-        self._assign(name, ("0", _WHOLE))
+        self._assign(name, self._value(first[0]) if first else ("0", _WHOLE))
         self._lines += [f"br label %{label}", f"{label}:"]
         index = ast.Name(id=name, ctx=ast.Load())
-        test = self._compare(ast.Lt(), self._value(index), self._value(end))
+        test, _ = self._compare(ast.Lt(), self._value(index), self._value(end))
         self._lines += [f"br i1 {test}, label %{label}_in, label %{label}_end", f"{label}_in:"]
         self._body(body)
         self._assign(name, self._operation(ast.Add(), self._value(index), ("1", _WHOLE)))
@@ -150,16 +171,18 @@ class _Function:
                 kind = self._variables[name]
                 return self._new(f"load {kind}, ptr %at_{name}"), kind
             case ast.Subscript():
-                return self._new(f"load {_FLOAT}, ptr {self._place(expression)}"), _FLOAT
+                place, kind = self._place(expression)
+                return self._new(f"load {kind}, ptr {place}, align 8"), kind
             case ast.BinOp(left=left, op=op, right=right):
                 return self._operation(op, self._value(left), self._value(right))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 name, kind = self._value(operand)
-                assert kind == _FLOAT
+                assert kind != _WHOLE
                 return self._new(f"fneg {kind} {name}"), kind
             case ast.Call(func=ast.Name(id="abs"), args=[argument]):
                 name, kind = self._value(argument)
-                return self._new(f"call {kind} @llvm.fabs.f64({kind} {name})"), kind
+                which = f"v{WIDE}f64" if kind == _VECTOR else "f64"
+                return self._new(f"call {kind} @llvm.fabs.{which}({kind} {name})"), kind
             case ast.IfExp(test=test, body=body, orelse=other):
                 condition = self._condition(test)
                 (one, kind), (two, _) = self._value(body), self._value(other)
@@ -168,7 +191,7 @@ class _Function:
                 raise NotImplementedError(ast.unparse(expression))
 
     def _operation(self, op: ast.operator, left: _Value, right: _Value) -> _Value:
-        assert left[1] == right[1]
+        left, right = self._alike(left, right)
         name = _OPERATIONS[type(op)][left[1] == _WHOLE]
         return self._new(f"{name} {left[1]} {left[0]}, {right[0]}"), left[1]
 
@@ -177,21 +200,58 @@ class _Function:
             case ast.BoolOp(op=ast.And(), values=[one, other]):
                 return self._new(f"and i1 {self._condition(one)}, {self._condition(other)}")
             case ast.Compare(left=left, ops=[op], comparators=[right]):
-                return self._compare(op, self._value(left), self._value(right))
+                name, kind = self._compare(op, self._value(left), self._value(right))
+                assert kind == _TRUE
+                return name
+            case ast.Call(
+                func=ast.Name(id=("any" | "all") as which),
+                args=[ast.Compare(left=left, ops=[op], comparators=[right])],
+            ):
+                name, kind = self._compare(op, self._value(left), self._value(right))
+                assert kind == _TRUTHS
+                how = f"{'or' if which == 'any' else 'and'}.v{WIDE}i1"
+                return self._new(f"call i1 @llvm.vector.reduce.{how}({kind} {name})")
             case _:
                 raise NotImplementedError(ast.unparse(expression))
 
-    def _compare(self, op: ast.cmpop, left: _Value, right: _Value) -> str:
-        assert left[1] == right[1]
+    def _compare(self, op: ast.cmpop, left: _Value, right: _Value) -> _Value:
+        left, right = self._alike(left, right)
         name = _COMPARISONS[type(op)][left[1] == _WHOLE]
-        return self._new(f"{name} {left[1]} {left[0]}, {right[0]}")
+        kind = _TRUTHS if left[1] == _VECTOR else _TRUE
+        return self._new(f"{name} {left[1]} {left[0]}, {right[0]}"), kind
 
-    def _place(self, target: ast.Subscript) -> str:
-        """Pointer to an entry of an array."""
+    def _alike(self, left: _Value, right: _Value) -> tuple[_Value, _Value]:
+        """Two values of one type: a number beside a vector is repeated."""
+        if {left[1], right[1]} == {_FLOAT, _VECTOR}:
+            left, right = self._widened(left), self._widened(right)
+        assert left[1] == right[1]
+        return left, right
+
+    def _widened(self, value: _Value) -> _Value:
+        if value[1] == _VECTOR:
+            return value
+        first = self._new(f"insertelement {_VECTOR} poison, {_FLOAT} {value[0]}, i64 0")
+        repeated = f"{_VECTOR} {first}, {_VECTOR} poison, <{WIDE} x i32> zeroinitializer"
+        return self._new(f"shufflevector {repeated}"), _VECTOR
+
+    def _place(self, target: ast.Subscript) -> _Value:
+        """Pointer to an entry of an array, or to a vector of them, and which of the two."""
         assert isinstance(target.value, ast.Name)
-        index, kind = self._value(target.slice)
-        assert kind == _WHOLE
-        return self._new(f"getelementptr inbounds double, ptr %{target.value.id}, i64 {index}")
+        match target.slice:
+            case ast.Slice(
+                lower=ast.expr() as first,
+                upper=ast.BinOp(left=again, op=ast.Add(), right=ast.Constant(value=8)),
+                step=None,
+            ) if ast.dump(first) == ast.dump(again):
+                at, kind = first, _VECTOR
+            case ast.Slice():
+                raise NotImplementedError(ast.unparse(target))
+            case at:
+                kind = _FLOAT
+        index, whole = self._value(at)
+        assert whole == _WHOLE
+        start = f"ptr %{target.value.id}"
+        return self._new(f"getelementptr inbounds double, {start}, i64 {index}"), kind
 
     def _new(self, text: str) -> str:
         self._count += 1

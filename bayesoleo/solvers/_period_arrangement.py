@@ -21,7 +21,8 @@ import numpy as np
 
 from bayesoleo._compiled import BLOCK, jit
 from bayesoleo._types import Array, Flags, Float, Integers
-from bayesoleo.solvers._unrolled_collocation import COLUMNS, REACH, WIDTH
+from bayesoleo.solvers._blocked_collocation import columns_of
+from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
 from bayesoleo.solvers._unrolled_program import Program, chunks
 
 #: Motion about a level that is smaller than this part of it is measured by the level: the digits of
@@ -284,7 +285,7 @@ def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
         transfer=(blocks, sizes.transfer * sizes.block),
         history=(length, D + 1, WIDTH),
         start=(D, WIDTH),
-        products=(WIDTH + 1, D, COLUMNS),
+        products=(WIDTH + 1, D, columns_of(D)),
         closure=(D, D),
         scale=(D,),
         inverse=(D, D),

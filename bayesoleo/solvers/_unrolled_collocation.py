@@ -203,7 +203,7 @@ def _entry(order: Sequence[int], i: int, column: int) -> str:
     return f"history[base + {(order[i] * (len(order) + 1) + column) * WIDTH}]"
 
 
-def _number(value: float) -> str:
+def literal(value: float) -> str:
     return f"({float(value)!r})"
 
 
@@ -221,13 +221,13 @@ def rows(orders: Sequence[int], method: Tableau, steps: int) -> str:
         for st in range(s):
             source.add(f"a{st} = x[{(D + st * d + j) * REACH} + i]")
         for i in range(s):
-            once = joined([f"{_number(method.a[i, st])}*a{st}" for st in range(s)])
-            twice = joined([f"{_number(aa[i, st])}*a{st}" for st in range(s)])
+            once = joined([f"{literal(method.a[i, st])}*a{st}" for st in range(s)])
+            twice = joined([f"{literal(aa[i, st])}*a{st}" for st in range(s)])
             point = f"{i * steps} + i"
             if orders[j] == 1:
                 source.add(f"z[{row * BLOCK} + {point}] = low + h1*({once})")
             else:
-                inner = f"{_number(method.c[i])}*rate + h1*({twice})"
+                inner = f"{literal(method.c[i])}*rate + h1*({twice})"
                 source.add(f"z[{row * BLOCK} + {point}] = low + h1*({inner})")
                 source.add(f"z[{(row + 1) * BLOCK} + {point}] = rate + h1*({once})")
             source.add(f"z[{(row + orders[j]) * BLOCK} + {point}] = a{i}")
@@ -252,12 +252,12 @@ def _stage_equations(
                     source.add(f"{name} = out[{at} + i]")
                 for st in range(s):
                     own = [names[-1]] if st == i else []
-                    once = f"{_number(method.a[i, st])}*h1*{names[-2]}"
-                    twice = [f"{_number(aa[i, st])}*h2*{names[0]}"] if orders[j] == 2 else []
+                    once = f"{literal(method.a[i, st])}*h1*{names[-2]}"
+                    twice = [f"{literal(aa[i, st])}*h2*{names[0]}"] if orders[j] == 2 else []
                     line[st][j] = joined([*own, once, *twice])
                 states.append(f"-{names[0]}")
                 if orders[j] == 2:
-                    states.append(f"-({_number(method.c[i])}*h1*{names[0]} + {names[1]})")
+                    states.append(f"-({literal(method.c[i])}*h1*{names[0]} + {names[1]})")
             matrix.append([line[st][j] for st in range(s) for j in range(d)])
             right.append([*states, f"-out[{e * BLOCK + i * steps} + i]"])
     return matrix, right
@@ -321,19 +321,19 @@ def _column(
         last = state + orders[j] - 1
         a = [f"x[{(D + st * d + j) * REACH} + i]" for st in range(s)]
         mine = [own[st * d + j] for st in range(s)]
-        once = joined([f"{_number(method.b[st])}*{mine[st]}" for st in range(s)])
+        once = joined([f"{literal(method.b[st])}*{mine[st]}" for st in range(s)])
         total = ["1.0"] if k == last else []
         if k == D:
-            gain = joined([f"{_number(method.b[st])}*{a[st]}" for st in range(s)])
+            gain = joined([f"{literal(method.b[st])}*{a[st]}" for st in range(s)])
             total = [f"(x[{last * REACH} + i] - x[{last * REACH + WIDTH} + i]) + h1*({gain})"]
         source.add(
             f"transfer[{(last * columns + k) * steps} + i] = {joined([*total, f'h1*({once})'])}"
         )
         if orders[j] == 2:
-            twice = joined([f"{_number(ba[st])}*{mine[st]}" for st in range(s)])
+            twice = joined([f"{literal(ba[st])}*{mine[st]}" for st in range(s)])
             total = ["1.0"] if k == state else ["h1"] if k == last else []
             if k == D:
-                gain = joined([f"{_number(ba[st])}*{a[st]}" for st in range(s)])
+                gain = joined([f"{literal(ba[st])}*{a[st]}" for st in range(s)])
                 jump = f"(x[{state * REACH} + i] - x[{state * REACH + WIDTH} + i])"
                 total = [f"{jump} + h1*(x[{last * REACH} + i] + h1*({gain}))"]
             source.add(

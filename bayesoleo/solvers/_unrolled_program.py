@@ -20,7 +20,10 @@ from numba import types
 
 from bayesoleo._compiled import BLOCK
 from bayesoleo._machine_code import COMPILING, address_of
-from bayesoleo.solvers import _unrolled_collocation as collocation_code
+from bayesoleo.solvers import (
+    _blocked_collocation as blocked_code,
+    _unrolled_collocation as collocation_code,
+)
 from bayesoleo.solvers._loop_instructions import instructions
 from bayesoleo.solvers._mesh import Tableau
 from bayesoleo.solvers._unrolled_collocation import (
@@ -40,6 +43,8 @@ from bayesoleo.solvers._unrolled_collocation import (
 
 #: Systems up to this size are solved by straight-line code; its length grows as the cube.
 LARGEST = 6
+#: A step's matrices of more unknowns than that are no longer kept for a whole period.
+LARGEST_BLOCKED = 16
 _P, _I = types.CPointer(types.float64), types.intp
 #: Of the pieces, see :class:`Program`.
 SIGNATURES = {
@@ -277,23 +282,13 @@ def _differences(
 
 def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
     d, s, D = len(orders), method.stages, sum(orders)
-    if not 1 <= s * d <= LARGEST or D > 4:
+    if not 1 <= d <= LARGEST_BLOCKED:
         return None
-    steps = BLOCK // s // WIDTH * WIDTH
-    pieces = _compile(
-        [
-            collocation_code.rows(orders, method, steps),
-            collocation_code.elimination(orders, method, steps),
-            chain(D, D, tuple(range(D)), steps),
-            collocation_code.substitution(orders, method, steps),
-            chain(D, D, tuple(range(D)), steps, constants_only=True),
-            product(D, range(D)),
-            begin(D, range(D)),
-            collocation_code.update(orders, s, steps),
-        ]
-    )
+    steps, straight = BLOCK // s // WIDTH * WIDTH, s * d <= LARGEST and D <= 4
+    parts = _straight(method, orders, steps) if straight else _blocked(method, orders, steps)
+    layout = blocked_code.Layout(orders, s)
     return Program(
-        **pieces,
+        **_compile([collocation_code.rows(orders, method, steps), *parts]),
         orders=orders,
         stages=s,
         unknowns=D + s * d,
@@ -302,8 +297,33 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
         window=D,
         front=0,
         order=tuple(range(D)),
-        transfer=(D + s * d) * (D + 1) + (s * d) ** 2,
+        transfer=(D + s * d) * (D + 1) + (s * d) ** 2 if straight else layout.total,
     )
+
+
+def _straight(method: Tableau, orders: tuple[int, ...], steps: int) -> list[str]:
+    D = sum(orders)
+    return [
+        collocation_code.elimination(orders, method, steps),
+        chain(D, D, tuple(range(D)), steps),
+        collocation_code.substitution(orders, method, steps),
+        chain(D, D, tuple(range(D)), steps, constants_only=True),
+        product(D, range(D)),
+        begin(D, range(D)),
+        collocation_code.update(orders, method.stages, steps),
+    ]
+
+
+def _blocked(method: Tableau, orders: tuple[int, ...], steps: int) -> list[str]:
+    return [
+        blocked_code.elimination(orders, method, steps),
+        blocked_code.chain(orders, method.stages),
+        blocked_code.substitution(orders, method, steps),
+        blocked_code.chain(orders, method.stages, constants_only=True),
+        blocked_code.product(sum(orders)),
+        blocked_code.begin(sum(orders)),
+        blocked_code.update(orders, method.stages),
+    ]
 
 
 def chunks(n: int) -> np.ndarray:
