@@ -157,6 +157,7 @@ class Sizes(NamedTuple):
     block: int
     transfer: int
     measured: int
+    chords: int
 
 
 @dataclass(frozen=True)
@@ -378,4 +379,5 @@ class Arranged:
             block=program.steps,
             transfer=program.transfer,
             measured=min(sum(program.orders), program.unknowns),
+            chords=program.chords,
         )

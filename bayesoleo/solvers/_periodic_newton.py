@@ -64,8 +64,10 @@ MAXIMUM_HALVINGS = 12
 ROUND_OFF = 1e-14
 #: Old derivatives are tried only below this relative step.
 CHORD_FROM = 0.1
-#: Steps with old derivatives, half as expensive, before there are new ones.
-MOST_CHORDS = 2
+#: The same after the first step, of which the contraction is not known yet; only where new
+#: derivatives cost more than :data:`FEW_CHORDS` steps with old ones, so that a vain one is cheap.
+FIRST_CHORD_FROM = 1e-2
+FEW_CHORDS = 2
 #: Ratio of successive steps above which old derivatives converge too slowly.
 SLOW_CHORD = 0.1
 #: What the steps that are not taken would add up to.
@@ -336,7 +338,8 @@ def _iterate(
         if least < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
             move(work.now, work.dx)
             return CONVERGED, iteration
-        if chords and last < CHORD_FROM and _chord_suffices(size, last):
+        early = sizes.chords > FEW_CHORDS and size < FIRST_CHORD_FROM and not options.initial
+        if chords and (early or (last < CHORD_FROM and _chord_suffices(size, last))):
             keep(work.now, work.base)
             steps, last = _chords(pieces, sizes, sweep, work, options, size)
             iteration += steps
@@ -346,6 +349,10 @@ def _iterate(
             if not chords:
                 keep(work.base, work.now)
             outcome = evaluate(pieces, sizes, sweep, work)
+            if chords and outcome != CONVERGED:  # the last of them led out of the region
+                chords = False
+                keep(work.base, work.now)
+                outcome = evaluate(pieces, sizes, sweep, work)
             continue
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
         last = size if fraction == 1.0 else np.inf
@@ -363,10 +370,10 @@ def _chords(
     """Take the step, and further ones with the same derivatives and closure.
 
     Returns their number and the last one's size: zero where they converged, infinite where they did
-    not contract.
+    not contract. They end before their time where all that are left would not suffice.
     """
-    last = size
-    for count in range(1, MOST_CHORDS + 1):
+    last, most = size, sizes.chords
+    for count in range(1, most + 1):
         move(work.now, work.dx)
         if not evaluate_again(pieces, sizes, sweep, work):
             return count, np.inf
@@ -380,8 +387,11 @@ def _chords(
         if least < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
             move(work.now, work.dx)
             return count, 0.0
+        if count == most or size * (size / last) ** (most - count) > CHORD_LEFT:
+            move(work.now, work.dx)
+            return count, size
         last = size
-    return MOST_CHORDS, last
+    return most, last
 
 
 @jit

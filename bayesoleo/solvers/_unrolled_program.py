@@ -191,6 +191,8 @@ class Program:
         Where in the history the components of the state stand.
     transfer : int
         Rows of a block's transfer, and of the factors behind it.
+    chords : int
+        How many steps with old derivatives cost less than one with new ones.
     """
 
     rows: int
@@ -210,6 +212,7 @@ class Program:
     front: int
     order: tuple[int, ...]
     transfer: int
+    chords: int
 
     @property
     def steps(self) -> int:
@@ -277,6 +280,7 @@ def _differences(
         front=3,
         order=order,
         transfer=d * (D + 1) + d * d,
+        chords=2,
     )
 
 
@@ -298,6 +302,7 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
         front=0,
         order=tuple(range(D)),
         transfer=(D + s * d) * (D + 1) + (s * d) ** 2 if straight else layout.total,
+        chords=2 if straight else 3,
     )
 
 
