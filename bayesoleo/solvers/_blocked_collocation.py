@@ -136,7 +136,6 @@ def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     source.rows(f"count//{WIDTH}")
     source.add(f"h1 = {vector('h', 'at')}")
     source.add("h2 = h1*h1")
-    _squares(source, steps)
     _assemble(source, method, steps)
     _factorise(source)
     _back(source, layout.own)
@@ -176,31 +175,16 @@ def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     return "\n".join(source.lines)
 
 
-def _squares(source: _Rows, steps: int) -> None:
-    """Emit the sums of squares of the residuals and of the equations' terms."""
-    d, s, nz = source.layout.d, source.layout.stages, source.layout.state + source.layout.d
-    stages = range(s)
-    source.loop(f"for e in range({d}):")
-    for i in stages:
-        source.add(f"g{i} = {vector('out', f'e*{BLOCK} + {i * steps} + at')}")
-        source.add(f"t{i} = g{i}*g{i}")
-    left, all_terms = (vector("sums", f"({k} + e)*{BLOCK} + at") for k in (0, d))
-    source.add(f"{left} = {left} + ({joined([f't{i}' for i in stages])})")
-    source.loop(f"for k in range({nz}):")
-    for i in stages:
-        slope = vector("out", f"({d} + e*{nz} + k)*{BLOCK} + {i * steps} + at")
-        source.add(f"term = {slope}*{vector('z', f'k*{BLOCK} + {i * steps} + at')}")
-        source.add(f"t{i} = t{i} + term*term")
-    source.end()
-    source.add(f"{all_terms} = {all_terms} + ({joined([f't{i}' for i in stages])})")
-    source.end()
-
-
 def _assemble(source: _Rows, method: Tableau, steps: int) -> None:
-    """Emit the equations of the stages, the stages of a dof next to each other."""
+    """Emit the equations of the stages, the stages of a dof next to each other, and sums of squares
+    of their residuals and of their terms."""
     layout, s = source.layout, method.stages
     nz, aa, stages = layout.state + layout.d, method.a @ method.a, range(s)
     source.loop(f"for e in range({layout.d}):")
+    for i in stages:
+        source.add(f"l{i} = {vector('out', f'e*{BLOCK} + {i * steps} + at')}")
+        source.add(f"t{i} = l{i}*l{i}")
+    _add_to(source, "e", stages)
     for run in layout.runs:
         source.loop(f"for j in range({run.count}):")
         for i in stages:
@@ -208,6 +192,9 @@ def _assemble(source: _Rows, method: Tableau, steps: int) -> None:
             for k in range(run.order + 1):
                 place = f"({row} + {k})*{BLOCK} + {i * steps} + at"
                 source.add(f"g{k} = {vector('out', place)}")
+                place = f"({run.row} + j*{run.order + 1} + {k})*{BLOCK} + {i * steps} + at"
+                source.add(f"term = g{k}*{vector('z', place)}")
+                source.add(f"t{i} = t{i} + term*term")
             source.add(f"once = h1*g{run.order - 1}")
             if run.order == 2:
                 source.add("twice = h2*g0")
@@ -220,17 +207,21 @@ def _assemble(source: _Rows, method: Tableau, steps: int) -> None:
             column = f"{layout.own + run.state} + j*{run.order}"
             source.add(f"{source.own(f'e*{s} + {i}', column)} = -g0")
             if run.order == 2:
-                slope = f"-({literal(method.c[i])}*once + twice)".replace("once", "h1*g0", 1)
-                slope = slope.replace("twice", "g1")
+                slope = f"-({literal(method.c[i])}*h1*g0 + g1)"
                 source.add(f"{source.own(f'e*{s} + {i}', f'{column} + 1')} = {slope}")
         source.end()
+    _add_to(source, f"{layout.d} + e", stages)
     for i in stages:
-        place = source.own(f"e*{s} + {i}", str(layout.width - 1))
-        source.add(f"{place} = -{vector('out', f'e*{BLOCK} + {i * steps} + at')}")
+        source.add(f"{source.own(f'e*{s} + {i}', str(layout.width - 1))} = -l{i}")
         source.add(f"size = abs({source.own(f'e*{s} + {i}', f'e*{s} + {i}')})")
         source.add(f"{source.size(f'e*{s} + {i}')} = size")
         source.add(f"{source.size(f'e*{s} + {i}', 1)} = size")
     source.end()
+
+
+def _add_to(source: _Rows, row: str, stages: Sequence[int]) -> None:
+    place = vector("sums", f"({row})*{BLOCK} + at")
+    source.add(f"{place} = {place} + ({joined([f't{i}' for i in stages])})")
 
 
 def _factorise(source: _Rows) -> None:

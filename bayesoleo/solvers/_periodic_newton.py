@@ -35,7 +35,7 @@ from bayesoleo.solvers._period_arrangement import (
     unit,
 )
 from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
-from bayesoleo.solvers._unrolled_program import SIGNATURES
+from bayesoleo.solvers._unrolled_program import FEW_CHORDS, SIGNATURES
 
 #: A pivot that asks for an exchange of rows, or a recursion that grows so much that its rounding
 #: errors would spoil the closure: neither is a failure of the problem, only of this elimination.
@@ -65,9 +65,8 @@ ROUND_OFF = 1e-14
 #: Old derivatives are tried only below this relative step.
 CHORD_FROM = 0.1
 #: The same after the first step, of which the contraction is not known yet; only where new
-#: derivatives cost more than :data:`FEW_CHORDS` steps with old ones, so that a vain one is cheap.
+#: derivatives cost more than a few steps with old ones, so that a vain one is cheap.
 FIRST_CHORD_FROM = 1e-2
-FEW_CHORDS = 2
 #: Ratio of successive steps above which old derivatives converge too slowly.
 SLOW_CHORD = 0.1
 #: What the steps that are not taken would add up to.

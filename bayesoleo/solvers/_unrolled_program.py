@@ -45,6 +45,8 @@ from bayesoleo.solvers._unrolled_collocation import (
 LARGEST = 6
 #: A step's matrices of more unknowns than that are no longer kept for a whole period.
 LARGEST_BLOCKED = 16
+#: Steps with old derivatives that cost less than one with new ones: of short code, and of long.
+FEW_CHORDS, MOST_CHORDS = 2, 3
 _P, _I = types.CPointer(types.float64), types.intp
 #: Of the pieces, see :class:`Program`.
 SIGNATURES = {
@@ -280,7 +282,7 @@ def _differences(
         front=3,
         order=order,
         transfer=d * (D + 1) + d * d,
-        chords=2,
+        chords=FEW_CHORDS,
     )
 
 
@@ -302,7 +304,7 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
         front=0,
         order=tuple(range(D)),
         transfer=(D + s * d) * (D + 1) + (s * d) ** 2 if straight else layout.total,
-        chords=2 if straight else 3,
+        chords=MOST_CHORDS if d > 1 else FEW_CHORDS,
     )
 
 

@@ -100,10 +100,10 @@ def motion(amplitudes, n):
     return np.real(turns @ (FORCE.coefficients[:, None] * amplitudes))
 
 
-def solved(d, name, n):
+def solved(d, name, n, backend="numpy"):
     """Values of the dofs at the nodes ``(n, d)`` and their derivatives by the force's scale."""
     model, orders, _, _ = system(d)
-    boundary, p = problem(model, FORCE, FREQUENCY, name, n)
+    boundary, p = problem(model, FORCE, FREQUENCY, name, n, backend)
     assert boundary.scheme.orders == orders
     solution = solve_periodic(boundary, p, rest(boundary, n))
     assert solution.status[0] == Status.CONVERGED
@@ -129,3 +129,12 @@ def test_the_scheme_is_that_of_the_differential_equations(d):
     values, _ = solved(d, "gauss3", 64)
     exact = motion(np.array([continuous(d, k) for k in FORCE.orders]), 64)
     np.testing.assert_allclose(values, exact, atol=1e-6)  # (3 omega h)**6, with rates above 1 too
+
+
+@pytest.mark.parametrize("n", [13, 64])
+@pytest.mark.parametrize(("d", "name"), [(3, "radau2"), (3, "radau3"), (5, "gauss3"), (6, "radau3")])
+def test_compiled_loops_over_dofs_of_mixed_orders(d, name, n):
+    values, by_scale = solved(d, name, n, "numba")
+    exact = motion(np.array([discrete(d, k, name, n) for k in FORCE.orders]), n)
+    np.testing.assert_allclose(values, exact, atol=1e-11)
+    np.testing.assert_allclose(by_scale, exact, atol=1e-11)
