@@ -120,7 +120,9 @@ class _Rows(Source):
     def last(self, line: str, column: str) -> str:
         """An entry of the last state."""
         start = f"base + {self.layout.ends * WIDTH}"
-        return vector("transfer", f"{start} + (({line})*{self.layout.state + 1} + {column})*{WIDTH}")
+        return vector(
+            "transfer", f"{start} + (({line})*{self.layout.state + 1} + {column})*{WIDTH}"
+        )
 
     def size(self, line: str, which: int = 0) -> str:
         """Sum of the sizes of what makes a pivot, and the size that it began with."""
@@ -148,7 +150,7 @@ def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
 def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     """The same for another residual, by the last elimination: ``substitute`` of a program."""
     layout = Layout(tuple(orders), method.stages)
-    s, m, constant = method.stages, layout.own, layout.width - 1
+    s, constant = method.stages, layout.width - 1
     source = _Rows("substitute", "out, x, h, transfer, count", layout)
     source.rows(f"count//{WIDTH}")
     source.add(f"h1 = {vector('h', 'at')}")
@@ -501,7 +503,7 @@ def update(orders: Sequence[int], stages: int) -> str:
     """The Newton step from the chunks' first states."""
     layout = Layout(tuple(orders), stages)
     d, D = layout.d, layout.state
-    source = _Rows("update", "transfer, history, start, dx, rows, width", layout)
+    source = _Rows("update", "transfer, history, start, block, dx, row, rows, width", layout)
     source.rows("rows")
     source.add(f"before = t*{D * (D + 1) * WIDTH}")
     for i0, count, rows in _tiles(D, 4):
@@ -514,17 +516,17 @@ def update(orders: Sequence[int], stages: int) -> str:
             source.add(f"y{q} = y{q} + {_past(D, f'{i0} + i*{rows} + {q}', 'k')}*r")
         source.end()
         for q in range(rows):
-            source.add(f"{vector('dx', f'({i0} + i*{rows} + {q})*{BLOCK} + at')} = y{q}")
+            source.add(f"{vector('dx', f'({i0} + i*{rows} + {q})*row + at')} = y{q}")
         source.end()
     source.loop(f"for j in range({d}):")
     for st in range(stages):
         source.add(f"y{st} = {source.own(f'j*{stages} + {st}', str(layout.width - 1))}")
     source.loop(f"for k in range({D}):")
-    source.add(f"r = {vector('dx', f'k*{BLOCK} + at')}")
+    source.add(f"r = {vector('dx', 'k*row + at')}")
     for st in range(stages):
         slope = source.own(f"j*{stages} + {st}", f"{layout.own} + k")
         source.add(f"y{st} = y{st} + {slope}*r")
     source.end()
     for st in range(stages):
-        source.add(f"{vector('dx', f'({D + st * d} + j)*{BLOCK} + at')} = y{st}")
+        source.add(f"{vector('dx', f'({D + st * d} + j)*row + at')} = y{st}")
     return "\n".join(source.lines)

@@ -5,7 +5,7 @@ range, sums and products of numbers in arrays. Its types are known from the argu
 translated to LLVM's instructions here, one by one. Numba takes ten seconds for the code of two dofs
 and gives the same instructions in the end.
 
-A slice of :data:`WIDE` numbers is one vector, and what is computed from it is one instruction. Loops
+A slice of :data:`WIDE` numbers is one vector, and what is computed from it one instruction. Loops
 within loops need this: the compiler turns only innermost loops into vector instructions by itself.
 """
 
@@ -137,9 +137,7 @@ class _Function:
         assert self._variables[name] == value[1], name
         self._lines.append(f"store {value[1]} {value[0]}, ptr %at_{name}")
 
-    def _loop(
-        self, name: str, first: list[ast.expr], end: ast.expr, body: list[ast.stmt]
-    ) -> None:
+    def _loop(self, name: str, first: list[ast.expr], end: ast.expr, body: list[ast.stmt]) -> None:
         self._count += 1
         label = f"loop{self._count}"
         self._assign(name, self._value(first[0]) if first else ("0", _WHOLE))

@@ -34,7 +34,7 @@ from bayesoleo.solvers._period_arrangement import (
     total,
     unit,
 )
-from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
+from bayesoleo.solvers._unrolled_collocation import WIDTH
 from bayesoleo.solvers._unrolled_program import FEW_CHORDS, SIGNATURES
 
 #: A pivot that asks for an exchange of rows, or a recursion that grows so much that its rounding
@@ -64,13 +64,14 @@ MAXIMUM_HALVINGS = 12
 ROUND_OFF = 1e-14
 #: Old derivatives are tried only below this relative step.
 CHORD_FROM = 0.1
-#: The same after the first step, of which the contraction is not known yet; only where new
-#: derivatives cost more than a few steps with old ones, so that a vain one is cheap.
-FIRST_CHORD_FROM = 1e-2
 #: Ratio of successive steps above which old derivatives converge too slowly.
 SLOW_CHORD = 0.1
 #: What the steps that are not taken would add up to.
 CHORD_LEFT = 1e-14
+#: Old derivatives are tried after the first step already below this, only where new ones cost more
+#: than a few steps with old ones. Each of three contracts by about the first step: its fourth power
+#: is left.
+FIRST_CHORD_FROM = CHORD_LEFT**0.25
 WITHOUT_SIGN = np.int64(2**63 - 1)
 
 
@@ -111,7 +112,6 @@ def move(now: Array, dx: Array) -> None:
 def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> int:
     """Equations at the present unknowns, and the recursion that solves them linearised."""
     steps, stages = sizes.block, sizes.stages
-    reach = steps + (sizes.front + 1) * WIDTH
     points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
     x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
     z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
@@ -120,8 +120,8 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
-        _call_rows(pieces.rows, (x, length, z, steps))
+        now = pointer(work.now, b * steps)
+        _call_rows(pieces.rows, (now, x, length, z, work.now.shape[1], steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
             broken, undefined = _outside(out, sizes, count)
@@ -150,7 +150,6 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
     """Equations alone at the present unknowns, solved with the last derivatives; whether the
     unknowns are admissible."""
     steps, stages = sizes.block, sizes.stages
-    reach = steps + (sizes.front + 1) * WIDTH
     points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
     x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
     z, out = pointer(work.z, 0), pointer(work.out, 0)
@@ -158,8 +157,8 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
     for b in range(u.shape[0]):
         count = min(steps, sizes.rows * WIDTH - b * steps)
         inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        _gather(pointer(work.now, b * steps), work.now.shape[1], x, sizes.unknowns, reach)
-        _call_rows(pieces.rows, (x, length, z, steps))
+        now = pointer(work.now, b * steps)
+        _call_rows(pieces.rows, (now, x, length, z, work.now.shape[1], steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
             broken, undefined = _outside(out, sizes, count)
@@ -170,13 +169,6 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
         _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
     return outside == 0 and odd == 0
-
-
-@jit
-def _gather(now: Any, row: int, x: Any, unknowns: int, reach: int) -> None:
-    """Copy a block's unknowns, and those before it that its steps reach."""
-    for k in range(unknowns):
-        _copy(after(now, k * row), after(x, k * REACH), reach)
 
 
 @jit
@@ -252,11 +244,9 @@ def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
         count = min(steps, sizes.rows * WIDTH - b * steps)
         transfer = pointer(work.transfer, b * work.transfer.shape[1])
         history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        _call_update(update, (transfer, history, start, to, count // WIDTH, WIDTH))
-        begin = sizes.front * WIDTH + b * steps
-        for k in range(sizes.unknowns):
-            at = k * dx.shape[1] + begin
-            _copy(pointer(work.dx_block, k * BLOCK), pointer(dx, at), count)
+        begin = pointer(dx, sizes.front * WIDTH + b * steps)
+        size = dx.shape[1], count // WIDTH, WIDTH
+        _call_update(update, (transfer, history, start, to, begin, *size))
     for k in range(sizes.unknowns):
         for i in range(sizes.front * WIDTH):
             dx[k, i] = dx[k, sweep.again[i]]

@@ -40,6 +40,25 @@ class Source:
         self.indent += "    "
 
 
+def gather(source: Source, unknowns: int, steps: int, front: int = 0) -> None:
+    """Emit the copy of a block's unknowns, and of those that its steps look at, to rows at constant
+    distances."""
+    source.loop(f"for k in range({unknowns}):")
+    for at in range(0, steps + (front + 1) * WIDTH, WIDTH):
+        to, begin = f"k*{REACH} + {at}", f"k*row + {at}"
+        source.add(f"x[{to}:{to} + {WIDTH}] = now[{begin}:{begin} + {WIDTH}]")
+    source.indent = "    "
+
+
+def scatter(source: Source, unknowns: int) -> None:
+    """Emit the copy of a block's step to where the whole period's stands."""
+    source.indent = "    "
+    source.loop(f"for k in range({unknowns}):")
+    source.loop("for t in range(rows):")
+    to, begin = f"k*row + t*{WIDTH}", f"k*{BLOCK} + t*{WIDTH}"
+    source.add(f"dx[{to}:{to} + {WIDTH}] = block[{begin}:{begin} + {WIDTH}]")
+
+
 def joined(terms: Sequence[str]) -> str:
     return " + ".join(terms) if terms else "0.0"
 
@@ -210,7 +229,8 @@ def literal(value: float) -> str:
 def rows(orders: Sequence[int], method: Tableau, steps: int) -> str:
     d, s, D = len(orders), method.stages, sum(orders)
     aa = method.a @ method.a
-    source = Source("rows", "x, h, z, count")
+    source = Source("rows", "now, x, h, z, row, count")
+    gather(source, D + s * d, steps)
     source.loop("for i in range(count):")
     source.add("h1 = h[i]")
     state = 0
@@ -348,7 +368,7 @@ def _column(
 def update(orders: Sequence[int], stages: int, steps: int) -> str:
     d, D = len(orders), sum(orders)
     columns = D + 1
-    source = Source("update", "transfer, history, start, dx, rows, width")
+    source = Source("update", "transfer, history, start, block, dx, row, rows, width")
     source.loop("for t in range(rows):")
     source.add(f"base = t*{D * columns * WIDTH}")
     source.add(f"at = t*{WIDTH}")
@@ -357,9 +377,10 @@ def update(orders: Sequence[int], stages: int, steps: int) -> str:
         now = [f"history[base + {(i * columns + k) * WIDTH} + c]" for k in range(columns)]
         terms = [now[D]] + [f"{now[k]}*start[{k * WIDTH} + c]" for k in range(D)]
         source.add(f"d{i} = {joined(terms)}")
-        source.add(f"dx[{i * BLOCK} + at + c] = d{i}")
+        source.add(f"block[{i * BLOCK} + at + c] = d{i}")
     for line in range(stages * d):
         own = [f"transfer[{((D + line) * columns + k) * steps} + at + c]" for k in range(columns)]
         terms = [own[D]] + [f"{own[k]}*d{k}" for k in range(D)]
-        source.add(f"dx[{(D + line) * BLOCK} + at + c] = {joined(terms)}")
+        source.add(f"block[{(D + line) * BLOCK} + at + c] = {joined(terms)}")
+    scatter(source, D + stages * d)
     return "\n".join(source.lines)

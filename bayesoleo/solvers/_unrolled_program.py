@@ -34,9 +34,11 @@ from bayesoleo.solvers._unrolled_collocation import (
     add_squares,
     begin,
     chain,
+    gather,
     joined,
     product,
     rows_before,
+    scatter,
     solve,
     solve_again,
 )
@@ -50,18 +52,32 @@ FEW_CHORDS, MOST_CHORDS = 2, 3
 _P, _I = types.CPointer(types.float64), types.intp
 #: Of the pieces, see :class:`Program`.
 SIGNATURES = {
-    "rows": types.void(_P, _P, _P, _I),
+    "rows": types.void(_P, _P, _P, _P, _I, _I),
     "eliminate": _I(_P, _P, _P, _P, _P, _P, _I),
     "chain": types.void(_P, _P, _I, _I),
     "substitute": types.void(_P, _P, _P, _P, _I),
     "follow": types.void(_P, _P, _I, _I),
     "product": types.void(_P, _P, _I, _I, _I),
     "begin": types.void(_P, _P, _P, _I, _I, _I),
-    "update": types.void(_P, _P, _P, _P, _I, _I),
+    "update": types.void(_P, _P, _P, _P, _P, _I, _I, _I),
 }
 #: Their arguments that are arrays; the others are whole numbers.
 ARRAYS = frozenset(
-    {"x", "h", "z", "out", "sums", "transfer", "history", "products", "inverse", "start", "dx"}
+    {
+        "x",
+        "h",
+        "z",
+        "out",
+        "sums",
+        "transfer",
+        "history",
+        "products",
+        "inverse",
+        "start",
+        "dx",
+        "now",
+        "block",
+    }
 )
 _PROGRAMS: dict[tuple[str, tuple[int, ...]], Program | None] = {}
 
@@ -72,7 +88,8 @@ def past_nodes(orders: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def rows(orders: Sequence[int], first: Sequence[float], second: Sequence[float]) -> str:
-    source = Source("rows", "x, h, z, count")
+    source = Source("rows", "now, x, h, z, row, count")
+    gather(source, len(orders), BLOCK, 3)
     source.add("once = 1.0/h[0]")
     source.add("twice = once*once")
     source.loop("for i in range(count):")
@@ -142,7 +159,7 @@ def substitution(orders: Sequence[int], steps: int) -> str:
 def update(orders: Sequence[int]) -> str:
     d, past = len(orders), len(past_nodes(orders))
     columns, window = past + 1, 3 * d
-    source = Source("update", "transfer, history, start, dx, rows, width")
+    source = Source("update", "transfer, history, start, block, dx, row, rows, width")
     source.loop("for t in range(rows):")
     source.add(f"base = t*{d * columns * WIDTH}")
     source.add(f"at = t*{WIDTH}")
@@ -154,7 +171,8 @@ def update(orders: Sequence[int]) -> str:
         terms = [at[past]] + [f"{at[k]}*s{k}" for k in range(past)]
         source.add(f"d{j} = {joined(terms)}")
     for j in range(d):
-        source.add(f"dx[{j * BLOCK} + at + c] = d{j}")
+        source.add(f"block[{j * BLOCK} + at + c] = d{j}")
+    scatter(source, d)
     return "\n".join(source.lines)
 
 
@@ -165,7 +183,8 @@ class Program:
     Parameters
     ----------
     rows : int
-        ``(x, h, z, count)``: values and derivatives of the dofs at the points.
+        ``(now, x, h, z, row, count)``: values and derivatives of the dofs at the points, and the
+        block's unknowns ``x`` out of rows ``now`` of a length.
     eliminate : int
         ``(out, x, h, z, sums, transfer, count)``: solves for a step's own unknowns, and adds
         squares of residuals, and of all terms, to ``sums``; returns how many pivots were too small.
@@ -181,8 +200,8 @@ class Program:
     begin : int
         ``(history, inverse, start, whole, rest, closed)``: the chunks' first states.
     update : int
-        ``(transfer, history, start, dx, rows, width)``: the Newton step from the chunks' first
-        states.
+        ``(transfer, history, start, block, dx, row, rows, width)``: the Newton step from the
+        chunks' first states, into rows ``dx`` of a length; ``block`` is work space.
     orders : tuple of int
         Order of each dof.
     stages, unknowns, state, new, window, front : int
@@ -304,7 +323,7 @@ def _collocation(method: Tableau, orders: tuple[int, ...]) -> Program | None:
         front=0,
         order=tuple(range(D)),
         transfer=(D + s * d) * (D + 1) + (s * d) ** 2 if straight else layout.total,
-        chords=MOST_CHORDS if d > 1 else FEW_CHORDS,
+        chords=MOST_CHORDS if D > 3 else FEW_CHORDS,
     )
 
 

@@ -132,7 +132,9 @@ def test_the_scheme_is_that_of_the_differential_equations(d):
 
 
 @pytest.mark.parametrize("n", [13, 64])
-@pytest.mark.parametrize(("d", "name"), [(3, "radau2"), (3, "radau3"), (5, "gauss3"), (6, "radau3")])
+@pytest.mark.parametrize(
+    ("d", "name"), [(3, "radau2"), (3, "radau3"), (5, "gauss3"), (6, "radau3")]
+)
 def test_compiled_loops_over_dofs_of_mixed_orders(d, name, n):
     values, by_scale = solved(d, name, n, "numba")
     exact = motion(np.array([discrete(d, k, name, n) for k in FORCE.orders]), n)

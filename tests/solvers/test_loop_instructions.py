@@ -76,14 +76,14 @@ def test_what_is_not_of_the_language_is_refused(statement, told):
 
 
 SIZES = {
-    "rows": {"count": 8},
+    "rows": {"row": 96, "count": 8},
     "eliminate": {"count": 8},
     "chain": {"rows": 2, "width": 8},
     "substitute": {"count": 8},
     "follow": {"rows": 2, "width": 8},
     "product": {"whole": 1, "rest": 3, "width": 2},
     "begin": {"whole": 1, "rest": 3, "closed": 1},
-    "update": {"rows": 2, "width": 8},
+    "update": {"row": 64, "rows": 2, "width": 8},
 }
 
 
