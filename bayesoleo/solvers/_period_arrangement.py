@@ -30,6 +30,9 @@ from bayesoleo.solvers._unrolled_program import Program, chunks
 LEAST_MOTION = 1e-6
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH
+#: Bytes of the steps' matrices, which a thread keeps, above which the general iteration, that
+#: eliminates them in groups, solves: a transient of ten dofs has them at thirty thousand steps.
+MOST_BYTES = 5e8
 #: Numbers in a cache line.
 LINE = 8
 _kept = threading.local()

@@ -141,7 +141,7 @@ class Boundary:
         if program is None:
             return None
         n = self.inputs.shape[1] // program.stages
-        if n < arrangement.LEAST_STEPS:
+        if n < arrangement.LEAST_STEPS or 8 * program.transfer * n > arrangement.MOST_BYTES:
             return None
         return arrangement.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
 

@@ -45,7 +45,8 @@ from bayesoleo.solvers._unrolled_collocation import (
 
 #: Systems up to this size are solved by straight-line code; its length grows as the cube.
 LARGEST = 6
-#: A step's matrices of more unknowns than that are no longer kept for a whole period.
+#: Dofs up to which there are loops for collocation; the matrices of a period's steps, which are
+#: kept, grow as their square.
 LARGEST_BLOCKED = 16
 #: Steps with old derivatives that cost less than one with new ones: of short code, and of long.
 FEW_CHORDS, MOST_CHORDS = 2, 3

@@ -28,6 +28,20 @@ def words(x, y, count, closed):
     return found
 """
 
+VECTORS = """
+def vectors(x, y, count):
+    low = 0
+    for t in range(1, count):
+        at = t*8
+        v = x[at:at + 8]*2.0
+        if any(v != 0.0):
+            w = 1.0/(2.5 + abs(v)) - x[t]
+            y[at:at + 8] -= -w
+        low += 0 if all(v > 0.0) and all(1.0 <= v) else 1
+        y[t:t + 8] = 7.0
+    return low*10 + count//3
+"""
+
 
 def called(source: str, arrays: dict[str, np.ndarray], whole: dict[str, int], returned: str) -> int:
     """By machine code, in place."""
@@ -61,9 +75,23 @@ def test_every_statement_of_the_language(closed):
     np.testing.assert_allclose(y, other, rtol=1e-14)
 
 
+def test_vectors():
+    """Slices of eight numbers, and numbers beside them."""
+    x, y = np.linspace(-1.0, 2.0, 64), np.linspace(0.0, 1.0, 64)
+    x[16:24] = 0.0
+    other = y.copy()
+    found = called(VECTORS, {"x": x, "y": y}, {"count": 8}, "i64")
+    assert found == by_python(VECTORS, {"x": x, "y": other}, {"count": 8})
+    assert 10 < found < 80, "some are low, and not all"
+    np.testing.assert_allclose(y, other, rtol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("statement", "told"),
     [
+        ("x[0:4] = 1.0", r"x\[0:4\]"),
+        ("x[0:1 + 8] = 1.0", r"x\[0:1 \+ 8\]"),
+        ("for i in range(1, 2, 3): x[i] = 1.0", "for i in range"),
         ("x[0] = 1.0 if x[0] else 0.0", r"x\[0\]"),
         ("x[0] = 1", r"a whole number in x\[0\]"),
         ("x[0] = True", "True"),
@@ -88,7 +116,7 @@ SIZES = {
 
 
 @pytest.mark.parametrize("name", list(SIZES))
-@pytest.mark.parametrize("orders", [(1,), (2, 1)])
+@pytest.mark.parametrize("orders", [(1,), (2, 1), (2, 2, 1)])
 def test_pieces_of_a_sweep(monkeypatch, orders, name):
     kept: list[str] = []
     monkeypatch.setattr(

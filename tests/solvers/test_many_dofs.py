@@ -9,7 +9,11 @@ import pytest
 from periodic_problems import harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers import _periodic as periodic, _unrolled_program as program
+from bayesoleo.solvers import (
+    _period_arrangement as arrangement,
+    _periodic as periodic,
+    _unrolled_program as program,
+)
 from bayesoleo.solvers._mesh import tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import sensitivities, solve_periodic
@@ -178,6 +182,15 @@ def test_first_steps_with_old_derivatives_end_at_the_same_motion(d):
     assert abs(found.x - exact).max() < 1e-12 * abs(exact).max()
     general = periodic._Newton(boundary, many, exact * (1.0 + distances[:, None, None]), 40, True)
     np.testing.assert_allclose(found.x, general.run().x, rtol=0, atol=1e-11)
+
+
+def test_what_does_not_fit_into_memory_takes_the_general_iteration(monkeypatch):
+    monkeypatch.setattr(arrangement, "MOST_BYTES", 1e4)
+    boundary, p = problem(chain(3), FORCE, FREQUENCY, "radau3", 13, "numba")
+    assert boundary.arranged is None
+    solution = solve_periodic(boundary, p, rest(boundary, 13))
+    values, _ = Dense(3, 13, False).solved(NOMINAL)
+    np.testing.assert_allclose(solution.x[0, :, :6][:, in_order(3)], values, rtol=0, atol=1e-12)
 
 
 def test_more_dofs_than_loops_are_for_take_the_general_iteration():
