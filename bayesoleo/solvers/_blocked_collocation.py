@@ -9,7 +9,8 @@ would be subtracted, so the result is the same to the last bit.
 
 A row of steps keeps, one behind the other: the stages' equations ``(s d, s d + D + 1)``, with the
 factors on the left and on the right what stages owe to the components of the first state and to the
-residual; the same of the last state ``(D, D + 1)``; sizes of pivots ``(2, s d)``.
+residual; the same of the last state ``(D, D + 1)``; sizes of pivots ``(2, s d)``; numbers that say
+which blocks of the factors are not zero ``(d, d)``.
 """
 
 from __future__ import annotations
@@ -74,8 +75,13 @@ class Layout:
         return self.ends + self.state * (self.state + 1)
 
     @property
-    def total(self) -> int:
+    def flags(self) -> int:
+        """Where it is said which blocks are not zero."""
         return self.sizes + 2 * self.own
+
+    @property
+    def total(self) -> int:
+        return self.flags - -(self.d**2) // WIDTH
 
     @property
     def runs(self) -> list[Run]:
@@ -140,7 +146,7 @@ def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     source.add("h2 = h1*h1")
     _assemble(source, method, steps)
     _factorise(source)
-    _back(source, layout.own)
+    _back(source, layout.own, known=False)
     _ends(source, method, 0)
     source.end()
     source.add("return failed")
@@ -159,7 +165,7 @@ def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     for q in range(s):
         source.add(f"x{q} = -{vector('out', f'e*{BLOCK} + {q * steps} + at')}")
     source.loop("for c in range(e):")
-    _unless_zero(source, "e", "c")
+    _unless_zero(source, "e", "c", known=True)
     for p in range(s):
         source.add(f"r{p} = {source.own(f'c*{s} + {p}', str(constant))}")
     for q in range(s):
@@ -172,7 +178,7 @@ def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     for q in range(s):
         source.add(f"{source.own(f'e*{s} + {q}', str(constant))} = x{q}")
     source.end()
-    _back(source, constant)
+    _back(source, constant, known=True)
     _ends(source, method, layout.state)
     return "\n".join(source.lines)
 
@@ -277,14 +283,21 @@ def _factorise(source: _Rows) -> None:
     source.end(3)
 
 
-def _unless_zero(source: _Rows, line: str, column: str) -> None:
-    """Load a block into ``b``, and go on where any of its numbers is not zero."""
-    s, blocks = source.layout.stages, []
+def _unless_zero(source: _Rows, line: str, column: str, known: bool = False) -> None:
+    """Load a block into ``b``, and go on where any of its numbers is not zero; whether that is so is
+    kept, since what is not looked at need not come from memory."""
+    s, layout, blocks = source.layout.stages, source.layout, []
+    flag = f"transfer[base + {layout.flags * WIDTH} + {line}*{layout.d} + {column}]"
+    if known:
+        source.loop(f"if {flag} != 0.0:")
     for q in range(s):
         for p in range(s):
             source.add(f"b{q}_{p} = {source.own(f'{line}*{s} + {q}', f'{column}*{s} + {p}')}")
             blocks.append(f"abs(b{q}_{p})")
-    source.loop(f"if any({joined(blocks)} != 0.0):")
+    if not known:
+        source.add(f"{flag} = 0.0")
+        source.loop(f"if any({joined(blocks)} != 0.0):")
+        source.add(f"{flag} = 1.0")
 
 
 def _subtract(source: _Rows, line: str, other: str, first: str, end: int) -> None:
@@ -301,13 +314,13 @@ def _subtract(source: _Rows, line: str, other: str, first: str, end: int) -> Non
     source.end()
 
 
-def _back(source: _Rows, first: int) -> None:
+def _back(source: _Rows, first: int, *, known: bool) -> None:
     """Emit back substitution of the right-hand sides from one column on."""
     layout, s = source.layout, source.layout.stages
     source.loop(f"for backwards in range({layout.d}):")
     source.add(f"e = {layout.d - 1} - backwards")
     source.loop(f"for c in range(e + 1, {layout.d}):")
-    _unless_zero(source, "e", "c")
+    _unless_zero(source, "e", "c", known)
     _subtract(source, "e", "c", str(first), layout.width)
     source.end(2)
     for q in range(s):
