@@ -284,8 +284,10 @@ def _factorise(source: _Rows) -> None:
 
 
 def _unless_zero(source: _Rows, line: str, column: str, known: bool = False) -> None:
-    """Load a block into ``b``, and go on where any of its numbers is not zero; whether that is so is
-    kept, since what is not looked at need not come from memory."""
+    """Load a block into ``b``, and go on where any of its numbers is not zero.
+
+    Whether that is so is kept: what is not looked at again need not come from memory.
+    """
     s, layout, blocks = source.layout.stages, source.layout, []
     flag = f"transfer[base + {layout.flags * WIDTH} + {line}*{layout.d} + {column}]"
     if known:
