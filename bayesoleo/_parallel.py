@@ -1,7 +1,8 @@
 """Independent work on threads, on processes of this machine, or on many machines by Dask.
 
-Kernels release the interpreter lock, so threads are enough inside one process. A calculation that
-is to outlive others' crashes gets a process of its own. Workers on other machines return results
+Kernels release the interpreter lock, so threads are enough for work that is mostly in kernels; work
+in Python goes to :mod:`bayesoleo._worker_processes`. A calculation that is to outlive others'
+crashes gets a process of its own. Workers on other machines return results
 and write nothing; the caller stores them. If a worker is lost, others repeat the tasks with which
 it was busy.
 """
@@ -49,6 +50,11 @@ def limit_threads(count: int | None) -> None:
     """
     global _limit
     _limit = count
+
+
+def thread_limit() -> int:
+    """Number of threads to which this process is limited; very many without a limit."""
+    return sys.maxsize if _limit is None else _limit
 
 
 def available_cores() -> int:

@@ -17,6 +17,8 @@ from threadpoolctl import threadpool_limits
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 threadpool_limits(1, user_api="blas")
+# For the same reason a search has no other processes; tests of these ask for them.
+os.environ.setdefault("BAYESOLEO_PROCESSES", "0")
 
 #: Modules that take turns over the compiled solvers, the integrator of shooting and the collocation
 #: of periodic motions. One worker runs them all, and first: a minute of compilation is done once,

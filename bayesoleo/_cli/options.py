@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
+from bayesoleo._cli import shell
 from bayesoleo._workflow.settings import OPTION, RUNNING, SettingOption, Settings
 from bayesoleo.errors import InputError
 
@@ -97,6 +98,8 @@ def of_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., No
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @wraps(command)
         def called(**given: Any) -> None:
+            if "quick" in names:  # it takes long
+                shell.announce(command.__name__, given)
             chosen = settings(**{name: given.pop(name) for name in names})
             command(**given, chosen=chosen)
 

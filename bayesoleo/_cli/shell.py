@@ -295,6 +295,23 @@ def _unfinished(results: Path) -> bool:
     return schema.UNFINISHED in read_attributes(results)
 
 
+def announce(command: str, given: Mapping[str, Any]) -> None:
+    """Say at once that a command has begun: to load numerical libraries takes seconds.
+
+    Parameters
+    ----------
+    command : str
+        Its name.
+    given : mapping of str to object
+        Its arguments and options; ``quiet`` says nothing.
+    """
+    campaign = given.get("campaign")
+    missing = isinstance(campaign, Path) and not campaign.expanduser().exists()
+    if not given.get("quiet") and not missing:  # an error is told in one line
+        of = f" {campaign}" if campaign is not None else ""
+        complain(f"{command}{of}: loading libraries")
+
+
 def console() -> Console:
     """Standard output; wide where it is not a terminal, so that tables are not cut."""
     from rich.console import Console

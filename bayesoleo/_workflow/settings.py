@@ -272,7 +272,13 @@ class Settings:
         min=0, metavar="N",
     )  # fmt: skip
     jobs: int | None = _setting(
-        None, int | None, RUNNING, "Threads.", min=1, metavar="N", show_default="all cores"
+        None,
+        int | None,
+        RUNNING,
+        "Threads, and processes that share a search.",
+        min=1,
+        metavar="N",
+        show_default="all cores",
     )
     quick: bool = _setting(False, bool, RUNNING, "Draw enough for intervals of two digits only.")
     effective_size: int = _setting(

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
@@ -40,7 +39,7 @@ from bayesoleo.discovery._refit import (
     fall_from,
     inflation_along,
     quick_fit,
-    refit,
+    refit_all,
     schwarz_price,
 )
 from bayesoleo.discovery._round import Progress, Round
@@ -224,7 +223,7 @@ def _best_seconds(
     scores, _ = score_candidates(base, state.assembly, effects, numerics.jobs)
     named = [score for score in scores if score.option.candidate.family != FAMILY]
     chosen = sorted(named, key=lambda score: -score.fall)[: numerics.policy.seconds]
-    return thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    return refit_all(base, chosen, numerics)
 
 
 def _with_two(progress: Progress) -> State:

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo._types import Array
+from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
 from bayesoleo.discovery._policy import SearchPolicy
@@ -31,6 +33,7 @@ from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._predictor import Layout, RunPrediction
+from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
 STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
@@ -240,6 +243,22 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price,
         base.policy, base.feigned,
     )  # fmt: skip
+
+
+def refit_all(base: Base, scores: Sequence[Score], numerics: Numerics) -> list[Refit]:
+    """Estimates of the model extended by each of some candidates; see :func:`refit`."""
+    shared = base, numerics
+    found = process_map(_apart, shared, scores, numerics.jobs, known=_records_of)
+    return [replace(one, score=score) for one, score in zip(found, scores, strict=True)]
+
+
+def _apart(shared: tuple[Base, Numerics], score: Score) -> Refit:
+    """The estimate without its score, which whoever asked has."""
+    return replace(refit(shared[0], score, shared[1]), score=cast(Any, None))
+
+
+def _records_of(shared: tuple[Base, Numerics]) -> Sequence[Record]:
+    return shared[0].fit.records
 
 
 def schwarz_price(base: Base) -> float:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
@@ -27,7 +26,7 @@ from bayesoleo.discovery._ranking import (
     rank,
     score_candidates,
 )
-from bayesoleo.discovery._refit import Refit, refit
+from bayesoleo.discovery._refit import Refit, refit, refit_all
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
@@ -265,7 +264,7 @@ def place_of(
     own, others = scores[0], scores[1:]
     known = accepted.same
     chosen = [own, *_worth_estimating(own, others, known, only_known, numerics.policy)]
-    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    results = refit_all(base, chosen, numerics)
     refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
     refits |= _from_other_shapes(base, refits, chosen, numerics)
     ranking = rank(scores, progress.rounds[number].tests, refits, policy=numerics.policy)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._fit import Numerics
@@ -20,7 +19,7 @@ from bayesoleo.discovery._hold_out_confirmation import confirmed
 from bayesoleo.discovery._nonparametric_search import CurveSearch
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, rank, score_candidates
-from bayesoleo.discovery._refit import Refit, refit
+from bayesoleo.discovery._refit import Refit, refit_all
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import corrected_p, effective_tests
 from bayesoleo.discovery._state import State
@@ -186,7 +185,7 @@ def _refit_few(
     callback(
         f"estimate the best {len(chosen)}: {', '.join(s.option.candidate.effect for s in chosen)}"
     )
-    results = thread_map(lambda score: refit(base, score, numerics), chosen, numerics.jobs)
+    results = refit_all(base, chosen, numerics)
     return {id(score): result for score, result in zip(chosen, results, strict=True)}
 
 

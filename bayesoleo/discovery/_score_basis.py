@@ -251,7 +251,10 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     """Derivatives of one run's outputs, shape (L, ny, na, N)."""
     run.motions = fit.predictor.runs[r].known_motions()
     run.watched = False  # at the null nothing has moved
-    if len(p) == 1:
+    known = run.evaluate_on(fit.predictor.runs[r], p)
+    if known is not None and (known.status == Status.CONVERGED.value).all():
+        samples = known
+    elif len(p) == 1:
         samples = run.evaluate(p[0])
     else:
         status = run.set_anchor(p[0])

@@ -17,13 +17,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from scipy import stats
 
-from bayesoleo._parallel import single_blas_thread, thread_map
+from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
+from bayesoleo._worker_processes import process_map
 from bayesoleo.data._noise import NoiseSpectrum, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Option
 from bayesoleo.discovery._policy import SearchPolicy
@@ -228,7 +229,11 @@ def score_all(
     failed : dict of str to str
         Reason by effect where the extended model could not be solved.
     """
-    results = thread_map(lambda option: _attempt(base, option), list(options), jobs)
+    found = process_map(_apart, base, options, jobs)
+    results = [
+        replace(one, option=option) if isinstance(one, Score) else one
+        for one, option in zip(found, options, strict=True)
+    ]
     scores = [item for item in results if isinstance(item, Score)]
     failed = {
         f"{o.key[0]} at {o.key[1]}": r.message
@@ -248,6 +253,12 @@ def _directions_of(columns: Array) -> Array:
     is beyond their range."""
     largest = np.abs(columns).max(axis=1, keepdims=True, initial=0.0)
     return np.asarray((columns / np.where(largest > 0, largest, 1.0)).astype(np.float32))
+
+
+def _apart(base: Base, option: Option) -> Score | Status | str:
+    """The score without its candidate, which whoever asked has."""
+    found = _attempt(base, option)
+    return replace(found, option=cast(Any, None)) if isinstance(found, Score) else found
 
 
 def _attempt(base: Base, option: Option) -> Score | Status | str:

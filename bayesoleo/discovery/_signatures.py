@@ -15,8 +15,8 @@ import scipy.fft
 from scipy import optimize, stats
 from scipy.special import expit
 
-from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
+from bayesoleo._worker_processes import process_map
 from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, without_masked
@@ -300,7 +300,7 @@ def signatures_of(
     groups: list[_Group] = []
     sensitivity = _sensitivity(fit, noise)
     gram = sensitivity @ sensitivity.T
-    for found in thread_map(lambda option: _groups(fit, others, option), options, jobs):
+    for found in process_map(_groups_of, (fit, others), options, jobs):
         scaled = (_scaled(fit, noise, group, sensitivity, gram) for group in found)
         groups += [group for group in scaled if group is not None]
     return _assembled(fit, others, noise, groups)
@@ -318,6 +318,11 @@ class _Group:
     member: str
     columns: Mapping[str, Mapping[str, Array]]
     directions: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def _groups_of(shared: tuple[ModelFit, Sequence[ModelFit]], option: Option) -> list[_Group]:
+    """See :func:`_groups`; also of another process."""
+    return _groups(*shared, option)
 
 
 def _groups(fit: ModelFit, others: Sequence[ModelFit], option: Option) -> list[_Group]:

@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, ProgressCallback
+from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Added, Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
@@ -44,6 +45,7 @@ from bayesoleo.effects._nonparametric import Axis, balance_places
 from bayesoleo.errors import ModelError
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import LogNormal
+from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
 
 #: Structures are estimated this many at a time, so often, where their probability may be more than
@@ -318,7 +320,7 @@ def structure_posterior(
     for grown, fit in known:
         evidence.add(_anchor(grown, fit, by_key))
     tried: set[tuple[Added, ...]] = set()
-    extended = _extended(base, assembly, by_key, numerics)
+    ground = Ground(base, assembly, by_key, numerics)
     for _ in range(TIMES):
         doubtful = [e for e in evidence.doubtful(float(np.log(WORTH))) if e and e not in tried]
         chosen = [e for e in evidence.without_outside() if e not in tried]
@@ -330,7 +332,7 @@ def structure_posterior(
         callback(f"estimate {len(chosen)} structures")
         tried |= set(chosen)
         starts = [(effects, evidence.nearest(effects, declared)) for effects in chosen]
-        for found in thread_map(lambda one: extended(*one), starts, numerics.jobs):
+        for found in process_map(extended, ground, starts, numerics.jobs, known=_records_of):
             if found is not None:
                 evidence.add(found)
     return evidence.posterior()
@@ -386,44 +388,51 @@ def _parameters(grown: Assembly, score: Score, part: float, base: Base) -> dict[
     return found
 
 
-def _extended(
-    base: Base, assembly: Assembly, scores: Mapping[Added, Score], numerics: Numerics
-) -> Callable[[tuple[Added, ...], EstimatedModel], EstimatedModel | None]:
-    """Estimates a set of effects together from the estimate of some of them; None where that
+@dataclass(frozen=True)
+class Ground:
+    """What structures are estimated from: the declared model, and the scores of all effects."""
+
+    base: Base
+    assembly: Assembly
+    scores: Mapping[Added, Score]
+    numerics: Numerics
+
+
+def extended(
+    ground: Ground, start: tuple[tuple[Added, ...], EstimatedModel]
+) -> EstimatedModel | None:
+    """Estimate a set of effects together from the estimate of some of them; None where that
     failed."""
-
+    effects, near = start
+    base, scores = ground.base, ground.scores
     order = {key: place for place, key in enumerate(scores)}
-
-    def estimated(effects: tuple[Added, ...], near: EstimatedModel) -> EstimatedModel | None:
-        grown, known = assembly.with_values(base.fit.shared), dict(base.fit.values)
-        named: dict[Added, Score] = {}
-        try:
-            # What exists beside another effect only comes after it.
-            for key in sorted(effects, key=lambda one: order[one]):
-                step = scores[key].option.assembly.steps[-1]
-                option = grown.option(step.effect, step.target, step.scales)
-                score = named[key] = _named_as(scores[key], option)
-                grown = option.assembly
-                # Beside others an effect has less to explain than alone.
-                part = LESS if near.effects else 1.0
-                grown = grown.with_parameters(_parameters(grown, score, part, base))
-                expected = zip(score.names, map(float, part * score.expected), strict=True)
-                known |= {
-                    name: value for name, value in expected if name not in grown.model().parameters
-                }
-            present = grown.model().parameters
-            shared = near.fit.shared
-            grown = grown.with_values({name: shared[name] for name in shared if name in present})
-            known |= near.fit.values
-            fit = quick_fit(base, grown.model(), known, numerics, "be")
-        except ModelError:
-            # Effects may exclude each other: what drifts has no periodic state that lags behind it.
-            return None
-        # A fit that stopped early is linearised where it is, which does nearly as well.
-        solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
-        return _anchor(grown, fit, named) if solved else None
-
-    return estimated
+    grown, known = ground.assembly.with_values(base.fit.shared), dict(base.fit.values)
+    named: dict[Added, Score] = {}
+    try:
+        # What exists beside another effect only comes after it.
+        for key in sorted(effects, key=lambda one: order[one]):
+            step = scores[key].option.assembly.steps[-1]
+            option = grown.option(step.effect, step.target, step.scales)
+            score = named[key] = _named_as(scores[key], option)
+            grown = option.assembly
+            # Beside others an effect has less to explain than alone.
+            part = LESS if near.effects else 1.0
+            grown = grown.with_parameters(_parameters(grown, score, part, base))
+            expected = zip(score.names, map(float, part * score.expected), strict=True)
+            known |= {
+                name: value for name, value in expected if name not in grown.model().parameters
+            }
+        present = grown.model().parameters
+        shared = near.fit.shared
+        grown = grown.with_values({name: shared[name] for name in shared if name in present})
+        known |= near.fit.values
+        fit = quick_fit(base, grown.model(), known, ground.numerics, "be")
+    except ModelError:
+        # Effects may exclude each other: what drifts has no periodic state that lags behind it.
+        return None
+    # A fit that stopped early is linearised where it is, which does nearly as well.
+    solved = all(np.isfinite(p.sensitivity).all() for p in fit.predictions)
+    return _anchor(grown, fit, named) if solved else None
 
 
 def structure_fits(
@@ -434,13 +443,15 @@ def structure_fits(
     numerics: Numerics,
 ) -> list[EstimatedModel | None]:
     """Estimates of some structures; None where one failed. No effects are the base itself."""
-    extended = _extended(base, assembly, {s.option.key: s for s in scores}, numerics)
+    ground = Ground(base, assembly, {s.option.key: s for s in scores}, numerics)
     declared = EstimatedModel(base.fit, {})
+    starts = [(effects, declared) for effects in structures if effects]
+    found = iter(process_map(extended, ground, starts, numerics.jobs, known=_records_of))
+    return [next(found) if effects else declared for effects in structures]
 
-    def fitted(effects: tuple[Added, ...]) -> EstimatedModel | None:
-        return extended(effects, declared) if effects else declared
 
-    return thread_map(fitted, list(structures), numerics.jobs)
+def _records_of(ground: Ground) -> Sequence[Record]:
+    return ground.base.fit.records
 
 
 def curves_of(

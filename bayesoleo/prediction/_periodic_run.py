@@ -31,6 +31,7 @@ from bayesoleo.solvers._periodic import (
     Boundary,
     Solution,
     sensitivities,
+    sensitivities_at,
     solve_extrapolated,
     solve_from_guess,
     solve_periodic,
@@ -113,7 +114,7 @@ class RunPredictor:
                 f"solves it, and run {record.label} is periodic",
                 hint="use time in outputs, or in equations of transients only",
             )
-        self.scheme = scheme(scheme_name, derived.orders)
+        self.scheme, self.scheme_name = scheme(scheme_name, derived.orders), scheme_name
         self.period = 1.0 / record.frequency
         self.points = self.scheme.phases(steps)
         self.known_rows: RowCache = {} if known_rows is None else known_rows
@@ -332,6 +333,45 @@ class RunPredictor:
         samples = self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
         monodromy = None if self.anchor.monodromy is None else self.anchor.monodromy[None]
         return replace(samples, jumped=np.array([self.anchor.jumped]), monodromy=monodromy)
+
+    def evaluate_on(self, other: RunPredictor, p: Array) -> PredictedSamples | None:
+        """Outputs with derivatives where constants leave the motion of another model unchanged.
+
+        Nothing is solved but the derivatives, by one elimination for all sets of constants. The
+        motion becomes the anchor.
+
+        Parameters
+        ----------
+        other : RunPredictor
+            The same run under a model that this one extends, at its anchor.
+        p : ndarray, shape (L, np)
+            Constants at which the extension is absent.
+
+        Returns
+        -------
+        PredictedSamples or None
+            None where the models have other states or meshes, or the motion is another one.
+        """
+        motion = other.anchor
+        if motion is None or not self._moves_like(other):
+            return None
+        found = sensitivities_at(self.boundary, p, motion.x)
+        if found is None:
+            return None
+        x_p, monodromy = found
+        moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+        self.anchor = Anchor(p[0].copy(), motion.x, moved, monodromy[0])
+        x = np.repeat(motion.x[None], len(p), axis=0)
+        status = np.full(len(p), Status.CONVERGED.value, dtype=np.int64)
+        return self._at_samples(p, x, x_p, status, derivatives=True)
+
+    def _moves_like(self, other: RunPredictor) -> bool:
+        """Whether unknowns mean the same: one mesh, and the same states in the same order."""
+        if not type(self) is type(other) is RunPredictor:
+            return False
+        mine, its = self.kernels.derived, other.kernels.derived
+        same = mine.dofs == its.dofs and mine.orders == its.orders and bool(mine.dofs)
+        return same and (self.steps, self.scheme_name) == (other.steps, other.scheme_name)
 
     def _at_samples(
         self,

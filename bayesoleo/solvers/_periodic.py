@@ -30,6 +30,9 @@ LAST_STEP = 1e-7
 #: Without quadratic contraction (at a kink) a step this small is taken as converged.
 SMALL_STEP = 1e-11
 MAXIMUM_HALVINGS = 12
+#: Residual over the size of its terms below which a known motion solves other equations too: one
+#: that was found leaves round-off, or at a kink a step of :data:`SMALL_STEP`.
+KNOWN_MERIT = 1e-10
 FIRST_STEP = 0.25
 SMALLEST_STEP = 1.0 / 512
 
@@ -429,6 +432,51 @@ def sensitivities(problem: Boundary, p: Array, solution: Solution) -> tuple[Solu
     status = solution.status.copy()
     status[lanes[~ok[lanes]]] = Status.SINGULAR.value
     return replace(solution, status=status), x_theta, monodromy
+
+
+def sensitivities_at(problem: Boundary, p: Array, x: Array) -> tuple[Array, Array] | None:
+    """Derivatives of one motion that solves the equations for several sets of constants.
+
+    Candidates of a search are absent at their null: the motion is that of the present model,
+    whatever their shape. One elimination then serves all sets.
+
+    Parameters
+    ----------
+    problem : Boundary
+    p : ndarray, shape (L, np)
+        Constants.
+    x : ndarray, shape (n, w)
+        Unknowns of the motion.
+
+    Returns
+    -------
+    x_theta : ndarray, shape (L, n, w, na)
+    monodromy : ndarray, shape (L, D, D)
+        The same for all sets.
+
+    Notes
+    -----
+    None is returned where the motion does not solve all of them, to :data:`KNOWN_MERIT`, where it
+    leaves the admissible region, or where small changes move it in another way for some of them.
+    """
+    count, lanes = p.shape[0], np.arange(p.shape[0])
+    trial = Trial(problem, p, np.repeat(x[None], count, axis=0))
+    if not trial.evaluate(lanes).all():
+        return None
+    with np.errstate(all="ignore"):
+        merit = np.sqrt(np.sum(trial.squares / (trial.terms + 1e-300), axis=1))
+    if not (merit < KNOWN_MERIT).all() or not (trial.gz == trial.gz[:1]).all():
+        return None
+    gp = np.zeros((count, len(trial.g[0]), problem.active, trial.g.shape[2]))
+    problem.equations.parameters(trial.z, problem.inputs, p, lanes, gp)
+    right = np.moveaxis(gp, 0, 1).reshape(1, gp.shape[1], -1, gp.shape[3])
+    dx, monodromy, ok = linear_by_column(
+        problem.scheme, trial.gz[:1], np.ascontiguousarray(right), lanes[:1], trial.step
+    )
+    if not ok[0]:
+        return None
+    by_set = np.moveaxis(dx[0].reshape(*x.shape, count, problem.active), 2, 0)
+    return np.ascontiguousarray(by_set), np.repeat(monodromy, count, axis=0)
 
 
 def linear_by_column(

@@ -67,7 +67,8 @@ def test_interrupt_says_what_is_kept(run, monkeypatch, campaign, model, tmp_path
     monkeypatch.setattr(workflow, "close", interrupted)
     result = run("close", campaign, "--model", model, "--out", out)
     assert result.exit_code == 130
-    (line,) = result.stderr.splitlines()
+    begun, line = result.stderr.splitlines()
+    assert begun == f"close {campaign}: loading libraries"
     if kept:
         assert line.startswith("stopped: no result was written; draws made so far are kept there")
     else:

@@ -38,8 +38,9 @@ from bayesoleo.discovery._structure_comparison import (
 from bayesoleo.discovery._structure_parameters import _summary
 from bayesoleo.discovery._structure_search import (
     Evidence,
-    _extended,
+    Ground,
     _named_as,
+    extended,
     structure_posterior,
 )
 from bayesoleo.effects import find_effect
@@ -124,7 +125,11 @@ def evidence_with(state: State, names=FEW) -> tuple[Evidence, list[EstimatedMode
     declared = EstimatedModel(base.fit, {})
     evidence.add(declared)
     by_key = {score.option.key: score for score in scores}
-    estimate = _extended(base, state.assembly, by_key, NUMERICS)
+    ground = Ground(base, state.assembly, by_key, NUMERICS)
+
+    def estimate(effects, near):
+        return extended(ground, (effects, near))
+
     single = [estimate((key,), declared) for key in PAIR]
     return evidence, [*single, estimate(PAIR, single[0]), estimate(PAIR, declared)]
 
@@ -200,9 +205,8 @@ def test_evidence_about_an_estimate_is_that_of_importance_sampling(tmp_path):
     evidence = Evidence(Comparison.of(base, errors, scores, StructurePrior()))
     evidence.add(EstimatedModel(base.fit, {}))
     (score,) = scores
-    anchor = _extended(base, rubbing.assembly, {FRICTION: score}, NUMERICS)(
-        (FRICTION,), EstimatedModel(base.fit, {})
-    )
+    ground = Ground(base, rubbing.assembly, {FRICTION: score}, NUMERICS)
+    anchor = extended(ground, ((FRICTION,), EstimatedModel(base.fit, {})))
     evidence.add(anchor)
     found = evidence.found[frozenset({FRICTION}), False]
     assert found == pytest.approx(_sampled(evidence.comparison, anchor), abs=0.3)

@@ -1,0 +1,381 @@
+"""Independent work of one calculation in several processes of this machine.
+
+Scores and estimates of candidate effects spend most of their time in Python, where threads wait
+for each other. The processes are kept for the next call, because to start one takes two seconds,
+and end when they have had nothing to do for a while or when this process ends.
+
+A result does not depend on where it was computed. A process that is lost, or that cannot read what
+it is sent, only costs time: its work is done here.
+"""
+
+from __future__ import annotations
+
+import atexit
+import io
+import json
+import os
+import pickle
+import select
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import Any, BinaryIO, cast
+
+import bayesoleo._parallel as parallel
+
+#: Seconds of work left, as far as can be seen, from which processes that run already are asked,
+#: and from which one is started.
+WORTH_ASKING, WORTH_STARTING = 0.5, 4.0
+#: Seconds between looks at whether they are worth asking.
+LOOK = 0.05
+#: Seconds without work after which a process ends.
+IDLE = 120.0
+
+_HEADER = struct.Struct("<Q")
+#: It finds modules where its parent finds them, and does not run the user's script again.
+_CHILD = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
+    " from bayesoleo._worker_processes import serve; serve()"
+)
+_READY, _VALUE, _ERROR, _UNREADABLE = "ready", "value", "error", "unreadable"
+
+
+class _LostError(Exception):
+    """A process ended, or cannot read what it was sent."""
+
+
+def process_map[S, T, R](
+    function: Callable[[S, T], R],
+    shared: S,
+    items: Iterable[T],
+    jobs: int | None = None,
+    *,
+    known: Callable[[S], Sequence[Any]] = lambda _: (),
+) -> list[R]:
+    """Apply ``function(shared, item)`` to every item, in this process and others; keep the order.
+
+    This process begins with the first item. Others take items from the end as soon as the work
+    that is left seems worth it, so that short work is done without them.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that other processes find it.
+    shared : object
+        What all calls need; sent once to each process.
+    items : iterable
+        The work.
+    jobs : int, optional
+        Processes, this one included; by default the cores that it may use.
+    known : callable
+        Objects within ``shared`` that results refer to rather than copy.
+
+    Returns
+    -------
+    list
+        Results in the order of the items. An exception that a call raises is passed on.
+    """
+    work = list(items)
+    jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+    if jobs <= 1 or len(work) <= 1 or not _usable():
+        return [function(shared, item) for item in work]
+    call = _Call(function, shared, work, known)
+    helpers = [
+        threading.Thread(target=call.help, args=(k,), daemon=True)
+        for k in range(min(jobs, len(work)) - 1)
+    ]
+    for helper in helpers:
+        helper.start()
+    try:
+        call.work()
+    except BaseException:
+        kill_processes()  # nobody waits for what they are doing
+        raise
+    finally:
+        call.stop()
+        for helper in helpers:
+            helper.join()
+    return cast(list[R], call.results())
+
+
+def _usable() -> bool:
+    """Whether processes may be started: not by a worker, nor where the user forbids it."""
+    asked = os.environ.get("BAYESOLEO_PROCESSES", "")
+    return asked != "0" and bool(sys.executable)
+
+
+class _Call:
+    """The items of one call, those that are taken, and what came of them."""
+
+    def __init__(
+        self,
+        function: Callable[[Any, Any], Any],
+        shared: Any,
+        items: list[Any],
+        known: Callable[[Any], Sequence[Any]],
+    ):
+        self.function, self.shared, self.items, self.known = function, shared, items, known
+        self.left = deque(range(len(items)))
+        self.found: dict[int, Any] = {}
+        self.failed: BaseException | None = None
+        self.lock, self.over = threading.Lock(), threading.Event()
+        self.begun, self._sent = time.perf_counter(), b""
+
+    def _take(self, last: bool) -> int | None:
+        with self.lock:
+            if not self.left or self.failed is not None:
+                return None
+            return self.left.pop() if last else self.left.popleft()
+
+    def _give_back(self, index: int) -> None:
+        with self.lock:
+            self.left.appendleft(index)
+
+    def work(self) -> None:
+        """Do items here until none is left and those of other processes have come."""
+        while True:
+            index = self._take(last=False)
+            if index is not None:
+                self.found[index] = self.function(self.shared, self.items[index])
+            elif self.failed is not None or len(self.found) == len(self.items):
+                return
+            else:
+                self.over.wait(LOOK)  # what a lost process had is given back
+                self.over.clear()
+
+    def stop(self) -> None:
+        """Take no further items."""
+        with self.lock:
+            self.left.clear()
+
+    def results(self) -> list[Any]:
+        """What came of all items, in their order."""
+        if self.failed is not None:
+            raise self.failed
+        return [self.found[index] for index in range(len(self.items))]
+
+    def help(self, number: int) -> None:
+        """Have another process do items, from the last on, once that is worth it."""
+        while not self._worth(number):
+            if not self.left:
+                return
+            time.sleep(LOOK)
+        index: int | None = None
+        try:
+            worker = _worker(number)
+            worker.ask(self._message())  # what all calls need
+            objects = self.known(self.shared)
+            while (index := self._take(last=True)) is not None:
+                kind, value = worker.ask(_dumps((index, self.items[index]), objects), objects)
+                if kind == _ERROR:
+                    self.failed = value
+                else:
+                    self.found[index] = value
+                index = None
+                self.over.set()
+            worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
+        except _LostError:
+            _forget(number)
+            if index is not None:
+                self._give_back(index)
+        except BaseException as error:  # it must not be lost with the thread
+            self.failed = self.failed or error
+        finally:
+            self.over.set()
+
+    def _worth(self, number: int) -> bool:
+        """Whether the work that is left is worth another process, by the time of that done."""
+        took = time.perf_counter() - self.begun
+        each = took / max(len(self.found), 1)
+        least = WORTH_ASKING if number in _workers else WORTH_STARTING
+        return took > LOOK and each * len(self.left) > least
+
+    def _message(self) -> bytes:
+        with self.lock:
+            if not self._sent:
+                self._sent = _dumps((self.function, self.shared, self.known))
+            return self._sent
+
+
+# -- processes ------------------------------------------------------------------------------------
+
+_workers: dict[int, _Worker] = {}
+
+
+class _Worker:
+    """A process that waits for work, and the pipes to it."""
+
+    def __init__(self) -> None:
+        environment = os.environ | dict.fromkeys(parallel.ONE_THREAD, "1")
+        command = [sys.executable, "-c", _CHILD, json.dumps(sys.path)]
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+
+    def ask(self, message: bytes, known: Sequence[Any] = ()) -> tuple[str, Any]:
+        """Send a message and wait for the answer: its kind and its content."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            _send(cast(BinaryIO, self.process.stdin), message)
+            answer = _receive(cast(BinaryIO, self.process.stdout))
+        except (OSError, ValueError) as error:
+            raise _LostError from error
+        if answer is None:
+            raise _LostError
+        try:
+            kind, value = _loads(answer, known)
+        except Exception as error:
+            raise _LostError from error
+        if kind == _UNREADABLE:
+            raise _LostError
+        return kind, value
+
+    def end(self) -> None:
+        """Close the pipes, at which the process ends."""
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+        self.process.kill()
+        self.process.wait()
+
+
+def _worker(number: int) -> _Worker:
+    """The process of a number, started where there is none or it has ended."""
+    known = _workers.get(number)
+    if known is not None and known.process.poll() is not None:
+        _forget(number)
+        known = None
+    if known is None:
+        try:
+            known = _workers[number] = _Worker()
+        except OSError as error:  # no memory, or too many processes
+            raise _LostError from error
+    return known
+
+
+def _forget(number: int) -> None:
+    worker = _workers.pop(number, None)
+    if worker is not None:
+        worker.end()
+
+
+def kill_processes() -> None:
+    """Kill all processes that are kept; whoever waits for one finds it lost."""
+    for worker in list(_workers.values()):
+        worker.process.kill()
+
+
+@atexit.register
+def end_processes() -> None:
+    """End all processes that are kept."""
+    for number in list(_workers):
+        _forget(number)
+
+
+if hasattr(os, "register_at_fork"):  # pipes belong to the process that made them
+    os.register_at_fork(after_in_child=_workers.clear)
+
+
+# -- messages -------------------------------------------------------------------------------------
+
+
+def _dumps(value: Any, known: Sequence[Any] = ()) -> bytes:
+    """A pickle by value of what no module holds; known objects are referred to by number."""
+    import cloudpickle
+
+    if not known:
+        return bytes(cloudpickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL))
+    number = {id(one): k for k, one in enumerate(known)}
+
+    class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+        def persistent_id(self, one: Any) -> int | None:
+            return number.get(id(one))
+
+    stream = io.BytesIO()
+    Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    return stream.getvalue()
+
+
+def _loads(content: bytes, known: Sequence[Any] = ()) -> Any:
+    class Unpickler(pickle.Unpickler):
+        def persistent_load(self, number: Any) -> Any:
+            return known[number]
+
+    return Unpickler(io.BytesIO(content)).load()
+
+
+def _send(pipe: BinaryIO, message: bytes) -> None:
+    pipe.write(_HEADER.pack(len(message)))
+    pipe.write(message)
+    pipe.flush()
+
+
+def _receive(pipe: BinaryIO) -> bytes | None:
+    """A message; None at the end of the pipe."""
+    head = pipe.read(_HEADER.size)
+    if len(head) < _HEADER.size:
+        return None
+    (size,) = _HEADER.unpack(head)
+    content = pipe.read(size)
+    return content if len(content) == size else None
+
+
+def serve() -> None:
+    """In another process: do what comes, until nothing comes any more."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    parallel.limit_threads(1)
+    source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what is printed must not get among the messages
+    function, shared, objects = cast(Any, None), None, cast(Sequence[Any], ())
+    while _waits(source):
+        message = _receive(source)
+        if message is None:
+            return
+        try:
+            content = _loads(message, objects)
+        except Exception as error:  # a module that only the parent has
+            _send(target, _dumps((_UNREADABLE, str(error))))
+            continue
+        if len(content) == 3:
+            function, shared, known = content
+            objects = () if known is None else known(shared)
+            _send(target, _dumps((_READY, None)))
+            continue
+        _, item = content
+        try:
+            answer = _dumps((_VALUE, function(shared, item)), objects)
+        except MemoryError as error:  # there is more where this one's memory is not needed
+            answer = _dumps((_UNREADABLE, str(error)))
+        except Exception as error:
+            answer = _of_error(error)
+        _send(target, answer)
+
+
+def _waits(source: BinaryIO) -> bool:
+    """Whether something comes before it has been idle for too long."""
+    if sys.platform == "win32":
+        return True  # pipes cannot be waited for
+    return bool(select.select([source], [], [], IDLE)[0])
+
+
+def _of_error(error: Exception) -> bytes:
+    """An error for the parent; where it cannot be sent, the parent meets it by itself."""
+    try:
+        content = _dumps((_ERROR, error))
+        _loads(content)
+    except Exception:
+        return _dumps((_UNREADABLE, str(error)))
+    return content

@@ -1,0 +1,125 @@
+"""Work of one calculation in several processes: the same results, whatever becomes of them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+import bayesoleo._worker_processes as processes
+from bayesoleo._parallel import limit_threads
+from bayesoleo._worker_processes import process_map
+
+
+@pytest.fixture
+def eager(monkeypatch):
+    """A process is there, and is asked as soon as there is work."""
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    monkeypatch.setattr(processes, "WORTH_STARTING", 0.0)
+    monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
+    processes._worker(0).ask(processes._dumps((None, None, None)))  # it answers once it has begun
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ended():
+    yield
+    processes.end_processes()
+
+
+def slow_square(shared, item):
+    time.sleep(0.1)
+    return os.getpid(), shared["unit"] * item**2
+
+
+def test_results_come_in_order_from_several_processes(eager):
+    found = process_map(slow_square, {"unit": 0.5}, range(12), 2)
+    assert [value for _, value in found] == [0.5 * k**2 for k in range(12)]
+    assert len({number for number, _ in found}) == 2
+
+
+def test_a_process_is_kept_for_the_next_call(eager):
+    first = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(12), 2)}
+    again = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(12), 2)}
+    assert len(first) == 2
+    assert again == first
+
+
+def test_short_work_starts_no_process(monkeypatch):
+    processes.end_processes()
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    pids = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(3), 2)}
+    assert pids == {os.getpid()}
+    assert not processes._workers
+
+
+@pytest.mark.parametrize("reason", ["one job", "limited", "forbidden"])
+def test_everything_is_done_here(eager, monkeypatch, reason):
+    if reason == "forbidden":
+        monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
+    if reason == "limited":  # as in a process that is a worker itself
+        limit_threads(1)
+    try:
+        found = process_map(slow_square, {"unit": 1.0}, range(4), 1 if reason == "one job" else 2)
+    finally:
+        limit_threads(None)
+    assert found == [(os.getpid(), float(k**2)) for k in range(4)]
+
+
+def fails_late(shared, item):
+    time.sleep(0.1)
+    if item == shared:
+        raise ValueError(f"item {item}")
+    return item
+
+
+@pytest.mark.parametrize("where", [0, 11])
+def test_an_error_is_passed_on_from_either_process(eager, where):
+    with pytest.raises(ValueError, match=f"item {where}"):
+        process_map(fails_late, where, range(12), 2)
+
+
+def kills_its_process(parent, item):
+    time.sleep(0.1)
+    if os.getpid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def test_the_work_of_a_lost_process_is_done_here(eager):
+    assert process_map(kills_its_process, os.getpid(), range(12), 2) == list(range(12))
+
+
+class UnknownElsewhere:
+    """Cannot be read by another process."""
+
+    def __reduce__(self):
+        return _only_here, (os.getpid(),)
+
+
+def _only_here(number):
+    if os.getpid() != number:
+        raise ImportError("a module that only one process has")
+    return UnknownElsewhere()
+
+
+def times_two(shared, item):
+    time.sleep(0.1)
+    return 2 * item
+
+
+def test_what_cannot_be_sent_is_done_here(eager):
+    assert process_map(times_two, UnknownElsewhere(), range(12), 2) == [2 * k for k in range(12)]
+
+
+def same_array(shared, item):
+    time.sleep(0.1)
+    return shared[item % 2], item
+
+
+def test_results_refer_to_what_is_known(eager):
+    shared = (np.arange(3.0), np.arange(4.0))
+    found = process_map(same_array, shared, range(12), 2, known=tuple)
+    assert all(array is shared[item % 2] for array, item in found)
