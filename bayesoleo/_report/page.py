@@ -6,10 +6,12 @@ import itertools
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
+import matplotlib
 import numpy as np
 import xarray as xr
 
@@ -29,6 +31,7 @@ from bayesoleo._report.tables import (
     words,
 )
 from bayesoleo._storage.files import write_text_atomic
+from bayesoleo._worker_processes import process_map
 from bayesoleo.assessment._residual_breakdown import GROUP, ORDERS, RUN, residual_breakdown
 from bayesoleo.effects._catalogue import called, listed, parameter_called
 from bayesoleo.effects._nonparametric import FAMILY
@@ -459,7 +462,31 @@ def _figures(
         "trace": ("the sampler's chains", sections.trace_figures),
         "error": ("the error of each run", sections.error_figure),
     }
-    return {name: drawing.of(words, partial(make, tree)) for name, (words, make) in makers.items()}
+    found = process_map(_draw, (tree, _drawing_settings()), list(makers.values()))
+    drawing.failed += [text for _, failed in found for text in failed]
+    return {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
+
+
+def _drawing_settings() -> dict[str, Any]:
+    """Matplotlib's settings that the user has changed; the backend draws no figure of a page."""
+    now: Mapping[Any, Any] = matplotlib.rcParams
+    usual: Mapping[Any, Any] = matplotlib.rcParamsDefault
+    return {key: now[key] for key in now if key != "backend" and now[key] != usual.get(key)}
+
+
+Maker = Callable[[xr.DataTree], list[sections.CaptionedFigure]]
+
+
+def _draw(
+    shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker]
+) -> tuple[list[sections.CaptionedFigure], list[str]]:
+    """Figures of one kind, and what could not be drawn; also in another process."""
+    (tree, settings), (words, make), drawing = shared, item, sections.Drawing()
+    now: Mapping[Any, Any] = matplotlib.rcParams
+    other = {key: value for key, value in settings.items() if now[key] != value}
+    # Settings are the whole process's: here, where they hold already, none is touched.
+    with matplotlib.rc_context(cast(Any, other)) if other else nullcontext():
+        return drawing.of(words, partial(make, tree)), drawing.failed
 
 
 def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:

@@ -8,10 +8,12 @@ import shutil
 import subprocess
 from importlib.resources import files
 
+import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
 
+import bayesoleo._worker_processes as processes
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections
 from bayesoleo._report.page import render_report, write_report
@@ -343,3 +345,19 @@ def test_a_browser_draws_one_run(two_runs, tmp_path):
     assert viewer.count('class="line ') == 3  # measured, predicted and the residual
     assert viewer.count("<option") == 2 + 1
     assert "NaN" not in viewer
+
+
+@pytest.mark.slow
+def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
+    processes._worker(0).ask(processes._dumps((None, None, None)))
+    try:
+        with matplotlib.rc_context({"axes.titleweight": "bold"}):
+            mixed = render_report(oleo)
+        assert render_report(oleo) == page
+    finally:
+        processes.end_processes()
+    monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
+    with matplotlib.rc_context({"axes.titleweight": "bold"}):
+        assert render_report(oleo) == mixed != page
