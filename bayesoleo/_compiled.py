@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import ctypes
 import pickle
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from math import prod
 from pathlib import Path
@@ -63,6 +63,30 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
         write_durably(Path(self._data_path(name)), sealed(self._dump(data)))
 
 
+#: Told once that something is compiled.
+_listeners: list[Callable[[str], object]] = []
+COMPILED_ONCE = (
+    "compile the solvers for this processor: done once, it takes up to half a minute in all"
+)
+
+
+@contextmanager
+def compilation_told(callback: Callable[[str], object]) -> Iterator[None]:
+    """Tell a callback, once, where functions have to be compiled that a user waits for."""
+    _listeners.append(callback)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):
+            _listeners.remove(callback)
+
+
+def is_compiled(function: Any) -> bool:
+    """Whether a function of :func:`cached` is on disk, for some arguments."""
+    cache = getattr(function, "_cache", None)
+    return not isinstance(cache, _CheckedCache) or not cache.is_empty
+
+
 class _CheckedCache(_FunctionCache):  # type: ignore[misc]
     """Numba's cache of a function, in files with checksums."""
 
@@ -73,6 +97,18 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
             filename_base=self._impl.filename_base,
             source_stamp=self._impl.locator.get_source_stamp(),
         )
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was compiled of the function on this machine."""
+        return not Path(self._cache_file._index_path).is_file()
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """What was compiled before; that something has to be compiled now is told once."""
+        found = super().load_overload(signature, target)
+        if found is None and _listeners:
+            _listeners.pop()(COMPILED_ONCE)
+        return found
 
     def _save_overload(self, signature: Any, data: Any) -> None:
         with suppress(OSError):  # a full disk must not stop a computation; only the cache is lost

@@ -287,6 +287,29 @@ if hasattr(os, "register_at_fork"):  # pipes belong to the process that made the
     os.register_at_fork(after_in_child=_workers.clear)
 
 
+def begin_elsewhere(module: str, function: str) -> None:
+    """Call a function without arguments in a process that nobody waits for.
+
+    It is killed where this process ends before it does.
+    """
+    if not _usable():
+        return
+    code = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); import {module} as m"
+    with suppress(OSError):
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"{code}; m.{function}()", json.dumps(sys.path)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        atexit.register(_end, process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
 # -- messages -------------------------------------------------------------------------------------
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import bayesoleo._worker_processes as processes
+from bayesoleo._compiled import COMPILED_ONCE, compilation_told, is_compiled
 from bayesoleo._parallel import limit_threads
 from bayesoleo._worker_processes import process_map
 
@@ -123,3 +126,45 @@ def test_results_refer_to_what_is_known(eager):
     shared = (np.arange(3.0), np.arange(4.0))
     found = process_map(same_array, shared, range(12), 2, known=tuple)
     assert all(array is shared[item % 2] for array, item in found)
+
+
+def leave_a_mark():
+    Path(os.environ["MARK"]).write_text(str(os.getpid()))
+
+
+def test_a_call_that_nobody_waits_for(eager, tmp_path, monkeypatch):
+    monkeypatch.setenv("MARK", str(tmp_path / "mark"))
+    processes.begin_elsewhere("test_worker_processes", "leave_a_mark")
+    deadline = time.monotonic() + 60  # a busy machine takes seconds to start a process
+    while not (tmp_path / "mark").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.1)
+    assert int((tmp_path / "mark").read_text()) != os.getpid()
+
+
+SLOW_SUM = """
+from bayesoleo._compiled import jit
+
+@jit
+def total(a, b):
+    return a + b
+"""
+
+
+def test_that_something_is_compiled_is_told_once(tmp_path):
+    (tmp_path / "summing.py").write_text(SLOW_SUM)
+    spec = importlib.util.spec_from_file_location("summing", tmp_path / "summing.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    said: list[str] = []
+    assert not is_compiled(module.total)
+    with compilation_told(said.append):
+        assert module.total(1.0, 2.0) == 3.0
+        assert module.total(1, 2) == 3
+    assert said == [COMPILED_ONCE]
+    assert is_compiled(module.total)
+    with compilation_told(said.append):
+        module.total(2.0, 2.0)
+    assert said == [COMPILED_ONCE]
+    module.total(True, 1.0)  # nobody listens any more
+    assert said == [COMPILED_ONCE]

@@ -338,9 +338,11 @@ def _closed(
 ) -> None:
     """Close the loop and print what came out, also where a late stage failed."""
     from bayesoleo import _workflow as workflow
+    from bayesoleo._compiled import compilation_told
 
     try:
-        tree = workflow.close(campaign, model, chosen, out=folder, **told)
+        with compilation_told(told["callback"]):
+            tree = workflow.close(campaign, model, chosen, out=folder, **told)
     except UnfinishedError as error:
         _print_loop(error.tree, folder, as_json)
         raise

@@ -18,7 +18,10 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
+from bayesoleo._compiled import is_compiled
+from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._units import parse_unit, same_quantity
+from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
@@ -45,6 +48,7 @@ from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import Invented, Lost, lost_inputs, without_invented
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
+from bayesoleo.solvers._collocation import linear
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION
 
@@ -331,6 +335,7 @@ def prepare(
     InputError
         If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
     """
+    _compile_ahead(settings.jobs)
     model = settings.inference.declare(check_dimensions(model))
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
@@ -351,6 +356,12 @@ def prepare(
     _check_units(driven, reduced.campaign)
     reduced = within_bands(reduced, driven)
     return Task(reduced, assign(reduced.records), assembly, settings)
+
+
+def _compile_ahead(jobs: int | None) -> None:
+    """Begin in another process with what has to be compiled, where nothing is yet."""
+    if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
+        begin_elsewhere("bayesoleo.solvers._collocation", "compile_elimination")
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:

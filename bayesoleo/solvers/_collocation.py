@@ -21,7 +21,7 @@ from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
 from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together
-from bayesoleo.solvers._mesh import Mesh, Tableau
+from bayesoleo.solvers._mesh import Mesh, Tableau, tableau
 
 #: Steps of the mesh whose stages are eliminated together, innermost in memory.
 BLOCK = 32
@@ -334,6 +334,13 @@ class SamplePlan:
     w0: Array
     w1: Array
     w2: Array
+
+
+def compile_elimination() -> None:
+    """Compile what sensitivities need, which takes ten seconds, or load it."""
+    scheme, points = Collocation(tableau("radau3"), (2,)), 8 * tableau("radau3").stages
+    right = np.zeros((1, 1, 1, points))
+    scheme.linear(np.ones((1, 1, 3, points)), right, None, np.arange(1), 1.0)
 
 
 @dataclass(frozen=True)
