@@ -41,6 +41,7 @@ from bayesoleo.discovery._refit import (
     quick_fit,
     refit_all,
     schwarz_price,
+    start_from,
 )
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base, squared_distance
@@ -90,17 +91,27 @@ class Loss:
 
 
 def eliminated(
-    state: State, roles: Roles, numerics: Numerics, notes: list[str], callback: ProgressCallback
+    state: State,
+    before: State,
+    roles: Roles,
+    numerics: Numerics,
+    notes: list[str],
+    callback: ProgressCallback,
 ) -> State:
-    """The state without effects that the last one made superfluous.
+    """The state without effects that are not worth their unknowns.
 
     The model is refitted without each earlier effect in turn. As long as an effect is not worth its
-    unknowns, the one with the smallest loss is removed.
+    unknowns, the one with the smallest loss is removed. The last one was just found to be needed,
+    beside the estimate that the model had before. Where the model without it does better from the
+    new estimate than it did before, that was a wrong optimum, and the last one is tested like the
+    others if its amplitudes are near their null: a wrong optimum is not a missing effect.
 
     Parameters
     ----------
     state : State
         The state with an effect just added.
+    before : State
+        The state that it was added to.
     roles : Roles
     numerics : Numerics
     notes : list of str
@@ -108,31 +119,52 @@ def eliminated(
     callback : callable
         Receives a message at each step.
     """
-    while len(state.assembly.steps) > 1:
+    last = state.assembly.steps[-1:]
+    while state.assembly.steps:
         base = state.base()
-        earlier = state.assembly.steps[:-1]
-        doubted = [step for step in earlier if not plainly_needed(state, base, step)]
+        doubted = [
+            step
+            for step in state.assembly.steps
+            if not plainly_needed(state, base, step, just_added=step in last)
+        ]
         if not doubted:
             return state
-        callback("test whether the earlier effects are still needed")
+        callback("test whether all effects are still needed")
         losses = [loss_without(state, base, step, numerics) for step in doubted]
-        least = min(losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf)
-        if not least.worth < 0.0:
+        losses = [one for one in losses if one.step not in last or _escaped(one, base, before)]
+        least = min(
+            losses, key=lambda loss: loss.worth if np.isfinite(loss.worth) else np.inf, default=None
+        )
+        if least is None or not least.worth < 0.0:
             return state
         effect = least.step.effect.id
         callback(f"remove {effect}: {least}")
-        notes.append(
-            f"{effect} was removed again because a later effect made it superfluous: {least}"
-        )
-        state = fit_state(state.assembly.without(least.step), roles, numerics, progress=callback)
+        why = "a later effect made it superfluous"
+        if least.step in last:
+            why = "its estimate led the model without it to a better optimum, and it is not needed"
+        notes.append(f"{effect} was removed again because {why}: {least}")
+        assembly = state.assembly.without(least.step)
+        start = start_from(base, base.fit.values, assembly.model())
+        state = fit_state(assembly, roles, numerics, start=start, progress=callback)
     return state
 
 
-def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
+def _escaped(loss: Loss, base: Base, before: State) -> bool:
+    """Whether the model without the last effect does better than it did before that was added."""
+    share, _ = compare(base, before.fit)
+    gained = -share * base.fall_back - loss.rise
+    # Twice a logarithm of densities is a difference of squares.
+    return bool(gained > 2.0 * base.policy.better_optimum_declared * loss.scale)
+
+
+def plainly_needed(
+    state: State, base: Base, step: AddedEffect, *, just_added: bool = False
+) -> bool:
     """Whether an effect's amplitudes are so far from their null that no fit without it is needed.
 
     The criterion is Wald's statistic. Where it differs much from the fall of the sum of squares, it
-    is the smaller of the two (Hauck and Donner 1977, JASA 72, 851-853).
+    is the smaller of the two (Hauck and Donner 1977, JASA 72, 851-853). An effect that was just
+    found to be needed is doubted only if that statistic is below the price of its unknowns.
     """
     point, names = state.fit.point, state.fit.problem.names
     index = [k for k, name in enumerate(names) if name.split("[")[0] in step.amplitudes]
@@ -140,7 +172,8 @@ def plainly_needed(state: State, base: Base, step: AddedEffect) -> bool:
     if not index or not point.status.ok or not np.isfinite(covariance).all():
         return False
     distance = squared_distance(point.theta[index], covariance)
-    return bool(distance > base.policy.plainly_needed * schwarz_price(base) * len(index))
+    factor = 1.0 if just_added else base.policy.plainly_needed
+    return bool(distance > factor * schwarz_price(base) * len(index))
 
 
 def loss_without(state: State, base: Base, step: AddedEffect, numerics: Numerics) -> Loss:

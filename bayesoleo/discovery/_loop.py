@@ -385,7 +385,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
                 outcome, opening, roles, numerics, room=room, callback=callback
             )
         if outcome.after is not None:
-            state = eliminated(outcome.after, roles, numerics, notes, callback)
+            state = eliminated(outcome.after, state, roles, numerics, notes, callback)
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)

@@ -1,13 +1,7 @@
 """Refit of a model with an added effect, and the weight of evidence for it.
 
 The refit starts at the values that the score test suggests. The variance of the estimate comes from
-the scatter between a few stretches of the data.
-
-References
-----------
-Bell and McCaffrey (2002), Bias reduction in standard errors for linear regression with multi-stage
-samples, Survey Methodology 28(2), 169-181; Pustejovsky and Tipton (2018), J. Business and Economic
-Statistics 36(4), 672-683.
+the spectrum of the noise.
 """
 
 from __future__ import annotations
@@ -17,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from bayesoleo._types import Array
@@ -25,8 +18,9 @@ from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._score_basis import Base, replicate, squared_distance
+from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_of
+from bayesoleo.discovery._transient_variance import Influence, coloured_variance
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -37,37 +31,6 @@ from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
 STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
-
-
-def clustered_variance(pulls: Array, sizes: Array, overlap: Array) -> tuple[float, float]:
-    """Variance of one estimate and its degrees of freedom.
-
-    The estimate moves by ``a @ e`` with the noise ``e``; stretch ``g`` of the data pulls it by
-    ``a_g @ r_g``, where the residual ``r = (I - H) e`` is smaller than the noise because the
-    estimate absorbs a part of it. Each squared pull is divided by the part that remains of white
-    noise, which makes the sum unbiased for white noise. The degrees of freedom are those of the
-    chi-square variate with the same mean and variance (Satterthwaite 1946).
-
-    Parameters
-    ----------
-    pulls : ndarray, shape (G,)
-        ``a_g @ r_g`` by stretch.
-    sizes : ndarray, shape (G,)
-        ``a_g @ a_g``.
-    overlap : ndarray, shape (G, G)
-        ``a_g @ H_gh @ a_h``.
-    """
-    left = np.diag(sizes) - overlap
-    own = np.diag(left)
-    used = own > 1e-9 * sizes
-    if used.sum() < 2:
-        return float(np.sum(pulls**2)), 0.0
-    # A stretch that is fitted exactly gives no information; the others are scaled up for it.
-    factor = np.where(used, sizes / np.where(used, own, 1.0), 0.0)
-    factor *= sizes.sum() / sizes[used].sum()
-    expected = float(factor @ own)
-    scatter = float(factor @ left**2 @ factor)
-    return float(factor @ pulls**2), expected**2 / scatter
 
 
 @dataclass(frozen=True)
@@ -289,56 +252,40 @@ def inflation_along(
     at the null is poor for some effects, such as a lag where friction switches: its error is no
     noise, and the estimate avoids it. The residual of a transient is seldom white, and at the null
     it is mostly the effect itself. There the inflation is measured on the residual of the estimate.
-    An unknown moves by the sum of its influence times the residual (Huber 1967): its variance is
-    that of the sums over stretches.
+    Its white level is the residual's own, so that the inflation tells the colour alone.
     """
     if all(record.periodic for record in fit.records):
         if not all(np.isfinite(change).all() for change in changes):
             return None
         return inflation_of(base, changes)
-    free = np.array([fit.predictor.layout.names.index(name) for name in fit.problem.names])
-    own = [k for k, name in enumerate(fit.problem.names) if name in names]
-    parts = [
-        _stretches(run, predicted, replicate(record, fit.policy), fit, free, own)
-        for run, predicted, record in zip(
-            fit.predictor.runs, fit.predictions, fit.records, strict=True
-        )
+    runs = [
+        _columns(run, predicted, fit)
+        for run, predicted in zip(fit.predictor.runs, fit.predictions, strict=True)
     ]
-    pulls, sizes, mixed = (np.concatenate(item, axis=1) for item in zip(*parts, strict=True))
-    if not all(np.isfinite(item).all() for item in (pulls, sizes, mixed)):
+    if not all(np.isfinite(item).all() for pair in runs for item in pair):
         return None
-    worst, freedom = 1.0, 0
-    for k, row in enumerate(own):
-        overlap = mixed[k] @ fit.point.covariance @ mixed[k].T
-        variance, degrees = clustered_variance(pulls[k], sizes[k], overlap)
-        ratio = variance / fit.point.covariance[row, row]
-        if degrees > 0 and ratio > worst:
+    covariance, worst, freedom = fit.point.covariance, 1.0, 0
+    for k, name in enumerate(fit.problem.names):
+        if name not in names:
+            continue
+        parts = [
+            Influence(np.einsum("l,lbn->bn", covariance[k], columns), residual, columns)
+            for columns, residual in runs
+        ]
+        variance, degrees = coloured_variance(parts, covariance)
+        ratio = variance / covariance[k, k]
+        if ratio > worst:
             worst, freedom = ratio, max(1, int(degrees))
     return worst, freedom
 
 
-def _stretches(
-    run: RunPredictor,
-    predicted: RunPrediction,
-    stretch: NDArray[np.int64],
-    fit: ModelFit,
-    free: NDArray[np.int64],
-    own: list[int],
-) -> tuple[Array, Array, Array]:
-    """Pull ``a @ r``, ``a @ a`` and ``a @ J`` by new unknown and stretch, in noise units."""
-    unit = np.sqrt(fit.point.variance)[:, None]
-    columns = predicted.sensitivity[:, free] / unit[:, None] * weights(run.record)
-    influence = np.einsum("kl,yln->kyn", fit.point.covariance[own], columns)
-    residual = (run.measured - predicted.y) / unit
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(stretch)) + 1])
-
-    def summed(values: Array) -> Array:
-        return np.add.reduceat(values, edges, axis=-1)
-
-    pulls = summed(np.einsum("kyn,yn->kn", influence, residual))
-    sizes = summed(np.einsum("kyn,kyn->kn", influence, influence))
-    mixed = summed(np.einsum("kyn,yln->kln", influence, columns))
-    return pulls, sizes, np.moveaxis(mixed, 1, 2)
+def _columns(run: RunPredictor, predicted: RunPrediction, fit: ModelFit) -> tuple[Array, Array]:
+    """Sensitivities ``(l, ny, N)`` and residual of a run, in units of the noise of each output."""
+    layout = fit.predictor.layout.names
+    free = [layout.index(name) for name in fit.problem.names]
+    weight = weights(run.record) / np.sqrt(fit.point.variance)[:, None]
+    columns = np.moveaxis(predicted.sensitivity[:, free], 1, 0) * weight
+    return columns, (run.measured - predicted.y) * weight
 
 
 def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> dict[str, Parameter]:
@@ -416,9 +363,9 @@ def quick_fit(
         model,
         base.fit.records,
         quick,
-        start=_start(base, known, model)
+        start=start_from(base, known, model)
         if isinstance(known, Mapping)
-        else np.array([_start(base, one, model) for one in known]),
+        else np.array([start_from(base, one, model) for one in known]),
         tolerance=1e-4,
         max_iterations=15,
         share=base.fit.predictor,
@@ -428,7 +375,7 @@ def quick_fit(
     )
 
 
-def _start(base: Base, known: Mapping[str, float], model: Model) -> Array:
+def start_from(base: Base, known: Mapping[str, float], model: Model) -> Array:
     """Known values inside the priors' support, and else nominal ones."""
     layout = Layout.of(model, [record.label for record in base.fit.records])
     start = layout.start(model)

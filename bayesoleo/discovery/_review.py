@@ -253,6 +253,8 @@ def place_of(
         return None  # other effects change the terms of this one
     fitted = replace(roles, held_out=(), strategy="none")
     without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
+    if not all(np.isfinite(run.y).all() for run in without.fit.predictions):
+        return None  # a run has no solution there, and nothing can be scored
     base = without.base()
     key = step.effect.id, step.target
     # The effect itself represents those that are equivalent to it.
@@ -350,7 +352,7 @@ def _replaced(
     tests = progress.rounds[place.number].tests
     ranking = (better, place.own, *(item for item in place.rivals if item is not better))
     notes = [*progress.notes, f"{better.effect} replaced {step.effect.id}: {reason}"]
-    state = eliminated(after, roles, numerics, notes, callback)
+    state = eliminated(after, before, roles, numerics, notes, callback)
     last = Round(before, ranking, {}, better, after, reason, tests)
     rounds = (*progress.rounds[:-1], last)
     return Progress(progress.first, state, rounds, tuple(notes))
