@@ -189,6 +189,23 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     fit = quick_fit(base, model, _starts(base, score, model), numerics)
+    return refit_at(base, score, assembly, fit)
+
+
+def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Refit:
+    """What an estimate of the extended model says of a candidate.
+
+    Parameters
+    ----------
+    base : Base
+        Residuals and sensitivities of the present model.
+    score : Score
+        Of the candidate.
+    assembly : Assembly
+        The model with the effect and its priors.
+    fit : ModelFit
+        Its estimate.
+    """
     share, changes = compare(base, fit)
     contribution = np.concatenate(
         [change[run.chosen] for change, run in zip(changes, base.runs, strict=True)]

@@ -26,7 +26,7 @@ from bayesoleo.discovery._ranking import (
     rank,
     score_candidates,
 )
-from bayesoleo.discovery._refit import Refit, refit, refit_all
+from bayesoleo.discovery._refit import Refit, fall_from, refit, refit_all, refit_at
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
@@ -268,6 +268,11 @@ def place_of(
     chosen = [own, *_worth_estimating(own, others, known, only_known, numerics.policy)]
     results = refit_all(base, chosen, numerics)
     refits = {id(score): result for score, result in zip(chosen, results, strict=True)}
+    same = set(own.names) <= set(final.fit.problem.names)
+    if same and fall_from(base, final.fit) > refits[id(own)].fall:
+        # Estimated anew, it may end at a worse optimum than that of the final model, which a rival
+        # would seem to surpass.
+        refits[id(own)] = refit_at(base, own, final.assembly, final.fit)
     refits |= _from_other_shapes(base, refits, chosen, numerics)
     ranking = rank(scores, progress.rounds[number].tests, refits, policy=numerics.policy)
     mine = next(item for item in ranking if item.score is own)

@@ -23,7 +23,7 @@ from scipy import stats
 from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
-from bayesoleo.discovery._fit import ModelFit, without_masked
+from bayesoleo.discovery._fit import RESOLUTION, ModelFit, without_masked
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
@@ -204,7 +204,7 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
     own = len(problem.names)
     # What is known of a nuisance parameter counts; of any other, only what the run says.
     method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
-    theta = estimate(problem, method).theta if own else np.empty(0)
+    theta = estimate(problem, method, resolution=RESOLUTION).theta if own else np.empty(0)
     full = problem.full(theta[None])[0]
     status = predictor.set_anchor(full)[0]
     samples = predictor.simulate(full[None], 0)
@@ -267,5 +267,5 @@ def _own_estimate(prediction: Prediction, record: Record) -> Array | None:
     problem = CampaignProblem(predictor).holding(shared)
     start = np.array([prediction.theta[name] for name in problem.names])
     method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
-    point = estimate(problem, method, start=start)
+    point = estimate(problem, method, start=start, resolution=RESOLUTION)
     return problem.full(point.theta[None])[0] if point.status.ok else None

@@ -21,7 +21,7 @@ from bayesoleo.discovery._nonparametric_round import (
 )
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked, rank
-from bayesoleo.discovery._refit import refit
+from bayesoleo.discovery._refit import fall_from, refit
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_tests import score_all
 from bayesoleo.discovery._state import fit_state
@@ -136,6 +136,26 @@ def begun_with_two(begun, roles):
         ("cubic_stiffness", "force"), ("coulomb_friction", "force")
     }  # fmt: skip
     return found
+
+
+def test_rivals_are_compared_with_the_estimate_that_the_final_model_has(tmp_path, monkeypatch):
+    """Estimated anew in its place, an effect may end at a worse optimum; a rival does not gain."""
+    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
+    found = begun_with_two(added_first(roles, "cubic_stiffness"), roles)
+
+    def poorly(base, score, numerics):
+        result = refit(base, score, numerics)
+        poor = 0.5 if score.option.key[0] == "cubic_stiffness" else 1.0
+        return replace(result, fall=poor * result.fall, share=poor * result.share)
+
+    monkeypatch.setattr(review, "refit", poorly)
+    step = found.state.assembly.steps[0]
+    place = review.place_of(found, step, 0, roles, NUMERICS, EFFECTS)
+    own, base = place.own.refit, place.without.base()
+    assert own.fall == pytest.approx(fall_from(base, found.state.fit))
+    assert own.fall > max(rival.refit.fall for rival in place.rivals)
+    assert own.excludes_null()
+    assert not place.better
 
 
 @pytest.mark.parametrize(
