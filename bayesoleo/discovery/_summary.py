@@ -18,11 +18,14 @@ from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structures import Structure, StructurePosterior
 from bayesoleo.effects._catalogue import titles_for, with_titles
+from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.posterior._diagnostics import Samples
 
 #: Structures are listed until their probabilities add up to the first, at most so many; a class is
 #: listed where so many of its effects have the last at least.
 LISTED, MOST_LISTED, OF_A_CLASS, VISIBLE = 0.99, 20, 2, 0.01
+#: Standard deviations on either side of an estimate that hold 95 %.
+_BOUND = 1.96
 
 
 def summarise(
@@ -50,12 +53,13 @@ def summarise(
     """
     final, stability, titles = loop.final, loop.final.stability, titles_of(loop)
     facts = CurveFacts.of(final) if facts is None else facts
+    parameters = _parameters(final, samples, facts.shared)
     summary = {
         **about,
         "rounds": [_round(item, titles) for item in loop.rounds],
         "effects": list(loop.effects),
         "targets": list(loop.targets),
-        "parameters": _parameters(final, samples, facts.shared),
+        "parameters": parameters,
         "error_before": _by_role(loop.first),
         "error_after": _by_role(final),
         "verdict": loop.verdict,
@@ -73,7 +77,7 @@ def summarise(
             "posterior": None if samples is None else samples.branch_jumps,
         },
         "notes": [
-            *(in_words(note, titles) for note in loop.notes),
+            *(in_words(note, titles) for note in (*loop.notes, *_may_be_absent(final, parameters))),
             *facts.notes,
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
@@ -299,6 +303,32 @@ def _parameters(
             entry |= {"sd": None, "interval": None, "shared_with": shared[name]}
         table[name] = entry
     return table
+
+
+def _may_be_absent(state: State, parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Say which added effects have amplitudes that zero is as likely for, beside the others.
+
+    What a round says of an effect is said of its estimate at that time.
+    """
+    notes = []
+    for step in state.assembly.steps:
+        own = [one for name, one in parameters.items() if name.split("[")[0] in step.amplitudes]
+        if own and step.effect.family != FAMILY and all(map(_includes_zero, own)):
+            notes.append(
+                f"{step.effect.id} at {step.target} may be absent: beside the other effects the"
+                f" 95 % interval of its amplitude includes zero; the share that its round states is"
+                f" that of the estimate then"
+            )
+    return notes
+
+
+def _includes_zero(parameter: Mapping[str, Any]) -> bool:
+    """Whether a parameter's 95 % interval includes zero; without draws, that of its estimate."""
+    interval, sd = parameter["interval"], parameter["sd"]
+    if interval is None and sd is None:
+        return False
+    low, high = interval or (parameter["estimate"] + k * _BOUND * sd for k in (-1, 1))
+    return bool(low <= 0.0 <= high)
 
 
 def _input_noise_notes(state: State) -> list[str]:

@@ -8,6 +8,7 @@ import pytest
 
 from bayesoleo import _schema as schema
 from bayesoleo.discovery._loop import certainty_of, explained_by_physics, verdict_of
+from bayesoleo.discovery._summary import _may_be_absent
 
 
 def state(ratio, *families, floor=1.15, quiet=(), shift=0.05):
@@ -86,3 +87,25 @@ def test_certainty_of_names():
     assert certainty_of(state(1.0, "nonparametric", "clock"), certain=False) == schema.NO_CAUSE
     quiet = state(0.16, "friction", quiet=("too little",))
     assert certainty_of(quiet, certain=False) == schema.LIKENESS
+
+
+@pytest.mark.parametrize(
+    ("interval", "sd", "said"),
+    [
+        ([-1.0, 4.0], 9.0, True),
+        ([1.0, 4.0], 9.0, False),  # draws know better than the curvature at the estimate
+        (None, 1.5, True),
+        (None, 0.5, False),
+        (None, None, False),  # shared with a curve
+    ],
+)
+def test_an_effect_whose_amplitude_may_be_zero_is_said_to_be_doubtful(interval, sd, said):
+    """A round tells what its estimate explained; the final model may do without it."""
+    effect = Stub(id="cubic_stiffness", family="stiffness")
+    step = Stub(effect=effect, target="upper", amplitudes=("cubic_stiffness_upper",))
+    state = Stub(assembly=Stub(steps=(step,)))
+    own = {"estimate": 2.0, "interval": interval, "sd": sd}
+    other = {"estimate": 0.0, "interval": [-1.0, 1.0], "sd": 1.0}
+    notes = _may_be_absent(state, {"cubic_stiffness_upper": own, "gain": other})
+    assert len(notes) == said
+    assert all("cubic_stiffness at upper may be absent" in note for note in notes)
