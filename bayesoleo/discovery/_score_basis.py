@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._fit import ModelFit, counted, weights
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
@@ -261,11 +261,31 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
         if status is not Status.CONVERGED:
             return status
         samples = run.predict(p, derivatives=True)
+        solved = samples.status == Status.CONVERGED.value
+        if not solved.all():
+            return _of_two_parts(fit, r, run, p, solved)
     if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
         return Status(int(samples.status.max()))
     constants = run.kernels.derived.constants
     own = [k for k, name in enumerate(constants) if name in fit.model.parameters]
     return resolved_sensitivities(run, p, samples, own)
+
+
+def _of_two_parts(
+    fit: ModelFit, r: int, run: RunPredictor, p: Array, solved: Flags
+) -> Array | Status:
+    """The same where some motions are not reached from that of the first shapes, as of a friction
+    that holds in small motions: each of these is solved from its own guess."""
+    found: list[Array] = [np.zeros(0)] * len(p)
+    parts = [np.flatnonzero(solved), *np.flatnonzero(~solved)[:, None]]
+    for lanes in parts:
+        run.anchor = None
+        derivatives = _of_run(fit, r, run, p[lanes])
+        if isinstance(derivatives, Status):
+            return derivatives
+        for lane, item in zip(lanes, derivatives, strict=True):
+            found[lane] = item
+    return np.stack(found)
 
 
 def present_constants(fit: ModelFit, r: int) -> Array:

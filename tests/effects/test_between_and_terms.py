@@ -283,6 +283,44 @@ def test_friction_behind_a_gap_does_the_work_of_its_path():
     assert np.abs(force[inside]).max() < 1e-9
 
 
+def _marched(x, friction: float, gap: float, rise: float):
+    """Force of an elastic slider behind a gap: both deflect by the motion until it slides."""
+    deflection, z = np.zeros(x.size), 0.0
+    for k in range(1, x.size):
+        z = float(np.clip(z + x[k] - x[k - 1], -gap - rise, gap + rise))
+        deflection[k] = z
+    return friction * (deflection - np.clip(deflection, -gap, gap)) / rise
+
+
+@pytest.mark.parametrize("gap, rise", [(0.003, 1e-3), (0.0, 2e-3), (1e-7, 5e-4), (0.002, 1e-5)])
+def test_backlash_is_its_slider_without_gap_and_without_rise(gap, rise):
+    """Neither limit is singular: no gap leaves the Jenkins element, no rise a rigid slider."""
+    amplitude, omega = 0.01, 2 * np.pi
+    times = np.linspace(0.0, 1.5, 6001)
+    x = amplitude * np.sin(omega * times)
+    v = lambda t: amplitude * omega * np.cos(omega * t)  # noqa: E731
+    force = _friction_along(x, v, times, gap, rise)
+    error = force - _marched(x, 1.0, gap, rise)
+    # Where a stiff slider is caught or let go, a sample's instant is a visible part of the rise.
+    assert np.mean(np.abs(error)) < 2e-3
+
+
+def test_a_jenkins_element_is_the_slider_without_a_gap():
+    model = find_effect("jenkins_friction").extend(system("duffing"), "position", POSITION).model
+    state, velocity = symbol("jenkins_friction_memory"), symbol("dot(position)")
+    at = {symbol("jenkins_friction_rate"): 500.0}
+    equation = model.equation(state.name).xreplace(at)
+    rate = sp.lambdify([state, velocity], -equation.subs(derivative_symbol(state.name, 1), 0))
+    times = np.linspace(0.0, 1.5, 3001)
+    v = lambda t: 0.01 * 2 * np.pi * np.cos(2 * np.pi * t)  # noqa: E731
+    found = solve_ivp(
+        lambda t, z: [rate(z[0], v(t))], (0, 1.5), [0.0], "LSODA", times, rtol=1e-8, atol=1e-10,
+        max_step=1e-3,
+    )  # fmt: skip
+    expected = _marched(0.01 * np.sin(2 * np.pi * times), 1.0, 0.0, 1 / 500.0)
+    assert np.abs(found.y[0] - expected).max() < 0.005
+
+
 def test_a_first_order_lag_answers_a_sine_as_it_should(scales):
     """At the amplitude one the channel is the answer of tau ds/dt + s = y, however long tau is."""
     model = Model(
