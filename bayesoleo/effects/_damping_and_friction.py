@@ -427,7 +427,7 @@ JENKINS = _with_memory(
     Amplitude("jenkins_friction", "force", "F_J", "sliding friction", 1),
     f"abs(velocity)*({_slip('memory')} + {_LEAK})",
     "friction over sliding friction",
-    formula=r"F_J w, \quad \dot w = \rho \dot q \,[|w| < 1 \lor w \dot q < 0]",
+    formula=r"F_J w, \quad \dot w = \rho \dot q \,[|w| < 1 \; \mathrm{or} \; w \dot q < 0]",
     title="Elastic Coulomb friction (Jenkins element)",
     source="Jenkins (1962), Analysis of the stress-strain relationships in reactor grade graphite,"
     " British J. Applied Physics 13, 30-32",

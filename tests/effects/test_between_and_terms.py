@@ -292,7 +292,7 @@ def _marched(x, friction: float, gap: float, rise: float):
     return friction * (deflection - np.clip(deflection, -gap, gap)) / rise
 
 
-@pytest.mark.parametrize("gap, rise", [(0.003, 1e-3), (0.0, 2e-3), (1e-7, 5e-4), (0.002, 1e-5)])
+@pytest.mark.parametrize(("gap", "rise"), [(0.003, 1e-3), (0.0, 2e-3), (1e-7, 5e-4), (0.002, 1e-5)])
 def test_backlash_is_its_slider_without_gap_and_without_rise(gap, rise):
     """Neither limit is singular: no gap leaves the Jenkins element, no rise a rigid slider."""
     amplitude, omega = 0.01, 2 * np.pi
