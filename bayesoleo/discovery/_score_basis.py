@@ -275,17 +275,20 @@ def _of_two_parts(
     fit: ModelFit, r: int, run: RunPredictor, p: Array, solved: Flags
 ) -> Array | Status:
     """The same where some motions are not reached from that of the first shapes, as of a friction
-    that holds in small motions: each of these is solved from its own guess."""
-    found: list[Array] = [np.zeros(0)] * len(p)
-    parts = [np.flatnonzero(solved), *np.flatnonzero(~solved)[:, None]]
-    for lanes in parts:
+    that holds in small motions: each of these is sought from its own guess. A shape whose motion
+    is not found is not seen, and the effect is scored with the others."""
+    run.anchor = None
+    first = _of_run(fit, r, run, p[solved])
+    if isinstance(first, Status):
+        return first
+    found = np.zeros((len(p), *first.shape[1:]))
+    found[solved] = first
+    for lane in np.flatnonzero(~solved):
         run.anchor = None
-        derivatives = _of_run(fit, r, run, p[lanes])
-        if isinstance(derivatives, Status):
-            return derivatives
-        for lane, item in zip(lanes, derivatives, strict=True):
-            found[lane] = item
-    return np.stack(found)
+        derivatives = _of_run(fit, r, run, p[[lane]])
+        if not isinstance(derivatives, Status):
+            found[lane] = derivatives[0]
+    return found
 
 
 def present_constants(fit: ModelFit, r: int) -> Array:
