@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fitted_states import NUMERICS, fitted
+from fitted_states import NUMERICS, fitted, scored
 from scipy.interpolate import CubicSpline
 from small_campaigns import (
     damper,
@@ -102,6 +102,13 @@ def test_gap_friction_and_rise_of_a_force_law_are_within_their_intervals(
     point = state.fit.point
     k = point.names.index("coulomb")
     assert abs(point.theta[k]) < 3.5 * point.sd[k]
+
+
+def test_a_slider_is_scored_though_a_stiff_one_is_not_reached_from_a_soft_one(tmp_path):
+    state = fitted(damper_campaign(tmp_path, noise=0.2), damper())
+    assert set(scored(state, "jenkins_friction", "backlash_friction")) == {
+        "jenkins_friction", "backlash_friction"
+    }  # fmt: skip
 
 
 # -- a mass that such a joint holds ----------------------------------------------------------------
