@@ -262,7 +262,7 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
             return status
         samples = run.predict(p, derivatives=True)
         solved = samples.status == Status.CONVERGED.value
-        if not solved.all():
+        if solved.any() and not solved.all():
             return _of_two_parts(fit, r, run, p, solved)
     if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
         return Status(int(samples.status.max()))
