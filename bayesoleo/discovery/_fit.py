@@ -32,6 +32,7 @@ from bayesoleo.prediction._predictor import Predictor, RunPrediction
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import motion_error, outputs_of
 from bayesoleo.prediction._stability import Stability
+from bayesoleo.prediction._transient_run import COARSEST, SETTLED, WHOLE
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
@@ -56,6 +57,8 @@ RESOLUTION = 1e-3
 #: Steps for each harmonic of the inputs, and limits.
 STEPS_PER_HARMONIC = 4
 FEWEST_STEPS, MOST_STEPS = 128, 8192
+#: Steps up to which a mesh is refined of a model that is only compared with others.
+MOST_COMPARED = 16 * WHOLE
 
 
 def weights(record: Record) -> Array:
@@ -360,61 +363,195 @@ def fit_model(
     ----------
     Verbeek (1993), eqs. 3.17, 3.19 and 3.23.
     """
-    callback, policy = progress or (lambda _: None), numerics.policy
-    steps, begun = numerics.steps or first_steps(model, records), None
+    callback, begun = progress or (lambda _: None), None
+    problem = _begun(model, records, numerics, share)
     while True:
-        problem = _problem(model, records, numerics, steps, share)
-        if start is not None and start.ndim == 2:
-            start = _likeliest(problem, start)
-        callback(f"{method.upper()}, {len(problem.names)} unknowns, {steps} steps")
-        mbe = estimate(
-            problem,
-            replace(step_of(method), damped=True) if damped else method,
-            start=start,
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            resolution=RESOLUTION,
+        mbe, point = _estimated(
+            problem, start, method, damped, tolerance, max_iterations, numerics.policy, callback
         )
-        callback("posterior mode")
-        point = polish(
-            problem,
-            mbe,
-            method=replace(step_of("be"), damped=damped),
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            resolution=RESOLUTION,
-        )
-        if start is None and doubtful(problem, point, policy):
-            callback("the estimate stands where the priors hardly allow it: other starts")
-            mbe, point = from_other_starts(
-                problem,
-                mbe,
-                point,
-                tolerance=tolerance,
-                max_iterations=max_iterations,
-                resolution=RESOLUTION,
-                policy=policy,
-            )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
-        # Without dofs there is no mesh.
-        shift, error, change = 0.0, 0.0, np.zeros((1, 1))
-        if model.dofs:
-            shift, error, change = UNKNOWN_MESH
-            if check_mesh:
-                shift, error, change = _mesh_shift(problem, point, predictions, policy)
+        shift, error, change = _error_of_mesh(problem, point, predictions, numerics, check_mesh)
         # The mode begins with the estimate, and that on a finer mesh with the last: what is told
         # is where all began.
         begun = mbe.start if begun is None else begun
-        fine = not shift > policy.mesh_shift
-        if fine or numerics.steps is not None or 2 * steps > MOST_STEPS:
+        steps = problem.predictor.steps
+        moved = shift > numerics.policy.mesh_shift
+        if not _wants_finer(problem, point, predictions, numerics, moved, change, check_mesh):
             mbe, point = replace(mbe, start=begun), replace(point, start=begun)
             return ModelFit(
                 model, problem, mbe, point, predictions, steps, numerics, shift, error, change
             )
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
-        steps, start = 2 * steps, point.theta
+        start = point.theta if point.status.ok else start
+        share = problem.predictor if _can_be_coarser(problem) else share
+        problem = _problem(model, records, numerics, 2 * steps, share)
+
+
+def _estimated(
+    problem: CampaignProblem,
+    start: Array | None,
+    method: str,
+    damped: bool,
+    tolerance: float,
+    max_iterations: int,
+    policy: SearchPolicy,
+    callback: Callable[[str], None],
+) -> tuple[PointEstimate, PointEstimate]:
+    """The estimate by a method and the mode, on one mesh; parameters as of :func:`fit_model`."""
+    limits = {
+        "tolerance": tolerance, "max_iterations": max_iterations, "resolution": RESOLUTION
+    }  # fmt: skip
+    several = start is not None and start.ndim == 2
+    first = _likeliest(problem, start) if start is not None and several else start
+    callback(f"{method.upper()}, {len(problem.names)} unknowns, {problem.predictor.steps} steps")
+    step = replace(step_of(method), damped=True) if damped else method
+    mbe = estimate(problem, step, start=first, **limits)  # type: ignore[arg-type]
+    callback("posterior mode")
+    mode = replace(step_of("be"), damped=damped)
+    point = polish(problem, mbe, method=mode, **limits)  # type: ignore[arg-type]
+    if start is None and doubtful(problem, point, policy):
+        callback("the estimate stands where the priors hardly allow it: other starts")
+        mbe, point = from_other_starts(problem, mbe, point, policy=policy, **limits)  # type: ignore[arg-type]
+    return mbe, point
+
+
+def _can_be_coarser(problem: CampaignProblem) -> bool:
+    """Whether any run is so long that its steps may be joined."""
+    return any(run.can_be_coarser for run in problem.predictor.runs)
+
+
+def _error_of_mesh(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    numerics: Numerics,
+    check: bool,
+) -> tuple[float, float, Array]:
+    """As :func:`_mesh_shift` gives it, if it is asked for; none where there is no mesh."""
+    if not problem.predictor.model.dofs:
+        return 0.0, 0.0, np.zeros((1, 1))
+    return _mesh_shift(problem, point, predictions, numerics.policy) if check else UNKNOWN_MESH
+
+
+def _wants_finer(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    numerics: Numerics,
+    moved: bool,
+    change: Array,
+    check: bool,
+) -> bool:
+    """Whether an estimate is to be repeated on half the steps.
+
+    That of a model that stands for itself until it moves no more; of long transients also until no
+    difference shows in what the model leaves, as of a model that is only compared with others.
+    """
+    steps, long = problem.predictor.steps, _can_be_coarser(problem)
+    if long and steps < WHOLE and not point.status.ok:
+        return True  # steps may be so long that no solution is found, or lost on the way
+    if not check:
+        return long and steps < MOST_COMPARED and _shows(problem, point, predictions, numerics)
+    if long and not np.isfinite(change).all():
+        moved = steps < WHOLE
+    elif long and steps < MOST_COMPARED:
+        moved = moved or _visible(problem, point, np.square(change)) > numerics.policy.unseen
+    return moved and numerics.steps is None and 2 * steps <= MOST_STEPS
+
+
+def _begun(
+    model: Model, records: Sequence[Record], numerics: Numerics, share: Predictor | None
+) -> CampaignProblem:
+    """The problem on the first mesh: of long records the coarsest, since an estimate is repeated on
+    finer ones until it no longer moves."""
+    steps = numerics.steps or first_steps(model, records)
+    problem = _problem(model, records, numerics, steps, share)
+    if numerics.steps or not all(run.can_be_coarser for run in problem.predictor.runs):
+        return problem
+    return _problem(model, records, numerics, COARSEST, problem.predictor)
+
+
+def for_comparison(fit: ModelFit) -> ModelFit:
+    """A fit on the coarsest mesh that shows no difference, to score and refit candidates on.
+
+    A comparison needs no higher accuracy than what it decides on. What a coarser mesh changes of
+    the outputs of long transients may not be more than one squared standard deviation of what the
+    model leaves, over all samples together: no decision rests on as little.
+
+    Parameters
+    ----------
+    fit : ModelFit
+
+    Returns
+    -------
+    ModelFit
+        The same estimate; itself where no run can be solved in fewer steps.
+    """
+    if any(record.periodic for record in fit.records):
+        return fit
+    if not fit.model.dofs:  # what candidates begin with
+        return replace(fit, steps=min(fit.steps, COARSEST))
+    if not _can_be_coarser(fit.problem):
+        return fit
+    theta, steps = fit.point.theta, COARSEST
+    while steps < fit.steps:
+        problem = _problem(fit.model, fit.records, fit.numerics, steps, fit.predictor)
+        if problem.freeze(theta) is Status.CONVERGED:
+            found = problem.predictor.predict(problem.full(theta[None])[0])
+            known = [run.y for run in fit.predictions]
+            if _squares(problem, found, known, fit.point) <= fit.policy.unseen:
+                return replace(fit, problem=problem, predictions=found, steps=steps)
+        steps *= 2
+    return fit
+
+
+def _shows(
+    problem: CampaignProblem,
+    point: PointEstimate,
+    predictions: list[RunPrediction],
+    numerics: Numerics,
+) -> bool:
+    """Whether half the steps would visibly change what a model leaves."""
+    if not point.status.ok:
+        return False
+    halved = _halved(problem, point)
+    if halved is None:  # where a force sets in, the solution is lost on one mesh and not on another
+        return True
+    return _squares(problem, predictions, halved, point) > numerics.policy.unseen
+
+
+def _squares(
+    problem: CampaignProblem,
+    predictions: list[RunPrediction],
+    others: list[Array],
+    point: PointEstimate,
+) -> float:
+    """What others change of predictions, over the variances of what is left."""
+    return _visible(problem, point, np.square(_change(predictions, others)))
+
+
+def _visible(problem: CampaignProblem, point: PointEstimate, squares: Array) -> float:
+    """The same of mean squares ``(runs, outputs)`` of the change."""
+    rows = zip(problem.predictor.runs, squares, strict=True)
+    return float(sum(visible(run.measured, row, point.variance) for run, row in rows))
+
+
+def visible(measured: Array, squares: Array, variance: Array) -> float:
+    """Sum of squares of a change of outputs, over the variances ``(ny,)`` of what a model leaves.
+
+    Where it leaves next to nothing, what has settled shows no more.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (ny, N)
+    squares : ndarray, shape (ny,)
+        Mean squares of the change.
+    variance : ndarray, shape (ny,)
+    """
+    shown = np.where(squares > SETTLED**2 * np.var(measured, axis=1), squares, 0.0)
+    return float(np.sum(shown / np.maximum(variance, 1e-300))) * measured.shape[1]
 
 
 def _likeliest(problem: CampaignProblem, starts: Array) -> Array:

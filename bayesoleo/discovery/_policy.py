@@ -41,6 +41,12 @@ class SearchPolicy:
         "Largest shift of a parameter by halving the steps of the mesh, in posterior standard"
         " deviations; above it the mesh is refined or doubted.",
     )
+    unseen: float = _value(
+        1.0,
+        "Change of the outputs by halving the steps of a long transient, summed over its samples,"
+        " in variances of what a model leaves, below which models are compared on that mesh.",
+        "the likelihoods that are compared differ by more",
+    )
     missed_factor: float = _value(
         3.0,
         "Factor by which the shift due to the error between steps must exceed the shift by halving"

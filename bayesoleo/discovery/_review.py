@@ -30,7 +30,7 @@ from bayesoleo.discovery._refit import Refit, fall_from, refit, refit_all, refit
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -43,8 +43,8 @@ class Place:
     ----------
     number : int
         Number of the round that added the effect, from zero.
-    without : State
-        The final model without the effect, on the fitted runs.
+    base : Base
+        Residuals of the final model without the effect, on the fitted runs.
     own : Ranked
         The effect, estimated there, with its class.
     rivals : tuple of Ranked
@@ -52,7 +52,7 @@ class Place:
     """
 
     number: int
-    without: State
+    base: Base
     own: Ranked
     rivals: tuple[Ranked, ...]
 
@@ -72,7 +72,7 @@ class Place:
             result = rival.refit
             assert result is not None
             gap, scale = result.worth - own.worth, max(result.inflation, own.inflation)
-            needed = policy.equal_likelihood * scale * _dispersion(result, self.without)
+            needed = policy.equal_likelihood * scale * _dispersion(result, self.base)
             if rival.absorbs < self.own.absorbs:
                 needed = -needed
             clearly = result.reached or gap > policy.fair_share * own.remaining
@@ -81,9 +81,8 @@ class Place:
         return tuple(found[: policy.review_confirmed])
 
 
-def _dispersion(result: Refit, without: State) -> float:
+def _dispersion(result: Refit, base: Base) -> float:
     """Dispersion of the residual of an estimate."""
-    base = without.base()
     return dispersion(replace(base, excess=base.excess - result.fall))
 
 
@@ -280,7 +279,7 @@ def place_of(
         return None
     rest = [item for item in ranking if item.refit is not None and item is not mine]
     rest.sort(key=lambda item: -(item.refit.worth if item.refit else 0.0))
-    return Place(number, without, mine, tuple(rest))
+    return Place(number, base, mine, tuple(rest))
 
 
 def _from_other_shapes(

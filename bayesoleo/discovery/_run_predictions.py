@@ -23,12 +23,19 @@ from scipy import stats
 from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
-from bayesoleo.discovery._fit import RESOLUTION, ModelFit, without_masked
+from bayesoleo.discovery._fit import (
+    MOST_COMPARED,
+    RESOLUTION,
+    ModelFit,
+    visible,
+    without_masked,
+)
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._transient_run import WHOLE
 from bayesoleo.solvers._orbit import Status
 
 #: Columns whose overlap says how many independent coefficients a band holds.
@@ -184,22 +191,45 @@ def predict_held_out(fit: ModelFit, records: Sequence[Record]) -> list[Predictio
     return [_held_out(fit, record) for record in records]
 
 
-def _single(fit: ModelFit, record: Record) -> Predictor:
+def _single(
+    fit: ModelFit, record: Record, steps: int | None = None, share: Predictor | None = None
+) -> Predictor:
     numerics = fit.numerics
     return Predictor(
         fit.model,
         [record],
-        steps=fit.steps,
+        steps=steps or fit.steps,
         scheme=numerics.scheme,
         solver=numerics.solver,
         backend=numerics.backend,
         jobs=numerics.jobs,
-        share=fit.predictor,
+        share=share or fit.predictor,
     )
 
 
 def _held_out(fit: ModelFit, record: Record) -> Prediction:
+    """On the mesh of the fit, or a finer one where a long transient asks for it."""
     predictor = _single(fit, record)
+    while True:
+        found, steps = _estimated_on(fit, record, predictor), predictor.steps
+        run = predictor.runs[0]
+        if not run.can_be_coarser or steps >= MOST_COMPARED:
+            return found
+        finer = _single(fit, record, 2 * steps, predictor)
+        if found.status.ok:
+            if finer.set_anchor(found.vector)[0] is not Status.CONVERGED:
+                return found
+            change = np.mean((finer.simulate(found.vector[None], 0).y[0] - found.y) ** 2, axis=1)
+            left = np.mean((run.measured - found.y) ** 2, axis=1)
+            if visible(run.measured, change, left) <= fit.policy.unseen:
+                return found
+        elif steps >= WHOLE:
+            return found
+        predictor = finer
+
+
+def _estimated_on(fit: ModelFit, record: Record, predictor: Predictor) -> Prediction:
+    """Prediction of a run, its own unknowns estimated on it."""
     problem = CampaignProblem(predictor).holding(fit.shared)
     own = len(problem.names)
     # What is known of a nuisance parameter counts; of any other, only what the run says.

@@ -12,7 +12,7 @@ therefore detected and left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
@@ -31,6 +31,7 @@ from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import input_columns
+from bayesoleo.prediction._transient_run import WHOLE
 from bayesoleo.solvers._orbit import Status
 
 #: A squared residual norm below this part of the squared norm is no direction of its own: the
@@ -217,7 +218,10 @@ def sensitivities_of(
         p = _constants(fit, r, run, predictor.constants(theta[None], r), shapes)
         derivatives = _of_run(fit, r, run, p)
         if isinstance(derivatives, Status):
-            return derivatives
+            # Steps that do for the present model may be too long for what an effect adds.
+            coarse = fit.steps < WHOLE and run.can_be_coarser
+            finer = replace(fit, steps=2 * fit.steps)
+            return sensitivities_of(finer, model, shapes) if coarse else derivatives
         for k, y_p in enumerate(derivatives):
             full = np.zeros((y_p.shape[0], theta.size, y_p.shape[2]))
             full[:, layout.columns[r]] = y_p

@@ -18,7 +18,7 @@ from bayesoleo._parallel import connected, each_done, thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out
-from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, promising
+from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, for_comparison, promising
 from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     Noise,
@@ -155,9 +155,9 @@ class State:
         return tuple(f"{p.record.label}: {p.status.message}" for p in found if not p.status.ok)
 
     def base(self) -> Base:
-        """Residuals and sensitivities for the scores of candidates."""
-        entries = self.fit_errors.entries
-        return base_of(self.fit, {(entry.run, entry.output): entry for entry in entries})
+        """Residuals and sensitivities for the scores of candidates, on a mesh for comparisons."""
+        entries, fit = self.fit_errors.entries, for_comparison(self.fit)
+        return base_of(fit, {(entry.run, entry.output): entry for entry in entries})
 
 
 def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:

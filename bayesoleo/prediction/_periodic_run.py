@@ -173,6 +173,11 @@ class RunPredictor:
         """Take over what :meth:`found` gave of the same run, here or in another process."""
         vars(self).update(found)
 
+    @property
+    def can_be_coarser(self) -> bool:
+        """Whether fewer steps than an integrator's may do; of a periodic run nobody chose any."""
+        return False
+
     def base_constants(self) -> Array:
         """Nominal parameters and this run's conditions, shape (np,)."""
         values = []

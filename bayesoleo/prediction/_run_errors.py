@@ -28,7 +28,6 @@ from bayesoleo.prediction._inputs import (
 )
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
-from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
@@ -152,7 +151,8 @@ def _start_errors(run: TransientRun) -> Array:
         curve = cast(Smoothed, signal_of(record, channel, max(*orders.values(), 1)))
         block = np.zeros((len(items), 0))
         if curve.noise > 0.0:
-            value, *changes = _curve_changes(curve, record, (0, *orders.values()), np.zeros(1))
+            asked, size = (0, *orders.values()), record.time.size
+            value, *changes = _curve_changes(curve, record.span, size, asked, np.zeros(1))
             # At the end of a record a smooth curve is also biased, by about the noise of a sample.
             factor = max(1.0, curve.noise / max(float(np.linalg.norm(value)), 1e-300))
             block = np.zeros((len(items), value.shape[0]))
@@ -219,31 +219,45 @@ def _transient_changes(run: RunPredictor, position: Array) -> Array:
         if not orders:
             continue
         curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
-        changes = _curve_changes(curve, record, orders.values(), position)
+        changes = _known_changes(
+            curve, record.span, record.time.size, tuple(orders.values()), position.tobytes()
+        )
         block = np.zeros((len(rows), changes.shape[1], position.size))
         block[list(orders)] = changes
         blocks.append(block)
     return np.concatenate(blocks, axis=1)
 
 
-def _curve_changes(
-    curve: Smoothed, record: Record, orders: Iterable[int], position: Array
+@lru_cache(maxsize=4)
+def _known_changes(
+    curve: Smoothed, span: float, samples: int, orders: tuple[int, ...], position: bytes
 ) -> Array:
-    """Change of some derivatives of a curve by one standard deviation of each of its errors."""
-    lines, found = _noise_lines(curve, record), []
+    """The same as :func:`_curve_changes`, kept: each model of a run asks for it again, and of a
+    long record it takes longer than to solve the model."""
+    found = _curve_changes(curve, span, samples, orders, np.frombuffer(position))
+    found.flags.writeable = False
+    return found
+
+
+def _curve_changes(
+    curve: Smoothed, span: float, samples: int, orders: Iterable[int], position: Array
+) -> Array:
+    """Change of some derivatives of a curve by one standard deviation of each of its errors, of a
+    record of that length and that many samples."""
+    lines, found = _noise_lines(curve, span, samples), []
     draws = () if lines is not None else _errors(curve)
     for order in orders:
         if lines is not None:
             omega, sd = lines
-            turn = np.multiply.outer(omega, position * record.span) + order * np.pi / 2
+            turn = np.multiply.outer(omega, position * span) + order * np.pi / 2
             found.append((sd * omega**order)[:, None] * np.cos(turn))
         else:
-            each = [draw.evaluate(position, record.rate, order) for draw in draws]
+            each = [draw.evaluate(position, 1.0 / span, order) for draw in draws]
             found.append(np.reshape(each, (len(draws), position.size)) / np.sqrt(DRAWS))
     return np.stack(found)
 
 
-def _noise_lines(curve: Smoothed, record: Record) -> tuple[Array, Array] | None:
+def _noise_lines(curve: Smoothed, span: float, samples: int) -> tuple[Array, Array] | None:
     """Angular frequencies of the noise in a band-limited curve, and the standard deviation of each
     amplitude; None where they are too many, or the curve is a spline.
 
@@ -253,11 +267,11 @@ def _noise_lines(curve: Smoothed, record: Record) -> tuple[Array, Array] | None:
     band = curve.band
     if band is None or not np.isfinite(band.cut) or curve.noise == 0.0:
         return None
-    count = int(2.0 * record.span * band.cut * (1.0 + band.fade)) + 1
+    count = int(2.0 * span * band.cut * (1.0 + band.fade)) + 1
     if count > MOST_LINES:
         return None
-    frequency = np.asarray(0.5 * np.arange(count) / record.span, dtype=np.float64)
-    size = np.sqrt(np.where(frequency > 0, 2.0, 1.0) / record.time.size)
+    frequency = np.asarray(0.5 * np.arange(count) / span, dtype=np.float64)
+    size = np.sqrt(np.where(frequency > 0, 2.0, 1.0) / samples)
     return 2.0 * np.pi * frequency, curve.noise * size * np.sqrt(band.gain(frequency))
 
 
@@ -268,7 +282,9 @@ def errors_known(run: RunPredictor) -> bool:
         return True
     channels = [name for name in run.model.inputs if name in highest]
     curves = [cast(Smoothed, signal_of(record, name, highest[name])) for name in channels]
-    return all(c.noise == 0.0 or _noise_lines(c, record) is not None for c in curves)
+    return all(
+        c.noise == 0.0 or _noise_lines(c, record.span, record.time.size) is not None for c in curves
+    )
 
 
 def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:

@@ -36,8 +36,11 @@ from bayesoleo.solvers._transient import (
     transient_sensitivities,
 )
 
-#: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each.
+#: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each,
+#: and fewer join the equal steps of a long record.
 WHOLE = 128
+#: The fewest: at most three of a highest frequency's radians in a step, which still sees all of it.
+COARSEST = WHOLE // 4
 #: To follow the inputs, steps are shortened to this many samples and to this angle at the highest
 #: frequency of an input at most, which a method of fifth order follows to 1e-4.
 SAMPLES_A_STEP, ANGLE = 4, 0.75
@@ -68,7 +71,9 @@ class TransientRun(RunPredictor):
     record : Record
         A transient run.
     steps : int
-        Fineness: :data:`WHOLE` is the integrator's own mesh; twice as much halves its steps.
+        Fineness: :data:`WHOLE` is the integrator's own mesh; twice as much halves its steps. Half
+        as much doubles those of a record so long that its inputs choose them; how fine it must be
+        is then for whoever asks to find out, as for a periodic run.
     scheme_name : str
         Discretisation by collocation; the thesis's differences have no counterpart here, and the
         default stands in for them.
@@ -136,8 +141,10 @@ class TransientRun(RunPredictor):
         )
 
     def _adopt(self, mesh: Mesh) -> None:
-        """Work on a mesh, cut as fine as asked for."""
+        """Work on a mesh, cut as fine as asked for, or as coarse."""
         fine = halved(mesh, max(round(np.log2(self.fineness / WHOLE)), 0))
+        if self.fineness < WHOLE and follows_inputs(mesh):
+            fine = equidistant(int(np.ceil(mesh.steps * self.fineness / WHOLE)))
         derived = self.kernels.derived
         self.collocation = Collocation(self.method, derived.orders, fine)
         self.steps, self.scheme = fine.steps, self.collocation
@@ -181,6 +188,21 @@ class TransientRun(RunPredictor):
         if self.chosen is not None:
             self._adopt(self.chosen)
 
+    @property
+    def can_be_coarser(self) -> bool:
+        """Whether its steps follow the inputs of a long record, so that fewer may do.
+
+        An integrator's steps are as long as its error allows.
+        """
+        if not self.kernels.derived.dofs:
+            return False
+        return self._is_long if self.chosen is None else follows_inputs(self.chosen)
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether an integrator would take minutes to follow the inputs."""
+        return max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED
+
     # -- solving ---------------------------------------------------------------------------
 
     def set_anchor(self, p: Array) -> Status:
@@ -208,9 +230,10 @@ class TransientRun(RunPredictor):
     def _first(self, p: Array, state: Array) -> Solution | Status:
         """The first solution, on a mesh of its own unless one was taken over."""
         rows: Motion = lambda position: self._known(position, state)  # noqa: E731
-        if self.chosen is None and max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED:
-            equal = self._by_inputs(p, state, rows)
-            if equal.status[0] == Status.CONVERGED.value:
+        if self.can_be_coarser:
+            equal = self._by_inputs(p, state, rows) if self.chosen is None else None
+            equal = self._begun_at(p, state, rows) if equal is None else equal
+            if equal.status[0] == Status.CONVERGED.value or self.fineness < WHOLE:
                 return equal
             # Where a force jumps, an integrator's own steps may still get across.
             self.chosen = None
@@ -221,6 +244,10 @@ class TransientRun(RunPredictor):
             self._choose(found.mesh or equidistant(FALLBACK))
             if (integrated := found.rows) is not None:
                 rows = lambda position: integrated(position * self.period)  # noqa: E731
+        return self._begun_at(p, state, rows)
+
+    def _begun_at(self, p: Array, state: Array, rows: Motion) -> Solution:
+        """A solution on the present mesh, from a motion and its first state."""
         start = self._unknowns(rows)
         start[:, 0, : self.scheme.state_size] = state
         return solve_transient(self.boundary, p[None], start)
@@ -229,6 +256,8 @@ class TransientRun(RunPredictor):
         """The first solution on equal steps that follow the inputs: the longest that suffice."""
         steps = int(np.ceil(1.0 / self._shortest))
         solution, place = self._on_equal(steps, p, state, rows), np.linspace(0.0, 1.0, 16 * WHOLE)
+        if self.fineness < WHOLE:
+            return solution
         while 2 * steps <= MOST_STEPS and solution.status[0] == Status.CONVERGED.value:
             coarse, motion = solution, self._motion_of(solution)
             solution = self._on_equal(2 * steps, p, state, motion)
@@ -247,9 +276,7 @@ class TransientRun(RunPredictor):
     def _on_equal(self, steps: int, p: Array, state: Array, rows: Motion) -> Solution:
         """A solution on equal steps, which are kept."""
         self._keep_equal(steps)
-        start = self._unknowns(rows)
-        start[:, 0, : self.scheme.state_size] = state
-        return solve_transient(self.boundary, p[None], start)
+        return self._begun_at(p, state, rows)
 
     def _motion_of(self, solution: Solution) -> Motion:
         """Rows of a solution on the present mesh at positions."""
@@ -325,6 +352,11 @@ class TransientRun(RunPredictor):
     def _at(self, phase: Array) -> Any:
         """Plan of the collocation for positions."""
         return self.collocation.plan(phase, self.steps, initial=True)
+
+
+def follows_inputs(mesh: Mesh) -> bool:
+    """Whether a mesh is one of equal steps, as chosen by the inputs of a long record."""
+    return mesh.steps > MOST_INTEGRATED and bool(np.ptp(mesh.relative) < 1e-6)
 
 
 def _joined(parts: list[PredictedSamples]) -> PredictedSamples:

@@ -186,7 +186,7 @@ def test_lines_of_noise_are_as_large_as_draws_of_it(order):
     values = np.sin(2 * np.pi * 1.1 * time) + 0.01 * rng.standard_normal(800)
     record = transient_record("a", time, {"x": values, "y": values})
     curve = record.smoothed["x"].for_derivative(2)
-    omega, sd = _noise_lines(curve, record)
+    omega, sd = _noise_lines(curve, record.span, record.time.size)
     inside = slice(100, -100)
     lines = sd[:, None] * omega[:, None] ** order
     lines = lines * np.cos(np.multiply.outer(omega, time) + order * np.pi / 2)

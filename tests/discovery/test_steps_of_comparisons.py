@@ -1,0 +1,179 @@
+"""Candidates are compared on long steps where that decides nothing, and on short ones elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.fft import irfft
+
+from bayesoleo.discovery import _fit
+from bayesoleo.discovery._fit import Numerics, fit_model, for_comparison, visible
+from bayesoleo.discovery._run_predictions import predict_held_out
+from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import transient_record
+from bayesoleo.prediction._transient_run import COARSEST, WHOLE
+
+STEP, COUNT = 1.0 / 600.0, 6000
+NUMERICS = Numerics(jobs=1)
+
+
+def oscillator(stop="0"):
+    """Measured force; with a stop that is touched in few samples."""
+    parameters = {"d": Parameter(50.0, "1/s", sd=20.0), "w": Parameter(300.0, "1/s", sd=30.0)}
+    if stop != "0":
+        parameters["k"] = Parameter(8e5, "1/s**2", sd=8e5)
+    return Model(
+        "oscillator",
+        inputs={"u": "V"},
+        dofs={"y": Dof("V")},
+        parameters=parameters,
+        equations={"y": {"all": f"ddot(y) + d*dot(y) + w**2*y + {stop} - w**2*u"}},
+        outputs={"out": Output("y", "V")},
+    )
+
+
+def lag():
+    """First order."""
+    return Model(
+        "lag",
+        inputs={"u": "V"},
+        dofs={"y": Dof("V")},
+        parameters={"t": Parameter(0.01, "s", sd=0.005)},
+        equations={"y": {"all": "t*dot(y) + y - u"}},
+        outputs={"out": Output("y", "V")},
+    )
+
+
+def friction():
+    """A force by a measured motion, with friction that remembers the last reversal."""
+    return Model(
+        "friction",
+        inputs={"u": "V"},
+        dofs={"z": Dof("")},
+        parameters={
+            "c": Parameter(1e-3, "s", sd=1e-3),
+            "f": Parameter(0.1, "V", sd=0.1),
+            "r": Parameter(50.0, "1/V", sd=50.0),
+        },
+        equations={"z": {"all": "dot(z) - r*(dot(u) - abs(dot(u))*z)"}},
+        outputs={"out": Output("c*dot(u) + f*z", "V")},
+    )
+
+
+STOP = "k*max(y - 0.21, 0)"
+KINDS = {
+    "oscillator": (oscillator(), [40.0, 320.0]),
+    "stop": (oscillator(STOP), [40.0, 320.0, 6e5]),
+    "lag": (lag(), [0.012]),
+    "friction": (friction(), [1.2e-3, 0.12, 30.0]),
+}
+
+
+def record(model, truth, seed=0, noise=0.01):
+    """Of a drive that fills a quarter of the band, solved on a fine mesh."""
+    rng = np.random.default_rng(seed)
+    lines = np.zeros(COUNT // 2 + 1, dtype=complex)
+    lines[1 : COUNT // 8] = np.exp(2j * np.pi * rng.random(COUNT // 8 - 1))
+    drive = irfft(lines, COUNT)
+    drive *= 0.05 / drive.std()
+    time = STEP * np.arange(COUNT - 1)
+    empty = transient_record(f"r{seed}", time, {"u": drive[:-1], "out": np.zeros(COUNT - 1)})
+    predictor = Predictor(model, [empty], steps=2 * WHOLE, jobs=1)
+    predictor.set_anchor(np.array(truth))
+    out = predictor.simulate(np.array([truth]), 0).y[0, 0]
+    out = out + noise * out.std() * rng.standard_normal(out.size)
+    return replace(empty, samples={**empty.samples, "out": out})
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def fitted(request):
+    model, truth = KINDS[request.param]
+    data = record(model, truth)
+    return request.param, truth, fit_model(model, [data], NUMERICS)
+
+
+def squares(fit):
+    """Sum of squares at an estimate, in variances of what is left: as found, and on a fine mesh."""
+    predictor = Predictor(fit.model, fit.records, steps=8 * WHOLE, jobs=1)
+    theta, measured = fit.problem.full(fit.point.theta[None])[0], predictor.runs[0].measured
+    predictor.set_anchor(theta)
+    fine = predictor.simulate(theta[None], 0).y[0]
+    return [float(np.sum((measured - y) ** 2)) for y in (fit.predictions[0].y, fine)] / (
+        fit.point.variance[0]
+    )
+
+
+def test_an_estimate_is_that_of_the_equations(fitted):
+    _, truth, fit = fitted
+    assert not fit.shift > fit.policy.mesh_shift
+    assert np.all(np.abs(fit.point.theta[: len(truth)] - truth) < 4 * fit.point.sd[: len(truth)])
+
+
+def test_no_decision_depends_on_the_steps_of_a_comparison(fitted):
+    _, _, fit = fitted
+    base = for_comparison(fit)
+    assert base.steps <= fit.steps
+    # Twice the logarithm of equal odds, 6, is the least difference that anything is decided on.
+    found, fine = squares(base)
+    assert abs(found - fine) < 4.0
+
+
+def test_a_candidate_is_refined_where_its_steps_show(fitted):
+    """Twice as many steps, and all of them, change little of what it leaves, whatever it began
+    with."""
+    _, _, fit = fitted
+    coarse = replace(NUMERICS, steps=COARSEST)
+    found = fit_model(
+        fit.model, fit.records, coarse, start=fit.point.theta, check_mesh=False, tolerance=1e-4
+    )
+    own, fine = squares(found)
+    assert abs(own - fine) < 4.0
+    worst = np.max(np.abs(found.point.theta - fit.point.theta) / fit.point.sd)
+    assert worst < 1.0
+
+
+def test_an_end_stop_in_few_samples_counts_in_full():
+    model, truth = KINDS["stop"]
+    data = record(model, truth)
+    without = fit_model(oscillator(), [data], NUMERICS)
+    assert np.mean(data.samples["out"] > 0.21) < 0.05
+    falls = []
+    for steps, limit in ((COARSEST, 1.0), (8 * WHOLE, np.inf)):
+        numerics = replace(NUMERICS, steps=steps, policy=replace(NUMERICS.policy, unseen=limit))
+        start = np.array([*without.point.theta, 5e5])
+        one = fit_model(model, [data], numerics, start=start, check_mesh=False, damped=True)
+        falls.append(float(np.log(without.point.variance[0] / one.point.variance[0])) * COUNT)
+    assert falls[1] > 100.0
+    assert abs(falls[0] - falls[1]) < 0.02 * falls[1] + 6.0
+
+
+def test_a_hold_out_run_has_steps_of_its_own(fitted):
+    name, truth, fit = fitted
+    rough = record(KINDS[name][0], truth, seed=3)
+    rough = replace(rough, label="other")
+    (found,) = predict_held_out(fit, [rough])
+    theta = found.vector
+    fine = Predictor(fit.model, [rough], steps=8 * WHOLE, jobs=1)
+    fine.set_anchor(theta)
+    change = np.mean((fine.simulate(theta[None], 0).y[0] - found.y) ** 2, axis=1)
+    left = np.mean((fine.runs[0].measured - found.y) ** 2, axis=1)
+    assert found.status.ok
+    assert visible(fine.runs[0].measured, change, left) < 4.0
+
+
+def test_steps_of_short_records_are_not_joined():
+    model, truth = KINDS["oscillator"]
+    whole = record(model, truth)
+    cut = {name: values[:300] for name, values in whole.samples.items()}
+    short = transient_record("short", whole.time[:300], cut)
+    fit = fit_model(model, [short], NUMERICS)
+    assert for_comparison(fit) is fit
+    assert fit.steps >= WHOLE
+    assert not _fit._can_be_coarser(fit.problem)
+
+
+def test_what_has_settled_does_not_show():
+    measured = np.random.default_rng(0).standard_normal((1, 100))
+    assert visible(measured, np.array([1e-12]), np.array([1e-30])) == 0.0
+    assert visible(measured, np.array([1e-6]), np.array([1e-4])) == pytest.approx(1.0)
