@@ -491,6 +491,8 @@ def for_comparison(fit: ModelFit) -> ModelFit:
     """
     if any(record.periodic for record in fit.records):
         return fit
+    if not any(run.is_long for run in fit.predictor.runs):
+        return fit
     if not fit.model.dofs:  # what candidates begin with
         return replace(fit, steps=min(fit.steps, COARSEST))
     if not _can_be_coarser(fit.problem):
@@ -535,7 +537,7 @@ def _squares(
 def _visible(problem: CampaignProblem, point: PointEstimate, squares: Array) -> float:
     """The same of mean squares ``(runs, outputs)`` of the change."""
     rows = zip(problem.predictor.runs, squares, strict=True)
-    return float(sum(visible(run.measured, row, point.variance) for run, row in rows))
+    return sum(visible(run.measured, row, point.variance) for run, row in rows)
 
 
 def visible(measured: Array, squares: Array, variance: Array) -> float:
@@ -551,7 +553,7 @@ def visible(measured: Array, squares: Array, variance: Array) -> float:
     variance : ndarray, shape (ny,)
     """
     shown = np.where(squares > SETTLED**2 * np.var(measured, axis=1), squares, 0.0)
-    return float(np.sum(shown / np.maximum(variance, 1e-300))) * measured.shape[1]
+    return float(np.sum(shown / np.maximum(variance, 1e-300)) * measured.shape[1])
 
 
 def _likeliest(problem: CampaignProblem, starts: Array) -> Array:

@@ -174,6 +174,11 @@ class RunPredictor:
         vars(self).update(found)
 
     @property
+    def is_long(self) -> bool:
+        """Whether the inputs of a transient choose its steps."""
+        return False
+
+    @property
     def can_be_coarser(self) -> bool:
         """Whether fewer steps than an integrator's may do; of a periodic run nobody chose any."""
         return False

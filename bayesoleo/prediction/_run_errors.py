@@ -152,7 +152,7 @@ def _start_errors(run: TransientRun) -> Array:
         block = np.zeros((len(items), 0))
         if curve.noise > 0.0:
             asked, size = (0, *orders.values()), record.time.size
-            value, *changes = _curve_changes(curve, record.span, size, asked, np.zeros(1))
+            value, *changes = _curve_changes(curve, record.rate, size, asked, np.zeros(1))
             # At the end of a record a smooth curve is also biased, by about the noise of a sample.
             factor = max(1.0, curve.noise / max(float(np.linalg.norm(value)), 1e-300))
             block = np.zeros((len(items), value.shape[0]))
@@ -220,7 +220,7 @@ def _transient_changes(run: RunPredictor, position: Array) -> Array:
             continue
         curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
         changes = _known_changes(
-            curve, record.span, record.time.size, tuple(orders.values()), position.tobytes()
+            curve, record.rate, record.time.size, tuple(orders.values()), position.tobytes()
         )
         block = np.zeros((len(rows), changes.shape[1], position.size))
         block[list(orders)] = changes
@@ -230,29 +230,29 @@ def _transient_changes(run: RunPredictor, position: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def _known_changes(
-    curve: Smoothed, span: float, samples: int, orders: tuple[int, ...], position: bytes
+    curve: Smoothed, rate: float, samples: int, orders: tuple[int, ...], position: bytes
 ) -> Array:
     """The same as :func:`_curve_changes`, kept: each model of a run asks for it again, and of a
     long record it takes longer than to solve the model."""
-    found = _curve_changes(curve, span, samples, orders, np.frombuffer(position))
+    found = _curve_changes(curve, rate, samples, orders, np.frombuffer(position))
     found.flags.writeable = False
     return found
 
 
 def _curve_changes(
-    curve: Smoothed, span: float, samples: int, orders: Iterable[int], position: Array
+    curve: Smoothed, rate: float, samples: int, orders: Iterable[int], position: Array
 ) -> Array:
     """Change of some derivatives of a curve by one standard deviation of each of its errors, of a
-    record of that length and that many samples."""
-    lines, found = _noise_lines(curve, span, samples), []
+    record of so many samples, and of a length with that reciprocal."""
+    lines, found = _noise_lines(curve, 1.0 / rate, samples), []
     draws = () if lines is not None else _errors(curve)
     for order in orders:
         if lines is not None:
             omega, sd = lines
-            turn = np.multiply.outer(omega, position * span) + order * np.pi / 2
+            turn = np.multiply.outer(omega, position * (1.0 / rate)) + order * np.pi / 2
             found.append((sd * omega**order)[:, None] * np.cos(turn))
         else:
-            each = [draw.evaluate(position, 1.0 / span, order) for draw in draws]
+            each = [draw.evaluate(position, rate, order) for draw in draws]
             found.append(np.reshape(each, (len(draws), position.size)) / np.sqrt(DRAWS))
     return np.stack(found)
 

@@ -196,10 +196,10 @@ class TransientRun(RunPredictor):
         """
         if not self.kernels.derived.dofs:
             return False
-        return self._is_long if self.chosen is None else follows_inputs(self.chosen)
+        return self.is_long if self.chosen is None else follows_inputs(self.chosen)
 
     @property
-    def _is_long(self) -> bool:
+    def is_long(self) -> bool:
         """Whether an integrator would take minutes to follow the inputs."""
         return max(self._angles(), default=0.0) > ANGLE * MOST_INTEGRATED
 

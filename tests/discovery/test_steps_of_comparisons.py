@@ -70,7 +70,7 @@ KINDS = {
 }
 
 
-def record(model, truth, seed=0, noise=0.01):
+def record(model, truth, seed=0, noise=0.05):
     """Of a drive that fills a quarter of the band, solved on a fine mesh."""
     rng = np.random.default_rng(seed)
     lines = np.zeros(COUNT // 2 + 1, dtype=complex)
@@ -95,7 +95,7 @@ def fitted(request):
 
 def squares(fit):
     """Sum of squares at an estimate, in variances of what is left: as found, and on a fine mesh."""
-    predictor = Predictor(fit.model, fit.records, steps=8 * WHOLE, jobs=1)
+    predictor = Predictor(fit.model, fit.records, steps=8 * WHOLE, jobs=1, share=fit.predictor)
     theta, measured = fit.problem.full(fit.point.theta[None])[0], predictor.runs[0].measured
     predictor.set_anchor(theta)
     fine = predictor.simulate(theta[None], 0).y[0]
@@ -142,19 +142,23 @@ def test_an_end_stop_in_few_samples_counts_in_full():
     for steps, limit in ((COARSEST, 1.0), (8 * WHOLE, np.inf)):
         numerics = replace(NUMERICS, steps=steps, policy=replace(NUMERICS.policy, unseen=limit))
         start = np.array([*without.point.theta, 5e5])
-        one = fit_model(model, [data], numerics, start=start, check_mesh=False, damped=True)
+        one = fit_model(
+            model, [data], numerics, start=start, check_mesh=False, damped=True,
+            share=without.predictor,
+        )  # fmt: skip
         falls.append(float(np.log(without.point.variance[0] / one.point.variance[0])) * COUNT)
     assert falls[1] > 100.0
     assert abs(falls[0] - falls[1]) < 0.02 * falls[1] + 6.0
 
 
+@pytest.mark.parametrize("fitted", ["lag", "friction"], indirect=True)
 def test_a_hold_out_run_has_steps_of_its_own(fitted):
     name, truth, fit = fitted
     rough = record(KINDS[name][0], truth, seed=3)
     rough = replace(rough, label="other")
     (found,) = predict_held_out(fit, [rough])
     theta = found.vector
-    fine = Predictor(fit.model, [rough], steps=8 * WHOLE, jobs=1)
+    fine = Predictor(fit.model, [rough], steps=8 * WHOLE, jobs=1, share=found.predictor)
     fine.set_anchor(theta)
     change = np.mean((fine.simulate(theta[None], 0).y[0] - found.y) ** 2, axis=1)
     left = np.mean((fine.runs[0].measured - found.y) ** 2, axis=1)
