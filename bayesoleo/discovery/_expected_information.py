@@ -242,10 +242,14 @@ def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Arra
     """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are
     uncertain; in all others their predictions are equal."""
     moved = np.stack([rival.mean - rivals[0].mean for rival in rivals])
-    rows = np.concatenate([moved, *(rival.spread for rival in rivals)])
-    _, size, directions = np.linalg.svd(rows, full_matrices=False)
-    basis = directions[size > NEGLIGIBLE].T
-    return moved @ basis, [rival.spread @ basis for rival in rivals]
+    distinct = {id(rival.spread): rival.spread for rival in rivals}
+    rows = np.concatenate([moved, *distinct.values()])
+    # Of the rows' coordinates in their own directions, the triangle alone is needed.
+    left, size, _ = np.linalg.svd(np.linalg.qr(rows.T, mode="r").T, full_matrices=False)
+    own = (left * size)[:, size > NEGLIGIBLE]
+    ends = np.cumsum([len(moved), *map(len, distinct.values())])
+    parts = dict(zip(distinct, np.split(own, ends[:-1])[1:], strict=True))
+    return own[: len(moved)], [parts[id(rival.spread)] for rival in rivals]
 
 
 def precision_gain(
