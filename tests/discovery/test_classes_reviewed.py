@@ -10,7 +10,7 @@ import pytest
 from fitted_states import NUMERICS, options
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo.discovery import _review as review
+from bayesoleo.discovery import _refit as refits, _review as review
 from bayesoleo.discovery._alternatives import followed, leads_as_far
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import SearchOptions, close_loop, searched
@@ -148,10 +148,10 @@ def test_rivals_are_compared_with_the_estimate_that_the_final_model_has(tmp_path
         poor = 0.5 if score.option.key[0] == "cubic_stiffness" else 1.0
         return replace(result, fall=poor * result.fall, share=poor * result.share)
 
-    monkeypatch.setattr(review, "refit", poorly)
+    monkeypatch.setattr(refits, "refit", poorly)
     step = found.state.assembly.steps[0]
     place = review.place_of(found, step, 0, roles, NUMERICS, EFFECTS)
-    own, base = place.own.refit, place.without.base()
+    own, base = place.own.refit, place.base
     assert own.fall == pytest.approx(fall_from(base, found.state.fit))
     assert own.fall > max(rival.refit.fall for rival in place.rivals)
     assert own.excludes_null()
