@@ -40,7 +40,7 @@ _HEADER = struct.Struct("<Q")
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
-    " from bayesoleo._worker_processes import serve; serve()"
+    " from bayesoleo._worker_processes import serve; serve(sys.argv[2:])"
 )
 _READY, _VALUE, _ERROR, _UNREADABLE = "ready", "value", "error", "unreadable"
 
@@ -101,6 +101,22 @@ def process_map[S, T, R](
         for helper in helpers:
             helper.join()
     return cast(list[R], call.results())
+
+
+def start_ahead(modules: Sequence[str], jobs: int | None = None) -> None:
+    """Start a process now for work that comes later: it takes seconds to load libraries.
+
+    Parameters
+    ----------
+    modules : sequence of str
+        What the work needs.
+    jobs : int, optional
+        As of :func:`process_map`; with one there is nothing to start.
+    """
+    jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+    if jobs > 1 and _usable():
+        with suppress(_LostError):
+            _worker(0, modules)
 
 
 def _usable() -> bool:
@@ -210,9 +226,9 @@ _workers: dict[int, _Worker] = {}
 class _Worker:
     """A process that waits for work, and the pipes to it."""
 
-    def __init__(self) -> None:
+    def __init__(self, modules: Sequence[str] = ()) -> None:
         environment = os.environ | dict.fromkeys(parallel.ONE_THREAD, "1")
-        command = [sys.executable, "-c", _CHILD, json.dumps(sys.path)]
+        command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), *modules]
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -250,7 +266,7 @@ class _Worker:
         self.process.wait()
 
 
-def _worker(number: int) -> _Worker:
+def _worker(number: int, modules: Sequence[str] = ()) -> _Worker:
     """The process of a number, started where there is none or it has ended."""
     known = _workers.get(number)
     if known is not None and known.process.poll() is not None:
@@ -258,7 +274,7 @@ def _worker(number: int) -> _Worker:
         known = None
     if known is None:
         try:
-            known = _workers[number] = _Worker()
+            known = _workers[number] = _Worker(modules)
         except OSError as error:  # no memory, or too many processes
             raise _LostError from error
     return known
@@ -354,14 +370,23 @@ def _receive(pipe: BinaryIO) -> bytes | None:
     return content if len(content) == size else None
 
 
-def serve() -> None:
-    """In another process: do what comes, until nothing comes any more."""
+def serve(modules: Sequence[str]) -> None:
+    """In another process: do what comes, until nothing comes any more.
+
+    Parameters
+    ----------
+    modules : sequence of str
+        To be loaded before anything comes.
+    """
+    import importlib
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     parallel.limit_threads(1)
     source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed must not get among the messages
+    for name in modules:
+        importlib.import_module(name)
     function, shared, objects = cast(Any, None), None, cast(Sequence[Any], ())
     while _waits(source):
         message = _receive(source)

@@ -15,6 +15,7 @@ from pathlib import Path
 import xarray as xr
 
 from bayesoleo._types import ProgressCallback
+from bayesoleo._worker_processes import start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
@@ -118,6 +119,7 @@ def close(
         summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
     output = ResultFolder.checked(out)
+    start_ahead(["bayesoleo.discovery._loop", "bayesoleo._report.page"], settings.jobs)
     task = prepare(campaign, model, settings, progress=progress)
     _check_aim(task)
     with output.alone():
