@@ -236,7 +236,8 @@ def sensitivities_of(
 def _backend(fit: ModelFit, model: Model, count: int) -> str:
     """NumPy's kernels are ready at once; machine code is worth its making on long records."""
     steps = sum(run.steps for run in fit.predictor.runs) if model.dofs else 0
-    least = WORTH_COMPILING if model.dofs.keys() == fit.model.dofs.keys() else WORTH_COMPILING_STATES
+    same = model.dofs.keys() == fit.model.dofs.keys()
+    least = WORTH_COMPILING if same else WORTH_COMPILING_STATES
     return fit.numerics.backend if count * steps > least else "numpy"
 
 
