@@ -229,7 +229,7 @@ class Reduced:
         kept = np.arange(self.size) if keep is None else np.asarray(keep, dtype=int)
         root = np.broadcast_to(np.sqrt(power), (len(self.square), chosen.size))
         inner = root[:, :, None] * self.gram[:, chosen[:, None], chosen] * root[:, None, :]
-        lower = np.linalg.cholesky(np.eye(chosen.size) + inner)
+        lower = root_of(np.eye(chosen.size) + inner, 1.0)
         cross = self.gram[:, chosen[:, None], kept]
         rows = np.concatenate([self.slope[:, chosen, None], cross], axis=2) * root[:, :, None]
         white = np.linalg.solve(lower, rows)
@@ -242,6 +242,30 @@ class Reduced:
             self.square - np.sum(first**2, axis=1),
             self.log_det + 2.0 * logs,
         )
+
+
+def root_of(matrices: Array, least: float) -> Array:
+    """Lower triangular roots of symmetric matrices ``(..., m, m)`` with known least eigenvalues.
+
+    Where columns are nearly the same and far above the noise, round-off is larger than the least
+    eigenvalue, and the matrix as computed is not positive definite. Its eigenvalues are then raised
+    to what they are at least.
+
+    Parameters
+    ----------
+    matrices : ndarray, shape (..., m, m)
+    least : float
+        No eigenvalue is smaller but for round-off.
+    """
+    try:
+        return np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrices)
+        sizes = np.sqrt(np.maximum(values, least))
+        rows = sizes[..., :, None] * np.swapaxes(vectors, -1, -2)
+        triangle = np.linalg.qr(rows, mode="r")
+        sign = np.where(np.diagonal(triangle, axis1=-2, axis2=-1) < 0.0, -1.0, 1.0)
+        return np.asarray(np.swapaxes(triangle * sign[..., :, None], -1, -2))
 
 
 @dataclass(frozen=True)

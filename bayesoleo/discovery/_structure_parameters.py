@@ -32,6 +32,7 @@ from bayesoleo.discovery._structure_columns import (
     Reduced,
     fewer,
     moment_power,
+    root_of,
 )
 from bayesoleo.discovery._structure_comparison import (
     Columns,
@@ -273,7 +274,8 @@ def _by_side(
         yield 0.0, mean, covariance
         return
     nodes, weights = _normal_nodes(mean.size)
-    moved = nodes @ np.linalg.cholesky(covariance).T
+    least = float(np.finfo(float).eps * np.trace(covariance))
+    moved = nodes @ root_of(covariance, least).T
     amplitudes, side, start = mean + moved, np.zeros(len(nodes), dtype=int), 0
     weights = weights.copy()
     for group, variance in zip(effects, power, strict=True):

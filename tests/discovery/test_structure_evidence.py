@@ -17,6 +17,7 @@ from bayesoleo.discovery._structure_columns import (
     Reduced,
     Remainders,
     mean_of,
+    root_of,
 )
 from bayesoleo.discovery._structure_evidence import Largest, effect_evidence, pair_evidence
 from bayesoleo.discovery._structure_moments import _scaled_tail, log_moments
@@ -455,3 +456,29 @@ def test_evidence_is_exact_wherever_it_counts(side):
             chosen = np.array(labels) == label
             ours, theirs = (logs[some][:, :, chosen] for logs in (found, exact))
             assert mean_of(ours) == pytest.approx(mean_of(theirs), abs=1e-9)
+
+
+def test_columns_that_are_nearly_the_same_far_above_the_noise():
+    """Round-off of their gram matrix is larger than one, which the noise adds to its diagonal."""
+    size = 1e19
+    gram = size * np.array([[1.0, 1.0 + 1e-15], [1.0 + 1e-15, 1.0]])
+    assert np.linalg.eigvalsh(np.eye(2) + gram)[0] < -1e3
+    part = Reduced(gram[None], np.zeros((1, 2)), np.array([100.0]), np.zeros(1))
+    found = part.with_columns([0, 1], np.ones(2))
+    # Of rank one: the determinant of I + size (1, 1)'(1, 1) is 1 + 2 size.
+    # Beside a root of 4e9 round-off is 1e-6 of the other one.
+    np.testing.assert_allclose(found.log_det, np.log(1.0 + 2.0 * size), atol=1e-5)
+    assert np.isfinite(found.gram).all()
+
+
+@pytest.mark.parametrize("least", [1.0, 1e-3])
+def test_roots_of_matrices_that_round_off_made_indefinite(least):
+    rng = np.random.default_rng(3)
+    turn = np.linalg.qr(rng.standard_normal((4, 4)))[0]
+    exact = turn @ np.diag([9.0, 4.0, least, least]) @ turn.T
+    broken = exact - turn @ np.diag([0.0, 0.0, 0.0, 2.0 * least]) @ turn.T
+    root = root_of(np.stack([exact, broken]), least)
+    np.testing.assert_allclose(root @ np.swapaxes(root, 1, 2), [exact, exact], atol=1e-13)
+    np.testing.assert_allclose(np.triu(root, 1), 0.0, atol=1e-14)
+    assert (np.diagonal(root, axis1=1, axis2=2) > 0).all()
+    np.testing.assert_array_equal(root_of(exact, least), np.linalg.cholesky(exact))
