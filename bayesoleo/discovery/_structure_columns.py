@@ -197,7 +197,8 @@ class Reduced:
         root, index = np.sqrt(power)[:, None], np.array(inner, dtype=int)
         rest = [k for k in range(self.size) if k not in inner]
         precision = np.eye(index.size) + root * self.gram[:, index[:, None], index] * root.T
-        covariance = np.linalg.inv(precision)
+        half = np.linalg.solve(root_of(precision, 1.0), np.eye(index.size))
+        covariance = np.swapaxes(half, 1, 2) @ half
         mean = covariance @ (root * self.slope[:, index, None])
         gain = covariance @ (root * self.gram[:, index[:, None], rest])
         turned = mean[:, :, 0].T, np.moveaxis(covariance, 0, 2), np.moveaxis(gain, 0, 1)

@@ -469,6 +469,13 @@ def test_columns_that_are_nearly_the_same_far_above_the_noise():
     # Beside a root of 4e9 round-off is 1e-6 of the other one.
     np.testing.assert_allclose(found.log_det, np.log(1.0 + 2.0 * size), atol=1e-5)
     assert np.isfinite(found.gram).all()
+    groups = [Group((0,), 0.5), Group((1,), 0.5)]
+    acting = part.with_effects(groups, [1.0, 1.0]).own
+    assert acting is not None
+    covariance = acting.covariance[:, :, 0]
+    assert np.linalg.eigvalsh(covariance)[0] >= -1e-6
+    # What the two do together is known, what they do apart is not.
+    np.testing.assert_allclose(covariance, [[0.5, -0.5], [-0.5, 0.5]], atol=1e-5)
 
 
 @pytest.mark.parametrize("least", [1.0, 1e-3])
