@@ -82,8 +82,27 @@ def process_map[S, T, R](
     """
     work = list(items)
     jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-    if jobs <= 1 or len(work) <= 1 or not _usable():
+    alone = jobs <= 1 or len(work) <= 1 or not _usable()
+    if alone or not _in_use.acquire(blocking=False):
         return [function(shared, item) for item in work]
+    try:
+        return _shared(function, shared, work, jobs, known)
+    finally:
+        _in_use.release()
+
+
+#: Held while a call uses the processes: another one at that time does its work by itself.
+_in_use = threading.Lock()
+
+
+def _shared[S, T, R](
+    function: Callable[[S, T], R],
+    shared: S,
+    work: list[T],
+    jobs: int,
+    known: Callable[[S], Sequence[Any]],
+) -> list[R]:
+    """Results of :func:`process_map` by this process and others."""
     call = _Call(function, shared, work, known)
     helpers = [
         threading.Thread(target=call.help, args=(k,), daemon=True)
@@ -187,7 +206,7 @@ class _Call:
             worker.ask(self._message())  # what all calls need
             objects = self.known(self.shared)
             while (index := self._take(last=True)) is not None:
-                kind, value = worker.ask(_dumps((index, self.items[index]), objects), objects)
+                kind, value = worker.ask(_sent((index, self.items[index]), objects), objects)
                 if kind == _ERROR:
                     self.failed = value
                 else:
@@ -214,7 +233,7 @@ class _Call:
     def _message(self) -> bytes:
         with self.lock:
             if not self._sent:
-                self._sent = _dumps((self.function, self.shared, self.known))
+                self._sent = _sent((self.function, self.shared, self.known))
             return self._sent
 
 
@@ -228,7 +247,7 @@ class _Worker:
 
     def __init__(self, modules: Sequence[str] = ()) -> None:
         environment = os.environ | dict.fromkeys(parallel.ONE_THREAD, "1")
-        command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), *modules]
+        command = [sys.executable, "-P", "-c", _CHILD, _paths(), *modules]
         self.process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -257,13 +276,18 @@ class _Worker:
         return kind, value
 
     def end(self) -> None:
-        """Close the pipes, at which the process ends."""
+        """End the process, and close the pipes to it."""
+        self.process.kill()
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 with suppress(OSError):
                     pipe.close()
-        self.process.kill()
         self.process.wait()
+
+
+def _paths() -> str:
+    """Where modules are found; an import passes over what is no text."""
+    return json.dumps([one for one in sys.path if isinstance(one, str)])
 
 
 def _worker(number: int, modules: Sequence[str] = ()) -> _Worker:
@@ -313,7 +337,7 @@ def begin_elsewhere(module: str, function: str) -> None:
     code = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); import {module} as m"
     with suppress(OSError):
         process = subprocess.Popen(
-            [sys.executable, "-c", f"{code}; m.{function}()", json.dumps(sys.path)],
+            [sys.executable, "-P", "-c", f"{code}; m.{function}()", _paths()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -344,6 +368,14 @@ def _dumps(value: Any, known: Sequence[Any] = ()) -> bytes:
     stream = io.BytesIO()
     Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
     return stream.getvalue()
+
+
+def _sent(value: Any, known: Sequence[Any] = ()) -> bytes:
+    """The same for a process; what cannot be sent is done here."""
+    try:
+        return _dumps(value, known)
+    except Exception as error:
+        raise _LostError from error
 
 
 def _loads(content: bytes, known: Sequence[Any] = ()) -> Any:
@@ -404,12 +436,20 @@ def serve(modules: Sequence[str]) -> None:
             continue
         _, item = content
         try:
-            answer = _dumps((_VALUE, function(shared, item)), objects)
+            answer = _answer(function(shared, item), objects)
         except MemoryError as error:  # there is more where this one's memory is not needed
             answer = _dumps((_UNREADABLE, str(error)))
         except Exception as error:
             answer = _of_error(error)
         _send(target, answer)
+
+
+def _answer(value: Any, known: Sequence[Any]) -> bytes:
+    """A result for the parent; where it cannot be sent, the parent computes it."""
+    try:
+        return _dumps((_VALUE, value), known)
+    except Exception as error:
+        return _dumps((_UNREADABLE, str(error)))
 
 
 def _waits(source: BinaryIO) -> bool:

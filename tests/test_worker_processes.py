@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -168,3 +170,37 @@ def test_that_something_is_compiled_is_told_once(tmp_path):
     assert said == [COMPILED_ONCE]
     module.total(True, 1.0)  # nobody listens any more
     assert said == [COMPILED_ONCE]
+
+
+def with_a_lock(shared, item):
+    time.sleep(0.1)
+    return threading.Lock()
+
+
+@pytest.mark.parametrize("shared", [None, threading.Lock()], ids=["result", "shared"])
+def test_what_cannot_be_pickled_is_done_here(eager, shared):
+    assert len(process_map(with_a_lock, shared, range(8), 2)) == 8
+
+
+def test_two_threads_do_not_take_each_others_results(eager):
+    found = {}
+
+    def work(unit):
+        found[unit] = [v for _, v in process_map(slow_square, {"unit": unit}, range(12), 2)]
+
+    threads = [threading.Thread(target=work, args=(unit,)) for unit in (1.0, 100.0)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert found == {unit: [unit * k**2 for k in range(12)] for unit in (1.0, 100.0)}
+
+
+def test_files_of_the_folder_are_not_run_and_odd_paths_do_no_harm(eager, tmp_path, monkeypatch):
+    processes.end_processes()
+    (tmp_path / "json.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path, tmp_path / "no text"])
+    processes._worker(0).ask(processes._dumps((None, None, None)))
+    found = process_map(slow_square, {"unit": 1.0}, range(12), 2)
+    assert len({number for number, _ in found}) == 2

@@ -45,9 +45,6 @@ from bayesoleo.posterior._log_density import LogDensity
 #: Seconds of a quick search from which on its result is written before the posterior is sampled:
 #: a command that is killed then says that the search had ended.
 WORTH_KEEPING = 60.0
-#: Seconds after which results are written again while the search goes on. To make and write them
-#: takes up to two seconds a round; what the search goes on from is written after every round.
-BETWEEN_WRITES = 15.0
 #: What stands in the place of the search's last round while it goes on.
 NOT_YET = "the search had not finished when this was written"
 
@@ -247,14 +244,10 @@ def run_loop(
             )
     known = output.kept(task, callback) if resume else None
     reached = [] if known is None else [known]
-    written = time.monotonic()
 
     def keep(progress: Progress) -> None:
-        nonlocal written
         reached.append(progress)
-        due = len(reached) == 1 or time.monotonic() - written > BETWEEN_WRITES
-        write_so_far(task, progress, output, callback, resume=resume, results=due)
-        written = time.monotonic() if due else written
+        write_so_far(task, progress, output, callback, resume=resume)
 
     try:
         return close_loop(
@@ -285,12 +278,8 @@ def write_so_far(
     callback: ProgressCallback,
     *,
     resume: bool,
-    results: bool = True,
 ) -> None:
-    """Write what is known; failing at that must not end what goes on.
-
-    With ``resume`` what the search goes on from, with ``results`` its results so far.
-    """
+    """Write what is known; failing at that must not end what goes on."""
     if output.folder is None:
         return
     stages = Stages()
@@ -298,8 +287,6 @@ def write_so_far(
     try:
         if resume:
             output.keep(task, progress)
-        if not results:
-            return
         loop = loop_of(progress.ended(NOT_YET), task.roles)
         output.write(*result_tree(task, loop, None, output, stages))
     except Exception as error:

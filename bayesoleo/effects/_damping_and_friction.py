@@ -423,18 +423,8 @@ def _slip(held: str) -> str:
 # lost, so that a motion within it has one answer.
 _LEAK = "memory/10000"
 
-JENKINS = _with_memory(
-    Amplitude("jenkins_friction", "force", "F_J", "sliding friction", 1),
-    f"abs(velocity)*({_slip('memory')} + {_LEAK})",
-    "friction over sliding friction",
-    formula=r"F_J w, \quad \dot w = \rho \dot q \,[|w| < 1 \; \mathrm{or} \; w \dot q < 0]",
-    title="Elastic Coulomb friction (Jenkins element)",
-    source="Jenkins (1962), Analysis of the stress-strain relationships in reactor grade graphite,"
-    " British J. Applied Physics 13, 30-32",
-)
-
-# The memory is scaled by all that can deflect, so that neither a gap nor a rise of zero is
-# singular: without a gap it is the Jenkins element, without a rise a rigid slider.
+# The memory is scaled by all that can deflect, so that no gap is singular: without one it is an
+# elastic slider, the Jenkins element.
 _BEHIND = "((max(memory*(gap + rise) - gap, 0) + min(memory*(gap + rise) + gap, 0))/rise)"
 BACKLASH = single_force(
     Amplitude("backlash_friction", "force", "F_g", "sliding friction behind the gap", 1),
@@ -462,4 +452,4 @@ BACKLASH = single_force(
     " element",
 )
 
-DYNAMIC_FRICTION_EFFECTS = (DAHL, BOUC_WEN, LUGRE, JENKINS, BACKLASH)
+DYNAMIC_FRICTION_EFFECTS = (DAHL, BOUC_WEN, LUGRE, BACKLASH)

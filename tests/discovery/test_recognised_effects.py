@@ -164,7 +164,6 @@ LAWS = {
     "dahl_friction": plus(dahl),
     "bouc_wen_friction": plus(bouc_wen),
     "lugre_friction": plus(lugre),
-    "jenkins_friction": plus(lambda x, v, t: behind_a_gap(x, v, t, gap=0.0, give=2e-3)),
     "backlash_friction": plus(behind_a_gap),
     "quadratic_stiffness": plus(lambda x, v, t: 3e4 * x**2),
     "quintic_stiffness": plus(lambda x, v, t: 1e10 * x**5),

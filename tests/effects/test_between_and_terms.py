@@ -305,22 +305,6 @@ def test_backlash_is_its_slider_without_gap_and_without_rise(gap, rise):
     assert np.mean(np.abs(error)) < 2e-3
 
 
-def test_a_jenkins_element_is_the_slider_without_a_gap():
-    model = find_effect("jenkins_friction").extend(system("duffing"), "position", POSITION).model
-    state, velocity = symbol("jenkins_friction_memory"), symbol("dot(position)")
-    at = {symbol("jenkins_friction_rate"): 500.0}
-    equation = model.equation(state.name).xreplace(at)
-    rate = sp.lambdify([state, velocity], -equation.subs(derivative_symbol(state.name, 1), 0))
-    times = np.linspace(0.0, 1.5, 3001)
-    v = lambda t: 0.01 * 2 * np.pi * np.cos(2 * np.pi * t)  # noqa: E731
-    found = solve_ivp(
-        lambda t, z: [rate(z[0], v(t))], (0, 1.5), [0.0], "LSODA", times, rtol=1e-8, atol=1e-10,
-        max_step=1e-3,
-    )  # fmt: skip
-    expected = _marched(0.01 * np.sin(2 * np.pi * times), 1.0, 0.0, 1 / 500.0)
-    assert np.abs(found.y[0] - expected).max() < 0.005
-
-
 def test_a_first_order_lag_answers_a_sine_as_it_should(scales):
     """At the amplitude one the channel is the answer of tau ds/dt + s = y, however long tau is."""
     model = Model(
