@@ -217,11 +217,14 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
             return found
         finer = _single(fit, record, 2 * steps, predictor)
         if found.status.ok:
-            if finer.set_anchor(found.vector)[0] is not Status.CONVERGED:
-                return found
-            change = np.mean((finer.simulate(found.vector[None], 0).y[0] - found.y) ** 2, axis=1)
+            solved = finer.set_anchor(found.vector)[0] is Status.CONVERGED
+            halved = finer.simulate(found.vector[None], 0).y[0] if solved else np.nan
+            change = np.mean((halved - found.y) ** 2, axis=1)
             left = np.mean((run.measured - found.y) ** 2, axis=1)
-            if visible(run.measured, change, left) <= fit.policy.unseen:
+            if np.isfinite(change).all():
+                if visible(run.measured, change, left) <= fit.policy.unseen:
+                    return found
+            elif steps >= WHOLE:  # nothing says that finer steps would be better
                 return found
         elif steps >= WHOLE:
             return found

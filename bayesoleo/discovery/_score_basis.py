@@ -230,7 +230,12 @@ def sensitivities_of(
             full = np.zeros((y_p.shape[0], theta.size, y_p.shape[2]))
             full[:, layout.columns[r]] = y_p
             found[k].append(full)
-    return [Block(layout.names, item) for item in found]
+    # A shape whose motion is not found in some run is not seen, and scores nothing.
+    seen = [all(np.isfinite(full).all() for full in item) for item in found]
+    return [
+        Block(layout.names, item if known else [np.zeros_like(full) for full in item])
+        for item, known in zip(found, seen, strict=True)
+    ]
 
 
 def _backend(fit: ModelFit, model: Model, count: int) -> str:
@@ -267,7 +272,7 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     elif len(p) == 1:
         samples = run.evaluate(p[0])
     else:
-        status = run.set_anchor(p[0])
+        status = _anchored(run, p)
         if status is not Status.CONVERGED:
             return status
         samples = run.predict(p, derivatives=True)
@@ -281,17 +286,28 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     return resolved_sensitivities(run, p, samples, own)
 
 
+def _anchored(run: RunPredictor, p: Array) -> Status:
+    """Anchor a run at the first constants ``(L, np)`` for which its motion is found."""
+    status = Status.NO_CONVERGENCE
+    for row in p:
+        run.anchor = None
+        status = run.set_anchor(row)
+        if status is Status.CONVERGED:
+            break
+    return status
+
+
 def _of_two_parts(
     fit: ModelFit, r: int, run: RunPredictor, p: Array, solved: Flags
 ) -> Array | Status:
     """The same where some motions are not reached from that of the first shapes, as of a friction
-    that holds in small motions: each of these is sought from its own guess. A shape whose motion
-    is not found is not seen, and the effect is scored with the others."""
+    that holds in small motions: each of these is sought from its own guess. NaN where it is not
+    found."""
     run.anchor = None
     first = _of_run(fit, r, run, p[solved])
     if isinstance(first, Status):
         return first
-    found = np.zeros((len(p), *first.shape[1:]))
+    found = np.full((len(p), *first.shape[1:]), np.nan)
     found[solved] = first
     for lane in np.flatnonzero(~solved):
         run.anchor = None

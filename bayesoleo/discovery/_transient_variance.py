@@ -82,7 +82,8 @@ def _of_run(run: Influence, covariance: Array) -> tuple[float, float]:
     along, left, columns = (scipy.fft.rfft(x) for x in (run.weights, run.residual, run.columns))
     taken = np.einsum("lbk,lm,mbk->bk", columns.conj(), covariance, columns).real / samples
     kept = np.mean(run.columns.any(axis=0) | (run.residual != 0.0), axis=1)
-    remains = np.clip(kept[:, None] - taken, LEAST, 1.0).mean(axis=0)
+    # An output without weight or noise tells nothing of what is left of the others.
+    remains = np.clip(kept[:, None] - taken, LEAST, 1.0)[kept > 0.0].mean(axis=0)
     lines = _Lines(samples)
     counted = lines.sums(lines.weights * remains)
     cross = left[:, None] * left[None].conj() * lines.weights
