@@ -96,8 +96,9 @@ def test_every_solver_finds_the_same_estimate(fits, name, solver):
     for found in (shot, fit):
         assert found.point.status is Status.CONVERGED
     # Equal steps may move an estimate by a tenth of its standard deviation; the others' errors are
-    # those of a millionth of a swing, and an estimate ends a thousandth from its optimum.
-    tolerance = 0.1 if solver == "collocation" else 0.005
+    # those of a millionth of a swing, and an estimate ends a thousandth from its optimum. Steps of
+    # a library change with the parameters: the objective scatters by 3e-4, which is 0.025.
+    tolerance = {"collocation": 0.1, "library": 0.03}.get(solver, 0.005)
     assert np.abs((fit.point.theta - shot.point.theta) / shot.point.sd).max() < tolerance
     np.testing.assert_allclose(fit.point.sd, shot.point.sd, rtol=0.02)
     truth = np.array([fit.model.parameters[n].value for n in fit.model.estimated()])
