@@ -478,7 +478,8 @@ def for_comparison(fit: ModelFit) -> ModelFit:
 
     A comparison needs no higher accuracy than what it decides on. What a coarser mesh changes of
     the outputs of long transients may not be more than one squared standard deviation of what the
-    model leaves, over all samples together: no decision rests on as little.
+    model leaves, over all samples together. (How much of it lies along what is left is not asked: a
+    difference of two models' squares may change by more.)
 
     Parameters
     ----------
