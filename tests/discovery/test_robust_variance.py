@@ -123,3 +123,20 @@ def test_noise_that_outputs_share_counts_along_both():
             found[sign].append(coloured_variance([run], np.zeros((0, 0)))[0])
     assert np.mean(found[1]) == pytest.approx(2 * np.sum(wave**2), rel=0.15)
     assert np.max(found[-1]) < 1e-9
+
+
+def test_an_output_that_nothing_moves_does_not_change_the_variance():
+    """Constant and without noise, it has neither weight nor residual."""
+    rng, size = np.random.default_rng(8), 600
+    column = np.cos(np.arange(size) / 20.0)
+    covariance = np.array([[1.0 / (column @ column)]])
+    residual = rng.standard_normal(size)
+    residual -= column * (column @ residual) * covariance[0, 0]
+    weights = covariance[0, 0] * column
+    alone = Influence(weights[None], residual[None], column[None, None])
+    dead = np.zeros(size)
+    beside = Influence(
+        np.stack([weights, dead]), np.stack([residual, dead]), np.stack([column, dead])[None]
+    )
+    one, two = (coloured_variance([run], covariance)[0] for run in (alone, beside))
+    assert two == pytest.approx(one, rel=1e-6)
