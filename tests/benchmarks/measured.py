@@ -29,6 +29,7 @@ key                   error, root mean square
 silverbox_arrow       simulation of the arrow from the parameters of Schroeder80mV alone, mV
 silverbox_arrow_…     the same up to the largest amplitude of the estimation data
 silverbox_multisine   the same of the random multisines
+silverbox_offset      offset of the sensor in Schroeder80mV, with which all three are simulated, mV
 emps_fit, _pulses     force, N
 emps_position         position on the pulses, simulated from the measured force, mm
 tanks_estimation, …   level, V
