@@ -256,7 +256,7 @@ def _line(name: str, entry: Mapping[str, Any]) -> str:
     scale = engineering(entry["unit"], abs(entry["mean"]))
     if entry["interval"] is None:
         mean = f"{scale.factor * entry['mean']:.4g}"
-        return f"  {name:32}{mean:>10}{scale.unit:>10}   shared with {entry['shared_with']}"
+        return f"  {name:32}{mean:>10} {scale.unit:>9}   shared with {entry['shared_with']}"
     sd = scale.factor * entry["sd"]
     mean, low, high = (
         format_number(scale.factor * value, sd) for value in (entry["mean"], *entry["interval"])

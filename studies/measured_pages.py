@@ -94,10 +94,12 @@ def beside_published() -> Figure:
     for place, (key, _, unit, others) in enumerate(rows):
         least = min(others.values())
         for name, value in others.items():
+            # Names of methods that are close to each other stand on either side.
+            side = "right" if value == least else "left"
             axes.plot(value / least, place, "D", ms=6, mfc="none", color="#6b7280")
             axes.annotate(
-                name, (value / least, place), (0, 7), textcoords="offset points",
-                ha="center", fontsize=8, color="#4b5563",
+                name, (value / least, place), (-4 if side == "right" else 4, 7),
+                textcoords="offset points", ha=side, fontsize=8, color="#4b5563",
             )  # fmt: skip
         axes.plot(figures[key] / least, place, "o", ms=8, color="#0072b2")
         axes.annotate(
@@ -106,9 +108,10 @@ def beside_published() -> Figure:
         )  # fmt: skip
     axes.axvline(1.0, color="#d1d5db", lw=1.0, zorder=0)
     axes.set_yticks(range(len(rows)), [title for _, title, *_ in rows])
-    axes.set(xscale="log", xlabel="error over the smallest published one", ylim=(-0.7, None))
-    axes.invert_yaxis()
-    axes.margins(x=0.12, y=0.12)
+    axes.set(xscale="log", xlabel="error over the smallest published one")
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.margins(x=0.12)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(left=False)
     return figure

@@ -13,6 +13,7 @@ import pytest
 
 from bayesoleo import load_model
 from bayesoleo.data._campaign import REGISTERED
+from bayesoleo.gallery import print_added
 from bayesoleo.model import driven_by
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -106,3 +107,17 @@ def test_errors_stand_beside_published_ones(tmp_path, monkeypatch, capsys):
         "Silverbox, arrow",
         "EMPS, position on the pulses",
     ]
+
+
+def test_a_long_unit_does_not_run_into_its_number(capsys):
+    name, unit = "quadratic", "(kg·m²/A/s⁵)/V²"
+    shared = {"mean": -4659.0, "interval": None, "unit": unit, "shared_with": "another"}
+    entry = {"effect": "quadratic_stiffness", "target": "y", "expected": {name: 0.0}}
+    candidates = [{**entry, "accepted": True}]
+    rounds = [{"accepted": "quadratic_stiffness", "accepted_target": "y", "candidates": candidates}]
+    summary = {
+        "effects": ["quadratic_stiffness"], "targets": ["y"], "rounds": rounds,
+        "parameters": {name: shared},
+    }  # fmt: skip
+    print_added(summary)
+    assert f"4659 {unit}   shared with another" in capsys.readouterr().out
