@@ -423,9 +423,14 @@ def _slip(held: str) -> str:
 # lost, so that a motion within it has one answer.
 _LEAK = "memory/10000"
 
+# Without a rise the slider is rigid, and no deflection tells its force: a rise of zero stands for a
+# ten-thousandth of the gap. A rise of a hundredth of the gap changes by a part in 20,000. With
+# neither there is no length at all; that is Coulomb friction.
+_RISE = "sqrt(rise**2 + (gap/10000)**2)"
 # The memory is scaled by all that can deflect, so that no gap is singular: without one it is an
 # elastic slider, the Jenkins element.
-_BEHIND = "((max(memory*(gap + rise) - gap, 0) + min(memory*(gap + rise) + gap, 0))/rise)"
+_LARGEST = f"(gap + {_RISE})"
+_BEHIND = f"((max(memory*{_LARGEST} - gap, 0) + min(memory*{_LARGEST} + gap, 0))/{_RISE})"
 BACKLASH = single_force(
     Amplitude("backlash_friction", "force", "F_g", "sliding friction behind the gap", 1),
     "friction",
@@ -442,7 +447,7 @@ BACKLASH = single_force(
     ),
     states={
         "memory": InternalState(
-            f"dot(memory) - (velocity - abs(velocity)*({_slip(_BEHIND)} + {_LEAK}))/(gap + rise)",
+            f"dot(memory) - (velocity - abs(velocity)*({_slip(_BEHIND)} + {_LEAK}))/{_LARGEST}",
             description="deflection of the gap and the friction element over the largest",
         )
     },
