@@ -447,7 +447,8 @@ def _wants_finer(
     """Whether an estimate is to be repeated on half the steps.
 
     That of a model that stands for itself until it moves no more; of long transients also until no
-    difference shows in what the model leaves, as of a model that is only compared with others.
+    difference shows in what the model leaves: the squares of the change alone. Of a model that is
+    only compared with others, what they do to the sum of squares through the residual counts too.
     """
     steps, long = problem.predictor.steps, _can_be_coarser(problem)
     if long and steps < WHOLE and not point.status.ok:
@@ -477,9 +478,11 @@ def for_comparison(fit: ModelFit) -> ModelFit:
     """A fit on the coarsest mesh that shows no difference, to score and refit candidates on.
 
     A comparison needs no higher accuracy than what it decides on. What a coarser mesh changes of
-    the outputs of long transients may not be more than one squared standard deviation of what the
-    model leaves, over all samples together. (How much of it lies along what is left is not asked: a
-    difference of two models' squares may change by more.)
+    the outputs of long transients, and of the sum of squares through the residual, may not be more
+    than one variance of what the model leaves, over all samples together. That holds at this
+    estimate: an effect that explains ``a`` such variances and has the same error of the mesh
+    explains at most ``2 sqrt(a) + 1`` more or less there, which is little of what is far from a
+    limit.
 
     Parameters
     ----------
@@ -531,8 +534,16 @@ def _squares(
     others: list[Array],
     point: PointEstimate,
 ) -> float:
-    """What others change of predictions, over the variances of what is left."""
-    return _visible(problem, point, np.square(_change(predictions, others)))
+    """Largest change of the sum of squares by better predictions, over the variances of what is
+    left: ``d.d + |2 r.d|`` of their changes ``d`` and residuals ``r``."""
+    squares, along = np.square(_change(predictions, others)), 0.0
+    for r, (run, here, other) in enumerate(
+        zip(problem.predictor.runs, predictions, others, strict=True)
+    ):
+        products = problem.kept(r, (run.measured - other) * (other - here.y)).sum(axis=1)
+        shown = products * _is_shown(run.measured, squares[r])
+        along += float(np.sum(2.0 * shown / np.maximum(point.variance, 1e-300)))
+    return _visible(problem, point, squares) + abs(along)
 
 
 def _visible(problem: CampaignProblem, point: PointEstimate, squares: Array) -> float:
@@ -553,8 +564,14 @@ def visible(measured: Array, squares: Array, variance: Array) -> float:
         Mean squares of the change.
     variance : ndarray, shape (ny,)
     """
-    shown = np.where(squares > SETTLED**2 * np.var(measured, axis=1), squares, 0.0)
+    shown = squares * _is_shown(measured, squares)
     return float(np.sum(shown / np.maximum(variance, 1e-300)) * measured.shape[1])
+
+
+def _is_shown(measured: Array, squares: Array) -> Array:
+    """One for outputs whose mean squared change ``(ny,)`` is more than what has settled, else
+    zero."""
+    return (squares > SETTLED**2 * np.var(measured, axis=1)).astype(float)
 
 
 def _likeliest(problem: CampaignProblem, starts: Array) -> Array:

@@ -43,9 +43,11 @@ class SearchPolicy:
     )
     unseen: float = _value(
         1.0,
-        "Change of the outputs by halving the steps of a long transient, summed over its samples,"
-        " in variances of what a model leaves, below which models are compared on that mesh.",
-        "the likelihoods that are compared differ by more",
+        "Change of the outputs on finer steps of a long transient, squared and summed over its"
+        " samples, in variances of what a model leaves, below which models are compared on a mesh;"
+        " what it changes of the squares along the residual is added.",
+        "twice the log likelihood of the present model changes by less; the part that an effect"
+        " explains may change by more, about twice its root",
     )
     missed_factor: float = _value(
         3.0,

@@ -119,6 +119,27 @@ def test_no_decision_depends_on_the_steps_of_a_comparison(fitted):
     assert abs(found - fine) < 4.0
 
 
+def test_a_change_along_what_is_left_counts(fitted):
+    """Of two changes of one size, that along the residual changes the sum of squares more."""
+    _, _, fit = fitted
+    measured, here = fit.predictor.runs[0].measured, fit.predictions[0]
+    left, sd = measured - here.y, np.sqrt(fit.point.variance[0])
+    along = 0.5 * sd * left / np.linalg.norm(left)
+    across = np.roll(along, 1, axis=1)
+    across -= left * np.sum(across * left) / np.sum(left**2)
+    across *= np.linalg.norm(along) / np.linalg.norm(across)
+
+    def seen(change):
+        return _fit._squares(fit.problem, [here], [here.y + change], fit.point)
+
+    # Both changes are half a standard deviation: d.d is 1/4. Across the residual of this mesh, that
+    # of the other one is shorter along d by d itself, so that |2 r.d| is twice d.d.
+    assert seen(across) == pytest.approx(3 * 0.25, rel=1e-6)
+    # The residual is sqrt(N) = 77 standard deviations long; d.d takes a quarter off twice that.
+    assert seen(along) == pytest.approx(np.sqrt(left.size) - 0.25, rel=1e-3)
+    assert seen(0.0 * along) == 0.0
+
+
 def test_a_candidate_is_refined_where_its_steps_show(fitted):
     """Twice as many steps, and all of them, change little of what it leaves, whatever it began
     with."""
