@@ -301,6 +301,34 @@ def test_a_step_is_not_shortened_below_what_is_to_be_resolved():
     assert resolved.evaluations < patient.evaluations / 2
 
 
+@pytest.mark.parametrize(
+    ("away", "resolution", "status"),
+    [
+        (0.02, 1e-3, Status.CONVERGED),
+        (0.05, 1e-3, Status.NO_CONVERGENCE),
+        (0.02, 0.0, Status.NO_CONVERGENCE),  # who names no resolution gets certified digits
+    ],
+)
+def test_a_start_that_scatter_hides_from_every_step_has_converged_if_it_is_near(
+    away, resolution, status
+):
+    """Any other solution has an error that costs more than the optimum would gain."""
+    y = np.random.default_rng(1).normal(1.0, 5.0, 50)
+    best, sd = y.mean(), y.std() / np.sqrt(y.size)
+    start = best + away * sd
+    # The optimum gains away**2 / 2, at most 1.3e-3; the sum of squares grows by 2e-4 of itself, of
+    # which the log likelihood falls by N/2 times as much, 5e-3.
+    scatter = 1e-4 * (y - best)
+    problem = FunctionProblem(
+        lambda x, t: t[0] * x - (0.0 if t[0] == start else scatter),
+        np.ones(y.size), y, [Normal(0.0, 1e4)], start=[start],
+        jacobian=lambda x, _: x[:, None],
+    )  # fmt: skip
+    point = estimate(problem, "mbe", resolution=resolution)
+    assert point.status is status
+    assert point.theta[0] == start
+
+
 def test_an_unknown_of_value_zero_is_known_by_its_standard_deviation():
     """Each step leaves an eighth of the error: against the value none would ever be small."""
     y = np.concatenate([np.full(25, 1.0), np.full(25, -1.0)])
