@@ -9,10 +9,12 @@ from scipy.fft import irfft
 from bayesoleo.discovery import _fit
 from bayesoleo.discovery._fit import Numerics, fit_model, for_comparison, visible
 from bayesoleo.discovery._run_predictions import predict_held_out
+from bayesoleo.discovery._score_basis import sensitivities_of
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import transient_record
-from bayesoleo.prediction._transient_run import COARSEST, WHOLE
+from bayesoleo.prediction._transient_run import COARSEST, WHOLE, TransientRun
+from bayesoleo.solvers._orbit import Status
 
 STEP, COUNT = 1.0 / 600.0, 6000
 NUMERICS = Numerics(jobs=1)
@@ -185,6 +187,61 @@ def test_a_hold_out_run_has_steps_of_its_own(fitted):
     left = np.mean((fine.runs[0].measured - found.y) ** 2, axis=1)
     assert found.status.ok
     assert visible(fine.runs[0].measured, change, left) < 4.0
+
+
+def failing(monkeypatch, fails):
+    """Let the motion not be found where a function of the steps and the number of the call says."""
+    solve = Predictor.set_anchor
+    seen = []
+
+    def set_anchor(self, theta, *args, **more):
+        seen.append(self.steps)
+        if fails(self.steps, seen.count(self.steps)):
+            return [Status.NO_CONVERGENCE] * len(self.runs)
+        return solve(self, theta, *args, **more)
+
+    monkeypatch.setattr(Predictor, "set_anchor", set_anchor)
+
+
+@pytest.mark.parametrize(
+    ("fitted", "coarse"), [("lag", True), ("friction", False)], indirect=["fitted"]
+)
+def test_a_hold_out_run_whose_finer_steps_are_not_solved(fitted, coarse, monkeypatch):
+    """On long steps nothing is known of them, and it goes on; on short ones it ends."""
+    name, truth, fit = fitted
+    other = replace(record(KINDS[name][0], truth, seed=3), label="other")
+    assert (fit.steps < WHOLE) == coarse
+    failing(monkeypatch, lambda steps, call: steps == 2 * fit.steps and call == 1)
+    (found,) = predict_held_out(fit, [other])
+    assert found.status.ok
+    assert found.predictor.steps > fit.steps if coarse else found.predictor.steps == fit.steps
+
+
+@pytest.mark.parametrize("fitted", ["friction"], indirect=True)
+def test_a_scan_begins_with_the_first_shape_that_is_solved(fitted, monkeypatch):
+    _, _, fit = fitted
+    model = fit.model.fixing("r")
+    shapes = [{"r": value} for value in (20.0, 30.0, 45.0)]
+    every = sensitivities_of(fit, model, shapes)
+    solve, asked = TransientRun.set_anchor, []
+
+    def set_anchor(self, p, *args, **more):
+        asked.append(float(p[self.kernels.derived.constants.index("r")]))
+        if asked[-1] in lost:
+            return Status.NO_CONVERGENCE
+        return solve(self, p, *args, **more)
+
+    monkeypatch.setattr(TransientRun, "set_anchor", set_anchor)
+    lost = {20.0}
+    found = sensitivities_of(fit, model, shapes)
+    assert asked == [20.0, 30.0]
+    for one, expected in zip(found, every, strict=True):
+        # The same equations from another start, solved to some 1e-9 of their size.
+        size = np.abs(expected.by_run[0]).max()
+        assert size > 0.0
+        np.testing.assert_allclose(one.by_run[0], expected.by_run[0], atol=1e-6 * size)
+    lost = {20.0, 30.0, 45.0}
+    assert sensitivities_of(fit, model, shapes) is Status.NO_CONVERGENCE
 
 
 def test_steps_of_short_records_are_not_joined():
