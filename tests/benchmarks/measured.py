@@ -17,7 +17,8 @@ Each set gives its errors, and
 ``<set>_seconds``
     time of what ``bayesoleo close --quick`` computes, compilation included;
 ``<set>_cpu_seconds``
-    CPU time of that, summed over threads: what a busy machine leaves alone;
+    CPU time of that, summed over the threads of one process: what a busy machine leaves alone.
+    With ``--jobs 1`` it is all of it; with more, worker processes are not counted;
 ``<set>_memory_GB``
     most memory that the process has used;
 ``<set>_failed``
