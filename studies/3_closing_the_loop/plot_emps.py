@@ -44,7 +44,7 @@ figure = study.figure("course", lambda: pages.course(tree, "force", "pulses", 1.
 # How small can these errors be? ``python tests/benchmarks/measured_limits.py --only emps`` answers
 # without the loop. Each pulse begins and ends with a step of 176 N. Above 300 Hz the force is
 # 2.7 N, root mean square, and the inertia that the recorded position shows there is 0.004 N: no
-# function of this position predicts that part. The best linear one leaves 3.4 N above 20 Hz.
+# linear function of this position predicts that part. The best one leaves 3.4 N above 20 Hz.
 #
 # Where force drives the model, nothing holds the slide, and an error of a hundredth of a newton
 # moves it by a millimetre in 25 s. The published parameters leave 9.2 mm on the pulses. Mass,

@@ -234,7 +234,7 @@ def brfd_run(file: Path, start: float, period: float) -> Figures:
             for rise in (0.02, 0.1, 0.3)
             for play in ((0.03, 0.08, 0.2) if gap else (0.0,))
         ]
-        fits = [least_squares(error, begin, loss="linear") for begin in starts]
+        fits = [least_squares(error, begin) for begin in starts]
         found[name] = min(rms(fit.fun) for fit in fits)
     return found
 

@@ -29,6 +29,14 @@ def test_a_mass_with_viscous_friction_follows_the_closed_form():
     assert np.abs(found - expected).max() < 0.5 * STEP / 3 * force / viscous
 
 
+def test_a_force_of_position_holds_the_slide_where_it_balances():
+    elastic, place = np.array([300.0, -20.0, 4000.0]), 0.05
+    balance = np.full(20_000, np.polyval([*elastic[::-1], 0.0], place))
+    found = moved(balance, 10.0, KNOTS, 100.0 * KNOTS, elastic, 0.0)
+    # After twenty seconds the motion has died away, by steps of any length.
+    assert found[-1] == pytest.approx(place, abs=1e-9)
+
+
 def test_a_slide_rests_within_its_coulomb_friction():
     mass, viscous, coulomb, _ = PUBLISHED
     values = np.array([mass, viscous, coulomb, coulomb, 0.0])
