@@ -365,17 +365,24 @@ class NoiseSpectrum:
 
     def freedom(self, power: Array) -> float:
         """Degrees of freedom of ``power @ level``: few lines have said what the level is."""
+        used, low, high, counts = self._neighbours
+        share, size = power / counts, self.level.size + 1
+        spread = np.bincount(low, share, size) - np.bincount(high, share, size)
+        measured = np.where(used, np.cumsum(spread)[:-1] * self.level, 0.0)
+        scatter = float(np.sum(2.0 * measured**2 / self.weights))
+        return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
+
+    @cached_property
+    def _neighbours(
+        self,
+    ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64], Array]:
+        """Which lines say what the noise is; by line, the first of those that say what its level
+        is, the first beyond them, and their number."""
         used = ~self._harmonic()
         if self.emptied is not None:
             used = used & ~self.emptied
         low, high = _windows(self.level.size, self.lines, self.emptied)
-        counts = np.maximum(_between(used.astype(float), low, high), 1.0)
-        spread = np.zeros(self.level.size + 1)
-        np.add.at(spread, low, power / counts)
-        np.add.at(spread, high, -power / counts)
-        measured = np.where(used, np.cumsum(spread)[:-1] * self.level, 0.0)
-        scatter = float(np.sum(2.0 * measured**2 / self.weights))
-        return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
+        return used, low, high, np.maximum(_between(used.astype(float), low, high), 1.0)
 
 
 def noise_spectrum(

@@ -130,8 +130,8 @@ def curves_of(columns: Array, position: Array, periodic: bool) -> Array:
     # Close to a multiple of one cycle rounding decides between both ends: they are one point.
     order = np.argsort(turn, kind="stable")
     around = np.concatenate([turn[order[-1:]] - 1, turn[order], turn[order[:1]] + 1])
-    values = columns[..., np.concatenate([order[-1:], order, order[:1]])]
-    return _between(around, values, np.arange(POINTS) / POINTS)
+    place = np.concatenate([order[-1:], order, order[:1]])
+    return _between(around, columns, np.arange(POINTS) / POINTS, place)
 
 
 def interpolated(curves: Array, position: Array, periodic: bool) -> Array:
@@ -142,12 +142,14 @@ def interpolated(curves: Array, position: Array, periodic: bool) -> Array:
     return _between(np.arange(POINTS + 1) / POINTS, closed, position % 1.0)
 
 
-def _between(known: Array, values: Array, wanted: Array) -> Array:
-    """Linear interpolation along the last axis; ``known`` ascends."""
+def _between(known: Array, values: Array, wanted: Array, place: Integers | None = None) -> Array:
+    """Linear interpolation along the last axis; ``known`` ascends, its values are at ``place``."""
     right = np.clip(np.searchsorted(known, wanted, side="right"), 1, known.size - 1)
     left = right - 1
     width = np.maximum(known[right] - known[left], np.finfo(float).tiny)
     part = np.clip((wanted - known[left]) / width, 0.0, 1.0)
+    if place is not None:
+        left, right = place[left], place[right]
     return np.asarray(values[..., left] * (1 - part) + values[..., right] * part)
 
 
@@ -171,35 +173,35 @@ def equal_shares(families: Sequence[str], members: Sequence[str]) -> Array:
     return np.array([1.0 / (len(inside[pair[0]]) * pairs.count(pair)) for pair in pairs])
 
 
-def alike(directions: Array, share: Array, usable: Flags, most: float) -> tuple[Integers, Array]:
+def alike(directions: Array, share: Array, most: float) -> tuple[Integers, Array]:
     """One signature for each group of nearly equal ones, and the groups' shares of the variance.
 
     Parameters
     ----------
     directions : ndarray, shape (k, n)
-        Of unit length.
+        Of unit length; single precision is enough.
     share : ndarray, shape (k,)
-    usable : ndarray of bool, shape (k,)
-        Which may stand alone.
     most : float
         Squared cosine above which two are alike.
 
     Returns
     -------
     single : ndarray of int, shape (q,)
+        The first of each group.
     odds : ndarray, shape (q,)
         They sum to one.
     """
-    single, odds = list[int](), list[float]()
-    for k in np.flatnonzero(usable):
-        cosines = directions[single] @ directions[k] if single else np.zeros(0)
-        if cosines.size and np.max(cosines**2) > most:
-            odds[int(np.argmax(cosines**2))] += share[k]
+    squared = np.square(directions @ directions.T) if len(directions) else np.zeros((0, 0))
+    kept, odds = list[int](), list[float]()
+    for own, row in enumerate(squared):
+        like = row[kept]
+        if like.size and like.max() > most:
+            odds[int(np.argmax(like))] += share[own]
         else:
-            single.append(int(k))
-            odds.append(float(share[k]))
+            kept.append(own)
+            odds.append(float(share[own]))
     weights = np.array(odds)
-    return np.array(single, dtype=np.int64), weights / weights.sum() if odds else weights
+    return np.array(kept, dtype=np.int64), weights / weights.sum() if odds else weights
 
 
 # -- bases -----------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import Polynomial, legendre
-from numpy.polynomial.polynomial import polyval
 
+from bayesoleo._compiled import jit
 from bayesoleo._types import Array, Float, Integers
 from bayesoleo.errors import InputError
 
@@ -72,8 +72,21 @@ class Tableau:
             They turn stage values of the highest derivative into that derivative, the one below and
             the one below that.
         """
-        tables = [np.asarray(polyval(position, c).T, float) for c in _coefficients(tuple(self.c))]
-        return tables[0], tables[1], tables[2]
+        found = [np.empty((np.size(position), self.stages)) for _ in range(3)]
+        for table, coefficients in zip(found, _coefficients(tuple(self.c)), strict=True):
+            _evaluate(np.asarray(position, float), coefficients, table)
+        return found[0], found[1], found[2]
+
+
+@jit
+def _evaluate(x: Array, coefficients: Array, values: Array) -> None:
+    """Polynomials (degree + 1, s) at ``x (N,)``, shape (N, s), by Horner's scheme."""
+    for i in range(x.size):
+        for j in range(coefficients.shape[1]):
+            value = coefficients[-1, j]
+            for k in range(coefficients.shape[0] - 2, -1, -1):
+                value = coefficients[k, j] + value * x[i]
+            values[i, j] = value
 
 
 @cache

@@ -196,11 +196,13 @@ def test_curves_give_back_smooth_signatures(periodic):
 def test_near_copies_share_what_one_of_them_has():
     shares = equal_shares(["friction"] * 4 + ["gas"], ["a", "a", "b", "c", "d"])
     np.testing.assert_allclose(shares, [1 / 6, 1 / 6, 1 / 3, 1 / 3, 1])
-    directions = np.eye(3)[[0, 0, 1, 2]]
-    usable = np.array([True, True, True, False])
-    single, odds = alike(directions, np.array([1.0, 1.0, 2.0, 4.0]), usable, 0.9)
-    np.testing.assert_array_equal(single, [0, 2])
-    np.testing.assert_allclose(odds, [0.5, 0.5])
+    # The second is the first's negative, and the last but 0.89 of the third by its square.
+    directions = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0.89**0.5, 0.11**0.5]])
+    single, odds = alike(directions.astype(np.float32), np.array([1.0, 1.0, 2.0, 4.0]), 0.9)
+    np.testing.assert_array_equal(single, [0, 2, 3])
+    np.testing.assert_allclose(odds, [0.25, 0.25, 0.5])
+    nothing, none = alike(np.zeros((0, 3)), np.zeros(0), 0.9)
+    assert nothing.size == none.size == 0
 
 
 def test_a_log_uniform_prior_is_one():
