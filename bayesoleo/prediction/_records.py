@@ -18,6 +18,8 @@ from bayesoleo.errors import CampaignError
 from bayesoleo.prediction._band_limited import Smoothed, band_limited_channels, sample_noise
 
 PERIODIC, TRANSIENT = "periodic", "transient"
+#: Harmonic orders of one table of exponentials: those of hundreds are products of two tables.
+TABLE = 32
 #: A smoother needs that many samples.
 FEWEST_SAMPLES = 8
 
@@ -96,13 +98,28 @@ class Harmonics:
             rates = rates.copy()
             rates[0] = 0.0
         values = np.empty(phase.shape)
-        # Blocks keep the table of exponentials small: 512 x 400 complex numbers stay within the
-        # second-level cache.
+        # Blocks keep the tables of exponentials small: they stay within the second-level cache.
         for first in range(0, phase.size, 512):
-            block = phase[first : first + 512]
-            table = np.exp(2j * np.pi * np.outer(block % 1.0, self.orders))
-            values[first : first + 512] = (table @ rates).real
+            cycles = phase[first : first + 512] % 1.0
+            values[first : first + 512] = _sum_of_harmonics(cycles, self.orders, rates)
         return values
+
+
+def _sum_of_harmonics(cycles: Array, orders: Integers, rates: ComplexArray) -> Array:
+    """``Re sum_k rates_k exp(2 pi i k cycles)``, shape (N,).
+
+    The exponentials take the time. Each of many is the product of one whose order is a multiple of
+    ``TABLE`` and one whose order is below: as many are computed as a table has rows and columns,
+    and not as it has fields.
+    """
+    if orders.size <= 2 * TABLE:
+        return np.asarray((np.exp(2j * np.pi * np.outer(cycles, orders)) @ rates).real)
+    high, low = np.divmod(orders, TABLE)
+    table = np.zeros((TABLE, int(high[-1]) + 1), dtype=complex)
+    table[low, high] = rates
+    fine = np.exp(2j * np.pi * np.outer(cycles, np.arange(TABLE)))
+    coarse = np.exp(2j * np.pi * np.outer(cycles, TABLE * np.arange(table.shape[1])))
+    return np.asarray(np.einsum("nh,nh->n", fine @ table, coarse).real)
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ discretisation error is estimated once, at the point estimate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
-from bayesoleo._types import Array, ComplexArray, Integers
+from bayesoleo._types import Array, ComplexArray, Flags, Integers
 from bayesoleo.prediction._band_limited import Smoothed
 from bayesoleo.prediction._inputs import (
     harmonics_of,
@@ -28,6 +28,7 @@ from bayesoleo.prediction._inputs import (
 )
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
+from bayesoleo.prediction._records import TABLE, Harmonics
 from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
@@ -46,8 +47,6 @@ MOST_LINES = 256
 TOLERANCE = 1e-6
 #: Points of a run at which its equations are looked at: every run of every fit is.
 LOOKS = 16_384
-#: Orders in the finer of two tables of exponentials.
-TABLE = 32
 #: Coefficients of an input for which states are solved together.
 TOGETHER = 32
 
@@ -177,15 +176,25 @@ def _input_changes(run: RunPredictor, phase: Array) -> Array:
     for channel in channels:
         item = harmonics_of(record, channel).for_derivative(highest[channel])
         own = [(k, derivative) for k, (name, derivative) in enumerate(rows) if name == channel]
-        count = item.orders.size
-        block = np.zeros((len(rows), 2 * count, phase.size))
+        count, kept = item.orders.size, counted_parts(item, [derivative for _, derivative in own])
+        place = np.cumsum(kept) - 1
+        block = np.zeros((len(rows), int(kept.sum()), phase.size))
         factors = zip(item.orders, np.sqrt(item.variances), _turns(item.orders, phase), strict=True)
         for j, (order, sd, turn) in enumerate(factors):
             for k, derivative in own:
                 changed = (2j * np.pi * record.frequency * order) ** derivative * sd * turn
-                block[k, j], block[k, count + j] = changed.real, -changed.imag
-        blocks.append(block[:, block.any(axis=(0, 2))])
+                for at, part in ((j, changed.real), (count + j, -changed.imag)):
+                    if kept[at]:
+                        block[k, place[at]] = part
+        blocks.append(block)
     return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))
+
+
+def counted_parts(item: Harmonics, derivatives: Sequence[int]) -> Flags:
+    """Which real, then which imaginary parts of coefficients change an input row: a mean has no
+    derivatives and no imaginary part."""
+    known, moves = item.variances > 0, item.orders > 0
+    return np.concatenate([known & (moves | (0 in derivatives)), known & moves])
 
 
 def _turns(orders: Integers, phase: Array) -> Iterator[ComplexArray]:

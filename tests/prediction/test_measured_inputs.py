@@ -10,6 +10,7 @@ from bayesoleo.model._expressions import within
 from bayesoleo.prediction._band_limited import declared
 from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
 from bayesoleo.prediction._records import Harmonics, Record, transient_record
+from bayesoleo.prediction._run_errors import counted_parts
 
 
 def harmonics(**amplitudes):
@@ -78,3 +79,28 @@ def test_of_a_transient_noise_above_the_band_of_the_motion_is_not_fed_back():
     # What moves the frame is left as it is.
     slow = 2e3 * motion
     assert np.std((shown - slow)[20:-20]) < 0.6 * noise.std()
+
+
+@pytest.mark.parametrize("highest", [40, 130, 900])
+@pytest.mark.parametrize("derivative", [0, 2])
+def test_many_harmonics_are_the_sum_of_each(highest, derivative):
+    rng = np.random.default_rng(highest)
+    orders = np.sort(rng.choice(highest + 1, size=highest, replace=False))
+    value = rng.standard_normal((2, orders.size)) / (1.0 + orders**derivative)
+    signal = Harmonics(orders, value[0] + 1j * value[1] * (orders > 0), np.ones(orders.size))
+    phase, expected = rng.uniform(0.0, 3.0, 700), np.zeros(700)
+    for order, real, imaginary in zip(orders, *value, strict=True):
+        turn, rate = 2 * np.pi * order * phase, (2 * np.pi * 5.0 * order) ** derivative
+        sign = -1.0 if derivative == 2 else 1.0
+        expected += sign * rate * (real * np.cos(turn) - imaginary * np.sin(turn))
+    found = signal.evaluate(phase, 5.0, derivative)
+    # A phase is good to 1e-16 of three cycles, and the highest order turns 900 times as far.
+    np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
+
+
+def test_noise_moves_an_input_along_every_part_of_its_harmonics_but_that_of_a_mean():
+    orders = np.array([0, 1, 5])
+    item = Harmonics(orders, np.ones(3, dtype=complex), np.array([1.0, 4.0, 0.0]))
+    # A mean moves the value, and not its rate; what has no noise moves nothing.
+    assert counted_parts(item, [0, 1]).tolist() == [True, True, False, False, True, False]
+    assert counted_parts(item, [1, 2]).tolist() == [False, True, False, False, True, False]
