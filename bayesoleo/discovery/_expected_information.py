@@ -238,6 +238,32 @@ def _root(spread: Array) -> Array:
     return np.asarray((rows * np.where(np.diag(rows) < 0, -1.0, 1.0)[:, None]).T)
 
 
+def in_common_directions(
+    rivals: Sequence[PredictiveDistribution],
+) -> list[PredictiveDistribution]:
+    """The same distributions in coordinates of the directions that occur in any of them.
+
+    Lengths and angles stay, so that these separate as the outputs themselves do, and so do what
+    :meth:`PredictiveDistribution.given` makes of them: of a long record with some hundred
+    directions that is a small part of the work. Means count from that of the first.
+
+    Parameters
+    ----------
+    rivals : sequence of PredictiveDistribution
+        Of the same experiment in the same units.
+    """
+    moved = np.stack([rival.mean - rivals[0].mean for rival in rivals])
+    rows = np.concatenate([moved, *(rival.spread for rival in rivals)])
+    if len(rows) < rows.shape[1]:
+        rows = np.linalg.qr(rows.T, mode="r").T
+    ends = np.cumsum([len(rivals), *(len(rival.spread) for rival in rivals)])
+    means, *spreads = np.split(rows, ends[:-1])
+    return [
+        PredictiveDistribution(mean, spread, rival.parameters)
+        for mean, spread, rival in zip(means, spreads, rivals, strict=True)
+    ]
+
+
 def _reduced(rivals: Sequence[PredictiveDistribution]) -> tuple[Array, list[Array]]:
     """Means ``(k, d)`` and spreads ``(r, d)`` in the directions in which rivals differ or are
     uncertain; in all others their predictions are equal."""

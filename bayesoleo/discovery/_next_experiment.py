@@ -21,6 +21,7 @@ from bayesoleo.discovery._expected_information import (
     PredictiveDistribution,
     Separation,
     entropy,
+    in_common_directions,
     precision_gain,
     separate,
 )
@@ -311,6 +312,7 @@ class _Judge:
     ) -> Separation | Precision:
         if self.aim == STRUCTURES:
             weights = [rival.weight for rival in self.rivals]
+            solved = in_common_directions(solved)
             return separate(solved, weights, self._components(solved, known))
         names = known[0].names
         shared = set(self.rivals[0].fit.shared)

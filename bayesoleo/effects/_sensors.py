@@ -36,6 +36,7 @@ from bayesoleo.model._expressions import (
     split_derivative,
     symbol,
     total_derivative,
+    with_symbols_as,
 )
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Dof
@@ -162,7 +163,7 @@ def _before(model: Model, expression: sp.Expr, lag: sp.Expr) -> sp.Expr:
             earlier[item] = _later(name, order, -lag, known)
             if highest == 1 and order == 0:
                 earlier[item] += lag**2 / 2 * _acceleration(model, name)
-    return expression.xreplace(earlier)
+    return with_symbols_as(expression, earlier)
 
 
 def _acceleration(model: Model, dof: str) -> sp.Expr:

@@ -8,9 +8,11 @@ rather than a new symbol.
 from __future__ import annotations
 
 import ast
+import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, lru_cache
+from typing import cast
 
 import sympy as sp
 from sympy.printing.str import StrPrinter
@@ -173,13 +175,61 @@ def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
 def _partial_of_term(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     if item not in expression.free_symbols:
         return sp.Integer(0)
-    if all(kink.args[0].is_extended_real for kink in expression.atoms(sp.Abs, sp.sign)):
-        return without_impulses(sp.diff(expression, item))
-    # A quotient may be infinite, and SymPy then takes it for complex: its derivatives of a modulus
-    # are real and imaginary parts, that of a sign is left undone.
-    real = expression.replace(sp.Abs, _RealModulus).replace(sp.sign, _RealSign)
-    slope = without_impulses(sp.diff(real, item))
-    return slope.replace(_RealModulus, sp.Abs).replace(_RealSign, sp.sign)
+    real = _known_to_be_real(expression)
+    slope = sp.diff(real, item)
+    if slope.has(sp.DiracDelta):
+        slope = without_impulses(slope)
+    return slope if real is expression else _exchanged(slope, _MODULUS_AND_SIGN)
+
+
+@lru_cache(maxsize=5_000)
+def _known_to_be_real(expression: sp.Expr) -> sp.Expr:
+    """The expression, with functions that SymPy takes for real where it doubts an argument.
+
+    A quotient may be infinite, and SymPy then takes it for complex: its derivatives of a modulus
+    are real and imaginary parts, that of a sign is left undone.
+    """
+    kinks = expression.atoms(sp.Abs, sp.sign)
+    if all(kink.args[0].is_extended_real for kink in kinks):
+        return expression
+    return _exchanged(expression, {sp.Abs: _RealModulus, sp.sign: _RealSign})
+
+
+_MODULUS_AND_SIGN: Mapping[type, type] = {_RealModulus: sp.Abs, _RealSign: sp.sign}
+
+
+def _exchanged(expression: sp.Expr, functions: Mapping[type, type]) -> sp.Expr:
+    """The expression with functions replaced by others."""
+    return _rebuilt(expression, {}, functions)
+
+
+def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """The expression with symbols replaced, where no argument of a maximum becomes another one."""
+    return _rebuilt(expression, table, {})
+
+
+def _rebuilt(
+    expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr], functions: Mapping[type, type]
+) -> sp.Expr:
+    """The expression with symbols and functions replaced.
+
+    The arguments of a maximum stay as different as they are: to compare them anew takes most of the
+    time that SymPy's own replacement does.
+    """
+    done: dict[sp.Basic, sp.Basic] = {}
+
+    def made(part: sp.Basic) -> sp.Basic:
+        if part.is_Atom:
+            return table.get(part, part)
+        if part not in done:
+            arguments = [made(argument) for argument in part.args]
+            kind = functions.get(part.func, part.func)
+            same = kind is part.func and all(map(operator.is_, arguments, part.args))
+            plain = {"evaluate": False} if isinstance(part, sp.Max | sp.Min) else {}
+            done[part] = part if same else kind(*arguments, **plain)
+        return done[part]
+
+    return cast(sp.Expr, made(expression))
 
 
 def parse(

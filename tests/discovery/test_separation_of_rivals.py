@@ -8,8 +8,10 @@ import pytest
 from scipy import stats
 
 from bayesoleo.discovery._expected_information import (
+    Component,
     PredictiveDistribution,
     entropy,
+    in_common_directions,
     precision_gain,
     separate,
 )
@@ -213,3 +215,32 @@ def test_an_uncertainty_far_above_the_noise_leaves_the_noise(size):
         logs = mpmath.log(mpmath.det(wide[1])) - mpmath.log(mpmath.det(wide[0]))
         expected = (trace + (away.T * inverse * away)[0] - SIZE + logs) / 2
     assert found == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize("samples", [SIZE, 400])
+def test_common_directions_separate_rivals_and_their_mixtures_as_all_samples_do(samples):
+    rng = np.random.default_rng(2)
+    direction = np.array([0.5, -0.2, 0.1])
+    whole = [
+        PredictiveDistribution(
+            5.0 + rng.standard_normal(samples) / samples**0.5,
+            rng.standard_normal((5, samples)) / samples**0.5,
+            parameters=3,
+        )
+        for _ in range(3)
+    ]
+
+    def told(rivals):
+        mixed = [
+            Component(k, 0.5, one.given(direction, shift, ratio))
+            for k, one in enumerate(rivals)
+            for shift, ratio in ((-1.0, 0.5), (1.0, 2.0))
+        ]
+        return separate(rivals, [0.5, 0.3, 0.2], mixed)
+
+    few = in_common_directions(whole)
+    assert few[0].mean.size == min(samples, 3 + 3 * 5)
+    expected, found = told(whole), told(few)
+    np.testing.assert_allclose(found.log_bayes_factor, expected.log_bayes_factor, rtol=1e-9)
+    # The same normal draws stand for other outcomes: both are means over a few hundred of them.
+    assert found.information == pytest.approx(expected.information, rel=0.15)

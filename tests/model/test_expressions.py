@@ -14,6 +14,7 @@ from bayesoleo.model._expressions import (
     split_derivative,
     symbol,
     total_derivative,
+    with_symbols_as,
 )
 
 KNOWN = {name: symbol(name) for name in ("q", "stiffness", "force")}
@@ -107,3 +108,23 @@ def test_a_modulus_inside_a_modulus_stays_real():
     at = {a: sp.Rational(3), x: sp.Rational(1, 2)}
     # There it is 5/x - 3/(1 - x), whose second derivative is 10/x**3 - 6/(1 - x)**3.
     assert float(slope.subs(at)) == pytest.approx(80.0 - 48.0)
+
+
+def test_a_modulus_inside_a_maximum_has_the_slope_of_its_side():
+    a, b, x = symbol("a"), symbol("b"), symbol("x")
+    slope = partial(sp.Max(sp.Abs(a / (1 - x)) - b, 0), x)
+    half = {a: sp.Rational(-3), x: sp.Rational(1, 2)}
+    # Of 3/(1 - x) - b where it is positive, and of nothing.
+    assert float(slope.subs({**half, b: 5})) == pytest.approx(12.0)
+    assert float(slope.subs({**half, b: 7})) == pytest.approx(0.0)
+
+
+def test_symbols_are_replaced_everywhere_and_at_once():
+    q, v, lag = symbol("q"), symbol("v"), symbol("lag")
+    before = sp.Max(q - v, 0) * sp.sqrt(q**2 + 1) + sp.Min(v, q)
+    found = with_symbols_as(before, {q: q - lag * v, v: q})
+    expected = before.subs({q: q - lag * v, v: q}, simultaneous=True)
+    for values in ((1.0, 2.0, 0.3), (-1.0, 0.5, 2.0), (3.0, -2.0, 0.1)):
+        at = dict(zip((q, v, lag), values, strict=True))
+        assert float(found.subs(at)) == pytest.approx(float(expected.subs(at)), rel=1e-12)
+    assert with_symbols_as(before, {lag: q}) is before
