@@ -204,8 +204,16 @@ def _exchanged(expression: sp.Expr, functions: Mapping[type, type]) -> sp.Expr:
 
 
 def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """The expression with symbols replaced, where no argument of a maximum becomes another one."""
-    return _rebuilt(expression, table, {})
+    """The expression with symbols replaced, where no argument of a maximum becomes another one.
+
+    Structures of a search share most of their expressions: what was made is kept.
+    """
+    return _with_symbols(expression, frozenset(table.items()))
+
+
+@lru_cache(maxsize=2_000)
+def _with_symbols(expression: sp.Expr, items: frozenset[tuple[sp.Symbol, sp.Expr]]) -> sp.Expr:
+    return _rebuilt(expression, dict(items), {})
 
 
 def _rebuilt(
