@@ -515,7 +515,7 @@ def normal_blocks(white: Array, log_sd: Array, starts: Integers) -> Array:
     Parameters
     ----------
     white : ndarray, shape (L, s, n)
-        Whitened samples: independent, of unit variance.
+        Whitened samples: independent, of unit variance. Their squares take their place.
     log_sd : ndarray, shape (L, s)
         Logarithm of the standard deviation by which they were divided.
     starts : ndarray of int, shape (B,)
@@ -526,7 +526,7 @@ def normal_blocks(white: Array, log_sd: Array, starts: Integers) -> Array:
     ndarray, shape (L, s, B)
     """
     sizes = np.diff(starts, append=white.shape[2])
-    squares = np.add.reduceat(white * white, starts, axis=2)
+    squares = np.add.reduceat(np.multiply(white, white, out=white), starts, axis=2)
     return np.asarray(-0.5 * squares - sizes * (log_sd[:, :, None] + 0.5 * np.log(2 * np.pi)))
 
 

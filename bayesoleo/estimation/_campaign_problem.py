@@ -161,7 +161,8 @@ class CampaignProblem:
     def residuals(self, theta: Array, run: int) -> tuple[Array, Integers]:
         """Residuals (L, s, n) of one run at vectors (L, l) and statuses (L,), from the anchor."""
         samples = self.predictor.simulate(self.full(theta), run)
-        return self.kept(run, self.predictor.runs[run].measured - samples.y), samples.status
+        left = np.subtract(self.predictor.runs[run].measured, samples.y, out=samples.y)
+        return self.kept(run, left), samples.status
 
     def freeze(self, theta: Array) -> Status:
         """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""

@@ -222,22 +222,12 @@ def _evaluate(
     """Log densities and predicted samples, each of shape (draws, s, blocks)."""
     problem = cast(ResidualProblem, density.problem)
     natural = samples.draws.reshape(-1, samples.draws.shape[2])
-    block, eta = density.split(density.coordinates(natural))
-    theta = density.unknowns.theta(block)
+    # A walker that refuses a proposal stays: a fourth of the draws are those before them.
+    different, which = np.unique(natural, axis=0, return_inverse=True)
+    likelihood, predicted = (
+        found[which.ravel()] for found in _at_draws(different, density, blocks, measured)
+    )
     ends = np.cumsum([0, *(len(part.starts) for part in blocks)])
-    shape = (len(natural), len(problem.outputs), int(ends[-1]))
-    likelihood, predicted = np.empty(shape), np.empty(shape)
-
-    def work(rows: slice) -> None:
-        residuals = [problem.residuals(theta[rows], run)[0] for run in range(len(blocks))]
-        found = density.errors.of_blocks(residuals, eta[rows], [part.starts for part in blocks])
-        likelihood[rows] = np.concatenate(found, axis=2)
-        for run, (e, part) in enumerate(zip(residuals, blocks, strict=True)):
-            columns = slice(ends[run], ends[run + 1])
-            predicted[rows, :, columns] = (measured[run][None] - e)[:, :, part.shown]
-
-    parts = [slice(k, min(k + LANES, len(natural))) for k in range(0, len(natural), LANES)]
-    thread_map(work, parts, density.jobs)
     rng, own = np.random.default_rng(seed), samples.of_errors.reshape(len(natural), -1)
     common = common_to_runs(density, natural, rng)
     for run, part in enumerate(blocks):
@@ -248,6 +238,30 @@ def _evaluate(
         errors = density.errors.draw(own, problem.runs[run], taken, rng, common)
         predicted[:, :, ends[run] : ends[run + 1]] += errors[:, :, 1:-1]
     return likelihood, predicted
+
+
+def _at_draws(
+    natural: Array, density: LogDensity, blocks: Sequence[Blocks], measured: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Log densities of blocks and expected samples at draws (W, p + m), of shape (W, s, blocks)."""
+    problem = cast(ResidualProblem, density.problem)
+    block, eta = density.split(density.coordinates(natural))
+    theta = density.unknowns.theta(block)
+    ends = np.cumsum([0, *(len(part.starts) for part in blocks)])
+    shape = (len(natural), len(problem.outputs), int(ends[-1]))
+    likelihood, expected = np.empty(shape), np.empty(shape)
+
+    def work(rows: slice) -> None:
+        residuals = [problem.residuals(theta[rows], run)[0] for run in range(len(blocks))]
+        found = density.errors.of_blocks(residuals, eta[rows], [part.starts for part in blocks])
+        likelihood[rows] = np.concatenate(found, axis=2)
+        for run, (e, part) in enumerate(zip(residuals, blocks, strict=True)):
+            columns = slice(ends[run], ends[run + 1])
+            expected[rows, :, columns] = measured[run][:, part.shown] - e[:, :, part.shown]
+
+    parts = [slice(k, min(k + LANES, len(natural))) for k in range(0, len(natural), LANES)]
+    thread_map(work, parts, density.jobs)
+    return likelihood, expected
 
 
 def common_to_runs(density: LogDensity, natural: Array, rng: np.random.Generator) -> Array | None:

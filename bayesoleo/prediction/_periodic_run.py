@@ -25,7 +25,7 @@ from bayesoleo.prediction._starts import (
     guess_rows,
     solve_from_shot,
 )
-from bayesoleo.prediction._sum_of_squares import FusedSquares, squared_distances
+from bayesoleo.prediction._sum_of_squares import FusedOutputs, squared_distances
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import (
     Boundary,
@@ -90,7 +90,9 @@ class RunPredictor:
         Input rows that another model of the same run has computed; this one adds to it.
     """
 
-    _fused: tuple[Any, FusedSquares | None] | None = None
+    #: Of a plan, with samples in the order of their phase and as they were recorded.
+    _by_phase: tuple[Any, FusedOutputs | None] | None = None
+    _as_recorded: tuple[Any, FusedOutputs | None] | None = None
 
     #: Solutions so far that left the branch of the anchor from which they were started, and whether
     #: they are looked for: where a solution is known, it costs more than the solution.
@@ -392,6 +394,14 @@ class RunPredictor:
         derivatives: bool,
     ) -> PredictedSamples:
         """Outputs of solutions ``x (L, n, w)`` with their derivatives ``x_p (L, n, w, na)``."""
+        fused = None if derivatives or x is None else self._fused_outputs(by_phase=False)
+        if fused is not None and x is not None:
+            lanes = np.flatnonzero(status == Status.CONVERGED.value)
+            step = self.boundary.step(self.steps)
+            y, inside, defined = fused.outputs(self.measured, x, p, step, lanes)
+            status = _failing(status, lanes, defined[lanes], inside[lanes])
+            y[status != Status.CONVERGED.value] = np.nan
+            return PredictedSamples(y, None, status)
         z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
         z_p = self._rows_at_samples(x_p, p) if derivatives and x_p is not None else None
         return self._outputs(p, z, z_p, status, derivatives)
@@ -428,26 +438,30 @@ class RunPredictor:
         The same as comparing :meth:`predict` with the measurement, but fused where there is
         compiled code for it.
         """
-        fused = self._fused_squares()
+        fused = self._fused_outputs(by_phase=True)
         if fused is None:
             return self._squares_of_predictions(p)
         solution = self.solve(p)
-        status = solution.status.copy()
-        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        lanes = np.flatnonzero(solution.status == Status.CONVERGED.value)
         step = self.boundary.step(self.steps)
         sums, inside, defined = fused.sums(self.measured, solution.x, p, step, lanes)
         finite = defined[lanes] & np.isfinite(sums[lanes]).all(axis=1)
-        status[lanes[~finite]] = Status.NOT_FINITE.value
-        status[lanes[~inside[lanes]]] = Status.INADMISSIBLE.value
+        status = _failing(solution.status, lanes, finite, inside[lanes])
         self._left(p, solution.x, status)
         return sums, status
 
-    def _fused_squares(self) -> FusedSquares | None:
+    def _fused_outputs(self, *, by_phase: bool) -> FusedOutputs | None:
         """Of the present plan: a transient's changes with its mesh."""
-        if self._fused is None or self._fused[0] is not self.plan:
-            made = FusedSquares.of(self.kernels, self.scheme, self.plan, self.sample_inputs)
-            self._fused = (self.plan, made)
-        return self._fused[1]
+        # Samples of a transient have the order of their phase.
+        name = "_by_phase" if by_phase and self.record.periodic else "_as_recorded"
+        known: tuple[Any, FusedOutputs | None] | None = getattr(self, name)
+        if known is None or known[0] is not self.plan:
+            made = FusedOutputs.of(
+                self.kernels, self.scheme, self.plan, self.sample_inputs, by_phase=by_phase
+            )
+            known = self.plan, made
+            setattr(self, name, known)
+        return known[1]
 
     def _squares_of_predictions(self, p: Array) -> tuple[Array, Integers]:
         """Through predictions of a few vectors at a time."""
@@ -463,14 +477,22 @@ class RunPredictor:
 
     def _judge(self, status: Integers, z: Array, p: Array, y: Array, lanes: Integers) -> Integers:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
-        status = status.copy()
         finite = np.isfinite(y[lanes]).all(axis=(1, 2))
-        status[lanes[~finite]] = Status.NOT_FINITE.value
+        inside = np.ones(lanes.size, dtype=np.bool_)
         if self.boundary.conditions:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
                 self.kernels.admissible(z, self.sample_inputs, p, lanes, a)
-            status[lanes[np.isnan(a[lanes]).any(axis=(1, 2))]] = Status.NOT_FINITE.value
-            status[lanes[(a[lanes] <= 0).any(axis=(1, 2))]] = Status.INADMISSIBLE.value
+            finite &= ~np.isnan(a[lanes]).any(axis=(1, 2))
+            inside = ~(a[lanes] <= 0).any(axis=(1, 2))
+        status = _failing(status, lanes, finite, inside)
         y[status != Status.CONVERGED.value] = np.nan
         return status
+
+
+def _failing(status: Integers, lanes: Integers, finite: Flags, inside: Flags) -> Integers:
+    """Statuses (L,) with those of the chosen lanes that are not finite or not inside."""
+    status = status.copy()
+    status[lanes[~finite]] = Status.NOT_FINITE.value
+    status[lanes[~inside]] = Status.INADMISSIBLE.value
+    return status

@@ -1,7 +1,9 @@
-"""Sums of squared residuals at raw samples, without the residuals themselves, for a sampler.
+"""Outputs at raw samples, or their sums of squared residuals alone, for a sampler.
 
-Samples are taken in the order of their phase, in blocks. Each block goes through interpolation,
-outputs and comparison while it is in the nearest cache. No array has the length of a record.
+Samples are taken in blocks: in the order of their phase where they are only compared, so that a
+solution is read once, and as they were recorded where outputs are kept. Each block goes through
+interpolation, outputs, conditions and comparison while it is in the nearest cache. Sums need no
+array of the length of a record, and outputs none but their own.
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ from bayesoleo.solvers._period_arrangement import total
 
 
 class Places(NamedTuple):
-    """A :class:`~bayesoleo.solvers.SamplePlan` in blocks: index and position
-    (blocks, BLOCK), weights (blocks, s, BLOCK)."""
+    """A :class:`~bayesoleo.solvers.SamplePlan` in blocks: number of the first unknown of each
+    sample's step, without a sign, and position (blocks, BLOCK), weights (blocks, s, BLOCK)."""
 
-    index: Any  # whole numbers; tuples have a method of this name
+    first: Any  # whole numbers
     position: Float[Array, "blocks BLOCK"]
     w0: Float[Array, "blocks stages BLOCK"]
     w1: Float[Array, "blocks stages BLOCK"]
@@ -32,15 +34,15 @@ class Places(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FusedSquares:
-    """How predictions of one run are compared with its samples.
+class FusedOutputs:
+    """How outputs of one run follow from its solutions, and are compared with its samples.
 
     Parameters
     ----------
     kernels : Kernels
         Compiled.
     order : ndarray of int, shape (N,)
-        Samples in the order of their phase.
+        Samples in the order in which they are taken.
     inputs : ndarray, shape (blocks, nu, BLOCK)
         Input rows in that order.
     places : Places
@@ -59,19 +61,24 @@ class FusedSquares:
     needed: Flags
 
     @classmethod
-    def of(cls, kernels: Kernels, scheme: Any, plan: Any, inputs: Array) -> FusedSquares | None:
-        """For samples at planned phases with input rows (nu, N); None where there is no code for
-        the scheme, or the kernels are not compiled."""
+    def of(
+        cls, kernels: Kernels, scheme: Any, plan: Any, inputs: Array, *, by_phase: bool
+    ) -> FusedOutputs | None:
+        """For samples at planned phases with input rows (nu, N), taken in the order of their phase
+        or of the record; None where there is no code for the scheme, or the kernels are not
+        compiled."""
         compiled = isinstance(kernels.output, BlockKernel)
         if not compiled or not isinstance(scheme, Collocation) or not isinstance(plan, SamplePlan):
             return None
         derived = kernels.derived
-        order = np.lexsort((plan.position, plan.index))
+        order = np.arange(plan.index.size)
+        if by_phase:
+            order = np.lexsort((plan.position, plan.index))
         return cls(
             kernels,
             order,
             _blocks(inputs[:, order]),
-            _places(plan, order),
+            _places(plan, order, scheme.width),
             np.array(derived.orders, dtype=np.int64),
             _needed(derived),
         )
@@ -103,16 +110,35 @@ class FusedSquares:
         defined : ndarray of bool, shape (L,)
             All conditions are numbers.
         """
-        derived = self.kernels.derived
-        sums = np.full((len(p), len(derived.outputs)), np.nan)
+        sums = np.full((len(p), len(self.kernels.derived.outputs)), np.nan)
+        nowhere = np.empty((len(p), len(measured), 0))
+        return sums, *self._run(measured, x, p, step, lanes, sums, nowhere)
+
+    def outputs(
+        self, measured: Array, x: Array, p: Array, step: float, lanes: Integers
+    ) -> tuple[Array, Flags, Flags]:
+        """The outputs themselves, shape (L, ny, N), in the order in which samples are taken.
+
+        Parameters and the other results are those of :meth:`sums`; ``defined`` also says that all
+        outputs are finite. Other lanes have no outputs.
+        """
+        sums = np.empty((len(p), len(self.kernels.derived.outputs)))
+        y = np.empty((*sums.shape, self.order.size))
+        return y, *self._run(measured, x, p, step, lanes, sums, y)
+
+    def _run(
+        self, measured: Array, x: Array, p: Array, step: float, lanes: Integers, sums: Array,
+        y: Array,
+    ) -> tuple[Flags, Flags]:  # fmt: skip
+        kernels = self.kernels
         inside, defined = np.ones(len(p), dtype=np.bool_), np.ones(len(p), dtype=np.bool_)
         _compare(
-            self.kernels.output.address, self.kernels.admissible.address, len(derived.admissible),
+            kernels.output.address, kernels.admissible.address, len(kernels.derived.admissible),
             self.order, self.inputs, self.places, self.orders, self.needed,
             np.ascontiguousarray(measured), np.ascontiguousarray(x), np.ascontiguousarray(p),
-            step, lanes, sums, inside, defined,
+            step, lanes, sums, y, inside, defined,
         )  # fmt: skip
-        return sums, inside, defined
+        return inside, defined
 
 
 def squared_distances(measured: Array, y: Array) -> Array:
@@ -143,25 +169,30 @@ def _blocks(rows: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(whole.reshape(len(rows), count, BLOCK).swapaxes(0, 1))
 
 
-def _places(plan: SamplePlan, order: Integers) -> Places:
-    index, position = (_blocks(row[None, order])[:, 0] for row in (plan.index, plan.position))
+def _places(plan: SamplePlan, order: Integers, width: int) -> Places:
+    first = (plan.index * width).astype(np.uint64)
+    first, position = (_blocks(row[None, order])[:, 0] for row in (first, plan.position))
     w0, w1, w2 = (_blocks(weights[:, order]) for weights in (plan.w0, plan.w1, plan.w2))
-    return Places(index, position, w0, w1, w2)
+    return Places(first, position, w0, w1, w2)
 
 
 @jit
 def _compare(
     output: int, admissible: int, conditions: int, order: Integers, inputs: Array, places: Places,
     orders: Integers, needed: Flags, measured: Array, x: Array, p: Array, step: float,
-    lanes: Integers, sums: Array, inside: Flags, defined: Flags,
+    lanes: Integers, sums: Array, y: Array, inside: Flags, defined: Flags,
 ) -> None:  # fmt: skip
     """Block by block, and in each lane by lane: all but the solutions stays in the cache.
 
     Squares are added point by point, and the points of a block only at the end: in an order that
-    depends on nothing, and without waiting for one addition after the other.
+    depends on nothing, and without waiting for one addition after the other. Outputs are kept if
+    ``y (L, ny, N)`` has room for any, one after the other: to put each where it was recorded would
+    take longer than to compute it. All is one function: counting the references of arrays that are
+    passed to another one for each block would take a third of the time.
     """
     ny, count = measured.shape[0], order.size
     z, out = np.zeros((max(needed.size, 1), BLOCK)), np.zeros((max(ny, conditions, 1), BLOCK))
+    near = np.zeros((2 + places.w0.shape[1], BLOCK))
     data, partial = np.zeros((ny, BLOCK)), np.zeros((lanes.size, ny, BLOCK))
     for b in range(inputs.shape[0]):
         size = min(BLOCK, count - b * BLOCK)
@@ -173,14 +204,22 @@ def _compare(
             lane = lanes[place]
             constants = pointer(p, lane * p.shape[1])
             sample_block(
-                x, lane, b, places.index, places.position, places.w0, places.w1, places.w2,
-                step, orders, needed, z,
+                x, lane, b, places.first, places.position, places.w0, places.w1, places.w2,
+                step, orders, needed, near, z,
             )  # fmt: skip
             call_kernel(output, (rows, u, constants, to, size))
             for k in range(ny):
                 for i in range(size):
                     error = data[k, i] - out[k, i]
                     partial[place, k, i] += error * error
+            if y.shape[2] > 0:
+                odd = 0
+                for k in range(ny):
+                    for i in range(size):
+                        odd += not abs(out[k, i]) < np.inf
+                    for i in range(size):
+                        y[lane, k, b * BLOCK + i] = out[k, i]
+                defined[lane] = defined[lane] and odd == 0
             if conditions > 0:
                 call_kernel(admissible, (rows, u, constants, to, size))
                 broken = odd = 0

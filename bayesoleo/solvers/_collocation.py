@@ -15,8 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import carray
 
-from bayesoleo._compiled import BLOCK as POINTS, jit
+from bayesoleo._compiled import BLOCK as POINTS, jit, pointer
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
@@ -70,46 +71,59 @@ def sample(
 
 @jit
 def sample_block(
-    x: Array, lane: int, block: int, index: Integers, position: Array, w0: Array, w1: Array,
-    w2: Array, h: float, orders: Integers, needed: Flags, z: Array,
+    x: Array, lane: int, block: int, first: Integers, position: Array, w0: Array, w1: Array,
+    w2: Array, h: float, orders: Integers, needed: Flags, near: Array, z: Array,
 ) -> None:  # fmt: skip
-    """The same for one lane and one block of samples, with plans cut into blocks: ``index (blocks,
-    POINTS)`` and weights ``(blocks, s, POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are
-    ``needed``; without a view of any array, which would cost more than what it is for."""
+    """The same for one lane and one block of samples, with plans cut into blocks: ``first (blocks,
+    POINTS)`` is the number of a step's first unknown in its lane, weights are ``(blocks, s,
+    POINTS)``. Fills the rows of ``z (nz, POINTS)`` that are ``needed``; without a view of any
+    array, which would cost more than what it is for.
+
+    The unknowns of each sample's step are fetched first, into ``near (2 + s, POINTS)``: from places
+    without a sign, and once for all rows. Indices that may be negative, and products that make
+    them, would cost more than the interpolation.
+    """
     d, s = orders.size, w0.shape[1]
     D = orders.sum()
+    size = x.shape[1] * x.shape[2]
+    own = carray(pointer(x, lane * size), (size,))
     row = state = 0
     for j in range(d):
         order = orders[j]
-        last, top = state + order - 1, row + order
-        if needed[row]:
+        top = row + order
+        wanted = needed[row] or needed[row + 1] or needed[top]
+        for k in range(order if wanted else 0):
+            place = np.uint64(state + k)
             for i in range(POINTS):
-                z[row, i] = x[lane, index[block, i], state]
-            for stage in range(s if order == 1 else 0):
-                own = D + stage * d + j
+                near[k, i] = own[first[block, i] + place]
+        for stage in range(s if wanted else 0):
+            place = np.uint64(D + stage * d + j)
+            for i in range(POINTS):
+                near[2 + stage, i] = own[first[block, i] + place]
+        if order == 1 and needed[row]:
+            for i in range(POINTS):
+                z[row, i] = near[0, i]
+            for stage in range(s):
                 for i in range(POINTS):
-                    z[row, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+                    z[row, i] += h * w1[block, stage, i] * near[2 + stage, i]
         if order == 2 and needed[row]:
             for i in range(POINTS):
-                z[row, i] += h * position[block, i] * x[lane, index[block, i], last]
+                z[row, i] = near[0, i] + h * position[block, i] * near[1, i]
             for stage in range(s):
-                own = D + stage * d + j
                 for i in range(POINTS):
-                    z[row, i] += h * h * w2[block, stage, i] * x[lane, index[block, i], own]
+                    z[row, i] += h * h * w2[block, stage, i] * near[2 + stage, i]
         if order == 2 and needed[row + 1]:
             for i in range(POINTS):
-                z[row + 1, i] = x[lane, index[block, i], last]
+                z[row + 1, i] = near[1, i]
             for stage in range(s):
-                own = D + stage * d + j
                 for i in range(POINTS):
-                    z[row + 1, i] += h * w1[block, stage, i] * x[lane, index[block, i], own]
+                    z[row + 1, i] += h * w1[block, stage, i] * near[2 + stage, i]
         if needed[top]:
             for i in range(POINTS):
                 z[top, i] = 0.0
             for stage in range(s):
-                own = D + stage * d + j
                 for i in range(POINTS):
-                    z[top, i] += w0[block, stage, i] * x[lane, index[block, i], own]
+                    z[top, i] += w0[block, stage, i] * near[2 + stage, i]
         row, state = top + 1, state + order
 
 

@@ -68,6 +68,36 @@ def test_two_outputs_and_many_runs(word):
     assert float(np.abs(about.mean(("chain", "draw"))).max()) < 0.5
 
 
+def test_what_a_refused_proposal_repeats_is_evaluated_once(monkeypatch):
+    rng = np.random.default_rng(1)
+    problem = linear_runs(
+        [0.1 * rng.standard_normal((2, 150)) for _ in range(2)], levels=(1.0, 2.0)
+    )
+    density = LogDensity(problem)
+    start = laplace_mixture(density, np.array([[1.0, 2.0, 1.5]]))
+    draws = sample(density, start, seed=1, quick=True, progress=False)
+    blocks, rows = cut(density), list[int]()
+    inner = type(problem).residuals
+
+    def counted(self, theta, run):
+        rows.append(len(theta))
+        return inner(self, theta, run)
+
+    monkeypatch.setattr(type(problem), "residuals", counted)
+    groups = block_groups(draws, density, seed=3)
+    flat = draws.draws.reshape(-1, draws.draws.shape[2])
+    different = len(np.unique(flat, axis=0))
+    assert sum(rows) == 2 * different < 2 * len(flat)
+    # Each draw has what it has alone.
+    of_blocks, eta = density.errors.of_blocks, density.split(density.coordinates(flat))[1]
+    for draw in (0, 1, len(flat) - 1):
+        left = [inner(problem, flat[draw : draw + 1, :3], run)[0] for run in range(2)]
+        alone = of_blocks(left, eta[draw : draw + 1], [part.starts for part in blocks])
+        for b, output in enumerate(problem.outputs):
+            stored = groups["log_likelihood"][output].values.reshape(len(flat), -1)[draw]
+            np.testing.assert_array_equal(stored, np.concatenate([one[0, b] for one in alone]))
+
+
 def test_thinning_leaves_diagnostics_and_counts():
     problem = linear_runs([0.1 * np.random.default_rng(1).standard_normal((1, 100))], levels=(1.0,))
     density = LogDensity(problem)

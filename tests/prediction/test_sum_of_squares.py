@@ -118,10 +118,58 @@ def test_comparing_block_by_block_is_comparing_predictions(model, channel, signa
     squares, status = predictor.sum_of_squares(theta)
     assert (status == Status.CONVERGED).all()
     for r, one in enumerate(predictor.runs):
-        assert one._fused_squares() is not None
+        assert one._fused_outputs(by_phase=True) is not None
         found = one.predict(predictor.constants(theta, r))
         expected = np.sum((one.measured - found.y) ** 2, axis=2)
         np.testing.assert_allclose(squares[:, r], expected, rtol=1e-12)
+
+
+def of_whole_arrays(one, p):
+    """The prediction by way of the dofs' rows at all samples."""
+    solution = one.solve(p)
+    z = one._rows_at_samples(solution.x[..., None], p)[:, :, 0]
+    return one._outputs(p, z, None, solution.status, derivatives=False)
+
+
+@pytest.mark.parametrize(
+    ("model", "channel", "signal"),
+    [
+        (driven_by(thermomechanical_oleo(2), "displacement"), "displacement", stroke(0.13, 0.03)),
+        (mechanical_oleo(2), "force", harmonics([0, 1], [2500.0, 500.0])),
+    ],
+)
+def test_outputs_block_by_block_are_those_of_whole_arrays(model, channel, signal):
+    """To the last bit, with first- and second-order dofs, and where they are not admissible."""
+    others = tuple({"force", "displacement", "pressure"} - {channel})
+    records = answered(model, [run("a", {channel: signal}, 0.5, others=others)], steps=STEPS)
+    predictor = Predictor(model, records, steps=STEPS, jobs=1)
+    start = predictor.layout.start(model)
+    predictor.set_anchor(start)
+    theta = start * (1 + 0.003 * np.random.default_rng(1).standard_normal((5, start.size)))
+    one = predictor.runs[0]
+    p = predictor.constants(theta, 0)
+    alike, found = of_whole_arrays(one, p), one.predict(p)
+    assert found.y.tobytes() == alike.y.tobytes()
+    assert (found.status == Status.CONVERGED).all()
+
+
+def test_samples_that_break_a_condition_or_are_no_number_have_no_outputs(predictor, vectors):
+    """Between the points of the mesh, where the solution itself does not show it."""
+    one = predictor.runs[0]
+    p = predictor.constants(vectors[:4], 0)
+    x, status = one.solve(p).x, np.zeros(4, dtype=np.int64)
+    x[1] *= -1.0  # of the temperature, which must be positive
+    x[2] = np.inf
+    status[3] = Status.NO_CONVERGENCE
+    found = one._at_samples(p, x, None, status, derivatives=False)
+    with np.errstate(invalid="ignore"):
+        z = one._rows_at_samples(x[..., None], p)[:, :, 0]
+        alike = one._outputs(p, z, None, status, derivatives=False)
+    wanted = [Status.CONVERGED, Status.INADMISSIBLE, Status.NOT_FINITE, Status.NO_CONVERGENCE]
+    assert [Status(value) for value in found.status] == wanted
+    assert found.status.tolist() == alike.status.tolist()
+    np.testing.assert_array_equal(found.y, alike.y)
+    assert np.isnan(found.y[1:]).all()
 
 
 def test_a_model_without_inputs_is_compared_too():
@@ -141,6 +189,14 @@ def test_a_model_without_inputs_is_compared_too():
     samples = blank.samples["displacement"]
     expected = [np.sum((samples - rest) ** 2) for rest in (1.5, 1.65)]
     np.testing.assert_allclose(squares[:, 0, 0], expected, rtol=1e-12)
+    # A solution that is no number has no outputs, where no condition says so first.
+    one, still = predictor.runs[0], np.zeros(2, dtype=np.int64)
+    p = predictor.constants(np.array([[3.0, 2.0], [3.3, 2.0]]), 0)
+    x = one.solve(p).x
+    x[1, 3] = np.inf
+    found = one._at_samples(p, x, None, still, derivatives=False)
+    assert [Status(value) for value in found.status] == [Status.CONVERGED, Status.NOT_FINITE]
+    assert np.isnan(found.y[1]).all()
 
 
 def test_a_predictor_sent_to_another_process_is_the_same(predictor, vectors, whole):
