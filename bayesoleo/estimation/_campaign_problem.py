@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import copy
 
 import numpy as np
@@ -87,6 +88,18 @@ class CampaignProblem:
     def branch_jumps(self) -> Integers:
         """Solutions so far, by run, that left the branch of the one they started from, (N,)."""
         return np.array([run.jumps for run in self.predictor.runs], dtype=np.int64)
+
+    @contextmanager
+    def unwatched(self) -> Iterator[None]:
+        """Look for no jumps between branches meanwhile."""
+        before = [run.watched for run in self.predictor.runs]
+        for run in self.predictor.runs:
+            run.watched = False
+        try:
+            yield
+        finally:
+            for run, watched in zip(self.predictor.runs, before, strict=True):
+                run.watched = watched
 
     def full(self, theta: Array) -> Array:
         """All unknowns of the predictor, shape (L, all), from the free ones, shape (L, l)."""

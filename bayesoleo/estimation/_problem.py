@@ -10,6 +10,7 @@ use sections of a problem, in which some unknowns are held.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Protocol, cast, runtime_checkable
 
@@ -65,6 +66,19 @@ class Misfit:
 def jumps_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
     """Number of solutions that left their branch, by run, shape (N,); zeros where not counted."""
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
+
+
+def unwatched(problem: object) -> AbstractContextManager[None]:
+    """Look for no jumps between branches meanwhile, where a problem looks for them.
+
+    Parameters
+    ----------
+    problem : EstimationProblem or Density
+        A campaign's counts the solutions that left their branch, and far from the anchor that takes
+        longer than the solutions.
+    """
+    found: AbstractContextManager[None] = getattr(problem, "unwatched", nullcontext)()
+    return found
 
 
 class Named(Protocol):
@@ -231,6 +245,10 @@ class Held(SameData):
     def branch_jumps(self) -> Integers:
         """Solutions so far that left their branch, by run, shape (N,)."""
         return jumps_of(self.problem)
+
+    def unwatched(self) -> AbstractContextManager[None]:
+        """Look for no jumps between branches meanwhile."""
+        return unwatched(self.problem)
 
     def misfit(self, theta: Array) -> Misfit:
         """Sums of squares at many vectors of the free unknowns."""

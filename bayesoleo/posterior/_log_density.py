@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, cast
@@ -20,7 +21,13 @@ from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._base import ErrorModel
 from bayesoleo.error_models._registry import error_model
 from bayesoleo.errors import InputError
-from bayesoleo.estimation._problem import EstimationProblem, Misfit, ResidualProblem, jumps_of
+from bayesoleo.estimation._problem import (
+    EstimationProblem,
+    Misfit,
+    ResidualProblem,
+    jumps_of,
+    unwatched,
+)
 from bayesoleo.model._correlated_priors import log_density_of, sample_of
 from bayesoleo.model._priors import Prior, Transforms
 from bayesoleo.solvers._orbit import Status
@@ -336,6 +343,10 @@ class LogDensity:
     def branch_jumps(self) -> int:
         """Number of solutions, by run, that left the branch from which they started."""
         return int(jumps_of(self.problem).sum())
+
+    def unwatched(self) -> AbstractContextManager[None]:
+        """Look for no jumps between branches meanwhile."""
+        return unwatched(self.problem)
 
     def natural(
         self, phi: Float[Array, "walkers quantities"]

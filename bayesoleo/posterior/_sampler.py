@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 from bayesoleo._parallel import connected
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
+from bayesoleo.estimation._problem import unwatched
 from bayesoleo.posterior._checkpoints import Segment, Store, open_store
 from bayesoleo.posterior._diagnostics import (
     Samples,
@@ -267,7 +268,9 @@ def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: S
     if climbs > 0:
         # A separate generator: if no mode is found, the draws are the same as without the search.
         rng = np.random.default_rng([seed, climbs])
-        start, spent = with_other_modes(group.log_density, start, climbs, rng)
+        # What it looks at lies far beyond what is sampled: jumps there say nothing of that.
+        with unwatched(group.log_density):
+            start, spent = with_other_modes(group.log_density, start, climbs, rng)
     first = group.start(start, seed)
     return replace(first, evaluations=first.evaluations + spent)
 

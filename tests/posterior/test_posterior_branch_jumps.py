@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import numpy as np
 from kill_target import run
 from posterior_targets import Gaussian
@@ -32,6 +34,33 @@ def test_jumps_are_counted_and_outlive_a_restart(tmp_path):
     assert again.branch_jumps == 0
     groups = to_datasets(first, (Normal(0, 1), Normal(0, 1)))
     assert groups["sample_stats"].attrs["branch_jumps"] == first.branch_jumps
+
+
+class Watching(Gaussian):
+    """Keeps whether each row was watched."""
+
+    def __init__(self) -> None:
+        super().__init__(np.ones(2))
+        self.watched, self.rows = True, {True: 0, False: 0}
+
+    @contextmanager
+    def unwatched(self):
+        self.watched = False
+        yield
+        self.watched = True
+
+    def __call__(self, phi):
+        self.rows[self.watched] += len(phi)
+        return super().__call__(phi)
+
+
+def test_only_the_search_for_modes_is_not_watched():
+    without, target = Watching(), Watching()
+    run(without, None, climbs=0)
+    assert without.rows[False] == 0
+    run(target, None, climbs=4)
+    assert target.rows[True] == without.rows[True]
+    assert target.rows[False] > 0
 
 
 def test_a_density_that_counts_none_has_none():

@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._problem import Held
+from bayesoleo.posterior import LogDensity
 from bayesoleo.prediction._branches import follow_branch
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of
 from bayesoleo.prediction._stability import Stability, count_unstable, swings
+from bayesoleo.prediction._starts import Anchor
 from bayesoleo.systems import system
 
 #: Between the folds of the declared Duffing system under 6 N, which are at 2.37 and 5.27 Hz.
@@ -83,6 +87,25 @@ def test_lanes_of_a_batch_are_told_apart(fold):
     assert made.runs[0].jumps == truth.sum()
     made.sum_of_squares(vectors)
     assert made.runs[0].jumps == 2 * truth.sum()
+
+
+def test_nobody_looks_for_jumps_that_are_not_asked_for(monkeypatch):
+    """Far from the anchor the walk that looks for one takes longer than the solution."""
+    made, theta = predictor(110.0)
+    vectors = theta * np.exp(np.random.default_rng(4).uniform(-0.7, 0.7, (50, theta.size)))
+    problem = CampaignProblem(made)
+    expected = problem.misfit(vectors)
+    counted = problem.branch_jumps.sum()
+    assert counted > 0
+    held = Held(problem, theta, [])
+    with monkeypatch.context() as patched:
+        patched.setattr(Anchor, "leads_to", None)
+        with LogDensity(held).unwatched():
+            found = problem.misfit(vectors)
+    np.testing.assert_array_equal(found.sum_of_squares, expected.sum_of_squares)
+    assert problem.branch_jumps.sum() == counted
+    problem.misfit(vectors)
+    assert problem.branch_jumps.sum() == 2 * counted
 
 
 def walked(made: Predictor, theta: np.ndarray, end: np.ndarray) -> np.ndarray | None:
