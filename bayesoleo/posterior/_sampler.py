@@ -58,6 +58,8 @@ class Schedule:
         Draws of the first warm-up round; each later one has twice as many.
     most_rounds : int
         Warm-up rounds at most.
+    least_rounds : int
+        Warm-up rounds before proposals of the mixture that are accepted may end it.
     least : int
         Kept draws of each walker before the stopping rule is applied.
     times : float
@@ -70,6 +72,7 @@ class Schedule:
     max_evaluations: int
     warm_up: int
     most_rounds: int
+    least_rounds: int
     least: int
     times: float
     segment: int
@@ -230,8 +233,8 @@ def sample(
 
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
     if quick:
-        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 25, 10.0, segment)
-    return Schedule(effective_size, evaluations, 20, 6, 50, 20.0, segment)
+        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, 25, 10.0, segment)
+    return Schedule(effective_size, evaluations, 20, 6, 2, 50, 20.0, segment)
 
 
 def _fingerprint(
@@ -249,6 +252,7 @@ def _fingerprint(
         seed,
         schedule.warm_up,
         schedule.most_rounds,
+        schedule.least_rounds,
         np.asarray(start.degrees).tolist(),
         climbs,
     ]
@@ -292,12 +296,12 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
     following = schedule.warm_up * 2 ** len(rounds) * segments[0].coords.shape[1]
     if spent + following > schedule.max_evaluations / 2:  # leave half for draws that are kept
         return True
-    if len(rounds) < 2:
-        return False
     # Nearly all independence proposals are accepted: walkers have forgotten their start, and none
     # is left in a tail that the mixture misses.
-    if _independence(rounds[-1]) > 0.8:
+    if len(rounds) >= schedule.least_rounds and _independence(rounds[-1]) > 0.8:
         return True
+    if len(rounds) < 2:
+        return False
     times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
     return bool(np.all(rounds[-1].draws >= 10 * times))
 

@@ -11,6 +11,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._datatree import choose_all
+from bayesoleo.posterior._ensemble_moves import Ensembles
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
@@ -70,6 +71,26 @@ def test_a_first_look_ends_after_so_many_evaluations_and_says_so(monkeypatch):
     assert not samples.reached
     assert samples.evaluations <= 4_000
     assert "stopped before 4000 evaluations; " in samples.warning
+
+
+def test_a_first_look_warms_up_once_where_the_mixture_is_the_posterior(monkeypatch):
+    """Walkers that start in the posterior have nothing to forget."""
+    sd, phases, advance = np.ones(3), list[str](), Ensembles.advance
+
+    def noted(group, last, steps, phase):
+        phases.append(phase)
+        return advance(group, last, steps, phase)
+
+    monkeypatch.setattr(Ensembles, "advance", noted)
+    rounds = {}
+    for name, stretch, quick in (("near", 1.0, True), ("far", 3.0, True), ("full", 1.0, False)):
+        phases.clear()
+        mixture = normal_mixture(sd, stretch=stretch)
+        samples = sample(Gaussian(sd), mixture, seed=1, quick=quick, progress=False)
+        assert samples.reached
+        within_error(samples, np.zeros(3), sd)
+        rounds[name] = phases.count("warm-up")
+    assert rounds == {"near": 1, "far": 2, "full": 2}
 
 
 @pytest.mark.slow
