@@ -85,26 +85,26 @@ class Covariances:
         ]
         return cls(variance, smooth * unit[output_of], output_of, levels, tuple(patterns))
 
-    def products(self, rows: Array) -> tuple[Array, Array]:
+    def products(self, rows: Array, count: int | None = None) -> tuple[Array, Array]:
         """``X V^-1 X'`` of rows ``X (p, n)`` for each pattern (patterns, p, p), and ``ln det V``
-        (patterns,)."""
-        outputs, sizes = self.levels.shape
-        grams: list[list[Array]] = [[] for _ in range(outputs)]
-        logs = np.zeros((outputs, sizes + 1))
-        for b in range(outputs):
+        (patterns,); of the first patterns only, if a count of them is given."""
+        patterns = self.patterns[:count]
+        grams: dict[tuple[int, int], Array] = {}
+        logs: dict[tuple[int, int], float] = {}
+        for b in range(len(self.levels)):
             own = self.output_of == b
             chosen = rows[:, own]
-            for k in range(sizes + 1):
+            for k in sorted({pattern[b] for pattern in patterns}):
                 level = self.levels[b, k - 1] if k else 0.0
                 variance = self.variance[own] + level * self.smooth[own]
                 white = chosen / np.sqrt(variance)
-                grams[b].append(white @ white.T)
-                logs[b, k] = np.log(variance).sum()
-        found = np.zeros((len(self.patterns), len(rows), len(rows)))
-        for q, pattern in enumerate(self.patterns):
-            for b, k in enumerate(pattern):
-                found[q] += grams[b][k]
-        total = [sum(logs[b, k] for b, k in enumerate(pattern)) for pattern in self.patterns]
+                grams[b, k] = white @ white.T
+                logs[b, k] = float(np.log(variance).sum())
+        found = np.zeros((len(patterns), len(rows), len(rows)))
+        for q, pattern in enumerate(patterns):
+            for place in enumerate(pattern):
+                found[q] += grams[place]
+        total = [sum(logs[place] for place in enumerate(pattern)) for pattern in patterns]
         return found, np.array(total)
 
 
@@ -414,6 +414,16 @@ class Group:
 
     columns: tuple[int, ...]
     positive: float = 0.5
+
+
+def in_a_row(groups: Sequence[Group], start: int) -> tuple[Group, ...]:
+    """Groups with their columns one after the other."""
+    found = []
+    for group in groups:
+        end = start + len(group.columns)
+        found.append(Group(tuple(range(start, end)), group.positive))
+        start = end
+    return tuple(found)
 
 
 def moment_power(sizes: Array, columns: int | Array) -> Array:

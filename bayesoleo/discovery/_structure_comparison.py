@@ -26,6 +26,7 @@ from bayesoleo.discovery._structure_columns import (
     Reduced,
     Remainders,
     fewer,
+    in_a_row,
     log_difference,
     mean_of,
     sizes_between,
@@ -235,47 +236,63 @@ class Reached:
 class _At:
     """An anchor with its columns, ready to be compared.
 
+    Products of columns are made for those that are looked at together: there are hundreds, and few
+    pairs of them are looked at.
+
     Parameters
     ----------
-    reduced : Reduced
-        By covariance of noise and remainder; own columns first, then candidates, then the law.
+    comparison : Comparison
+    columns : Columns
+        Of all candidates.
+    residual : ndarray, shape (n,)
+    unknowns : ndarray, shape (l, n)
+        In units of their priors.
+    offset : ndarray, shape (l,)
+        Centres of these.
+    rows : ndarray, shape (m, n)
+        Of the anchor's effects, of unit size in units of the noise.
+    own : tuple of Group
+        Of the anchor's effects, among these.
     remainders : Remainders
-    likelihood : Likelihood
     sizes : ndarray
         Of an effect: root mean square of the part of its change that can be seen (:func:`visible`).
-    own : tuple of Group
-        Of the anchor's effects.
-    groups : mapping of (effect, target) to list of Group
-        Of candidates.
-    curves : mapping of (curve, balance) to list of Group
-        Of unnamed functions.
-    law : list of int
-        Columns of the law.
     """
 
-    reduced: Reduced
-    remainders: Remainders
-    likelihood: Likelihood
-    sizes: Array
+    comparison: Comparison
+    columns: Columns
+    residual: Array
+    unknowns: Array
+    offset: Array
+    rows: Array
     own: tuple[Group, ...]
-    groups: dict[Added, list[Group]]
-    curves: dict[Added, list[Group]]
-    law: list[int]
-
-    def parts(self, columns: Sequence[int]) -> list[Reduced]:
-        """Some columns by remainder, once for each set of sizes of the anchor's own effects."""
-        return self._by_size(
-            self.remainders.parts(self.reduced, [*self._own_columns, *columns], self.law)
-        )
-
-    def alone(self, columns: Sequence[int]) -> list[Reduced]:
-        """The same without anything outside the catalogue: of noise alone."""
-        return self._by_size(self.reduced.of_some([0], [*self._own_columns, *columns]))
+    remainders: Remainders
+    sizes: Array
 
     @property
-    def _own_columns(self) -> list[int]:
-        """Columns of the anchor's effects."""
-        return [c for group in self.own for c in group.columns]
+    def likelihood(self) -> Likelihood:
+        """Of the residual."""
+        return Likelihood(self.comparison.variance.size, self.comparison.freedom)
+
+    def parts(self, groups: Sequence[Group]) -> list[Reduced]:
+        """Columns of some groups, one group after the other, by remainder, once for each set of
+        sizes of the anchor's own effects."""
+        reduced = self._reduced(groups, self.columns.law)
+        size = reduced.size - len(self.columns.law)
+        return self._by_size(self.remainders.parts(reduced, range(size), range(size, reduced.size)))
+
+    def alone(self, groups: Sequence[Group]) -> list[Reduced]:
+        """The same without anything outside the catalogue: of noise alone."""
+        return self._by_size(self._reduced(groups, self.columns.law[:0], 1))
+
+    def _reduced(self, groups: Sequence[Group], law: Array, count: int | None = None) -> Reduced:
+        """Columns of the anchor's effects, of some groups and of a law after the unknowns are
+        integrated out, for all covariances of noise and remainder or the first few."""
+        chosen = self.columns.rows[[column for group in groups for column in group.columns]]
+        rows = [self.residual[None], self.unknowns, self.rows, chosen, law]
+        products, logs = self.remainders.covariances.products(np.concatenate(rows), count)
+        reduced = Reduced.of(products, logs, len(self.unknowns), self.offset)
+        every = [*self.own, *in_a_row(groups, len(self.rows))]
+        return reduced.scaled(visible(reduced, every, self.comparison.data.samples))
 
     def _by_size(self, parts: Reduced) -> list[Reduced]:
         """With the anchor's own effects, whose columns come first, in the covariance."""
@@ -313,7 +330,7 @@ def evidences_about(
     beside = [key for key in columns.groups if chosen is None or key in chosen]
     beside = [key for key in beside if key not in anchor.effects]
     tried = [key for key in columns.curves if best_curves is None or key in best_curves]
-    at = _anchored(anchor, comparison, columns, beside, tried)
+    at = _anchored(anchor, comparison, columns)
     own = frozenset(anchor.effects)
     totals = np.stack(
         [at.likelihood(p.square, p.log_det) + p.log_moment(at.likelihood) for p in at.parts([])],
@@ -323,11 +340,11 @@ def evidences_about(
     for outside, value in zip((False, True), at.remainders.split(totals), strict=True):
         found[own, outside] = mean_of(value)
     similar = _like_own(at, tuple(anchor.effects), totals)
-    logs = {key: _curve(at, groups) for key, groups in at.curves.items()}
+    logs = {key: _curve(at, columns.curves[key]) for key in tried}
     by_curve = _like_own_by_curves(at, tuple(anchor.effects), logs, len(columns.curves))
     for pair, log in by_curve.items():
         similar[pair] = float(np.logaddexp(similar[pair], log) - _LOG_2)
-    for some in _chunks(at.groups):
+    for some in _chunks({key: columns.groups[key] for key in beside}):
         more, alike = _one_more(at, some)
         found |= {(own | {key}, outside): value for (key, outside), value in more.items()}
         similar |= {(own, key): value for key, value in alike.items()}
@@ -362,9 +379,8 @@ def _curve(at: _At, groups: Sequence[Group]) -> Array:
     anchor's own effects, and size of the function."""
     values = []
     for group in groups:
-        local = Group(tuple(range(len(group.columns))))
-        noise = at.alone(group.columns)
-        found = [effect_evidence(part, at.likelihood, [local], at.sizes) for part in noise]
+        local, noise = in_a_row([group], 0), at.alone([group])
+        found = [effect_evidence(part, at.likelihood, local, at.sizes) for part in noise]
         values.append([logs[0, 0] for logs in found])
     return np.array(values)
 
@@ -407,14 +423,13 @@ def _one_more(
     at: _At, keys: Sequence[Added]
 ) -> tuple[dict[tuple[Added, bool], float], dict[Added, float]]:
     """Log evidence of the anchor's structure with one more effect, and with a law like it."""
-    columns, groups = _local(at, keys)
-    flat = [(key, group) for key in keys for group in groups[key]]
+    flat = [(key, group) for key in keys for group in at.columns.groups[key]]
     if not flat:
         return {}, {}
-    own = [group for _, group in flat]
+    own = in_a_row([group for _, group in flat], 0)
     labels, largest = [list(keys).index(key) for key, _ in flat], Largest.of(len(keys))
     each: dict[int, Array] = {}
-    parts = at.parts(columns)
+    parts = at.parts([group for _, group in flat])
     # Probable sizes of the anchor's own effects come first: beside them most others are small.
     height = [at.likelihood(part.square, part.log_det).max() for part in parts]
     for k in np.argsort(height)[::-1]:
@@ -431,17 +446,6 @@ def _one_more(
     return found, similar
 
 
-def _local(at: _At, keys: Sequence[Added]) -> tuple[list[int], dict[Added, list[Group]]]:
-    """Columns of some effects, and their groups among these."""
-    columns = [c for key in keys for group in at.groups[key] for c in group.columns]
-    place = {column: k for k, column in enumerate(columns)}
-    groups = {
-        key: [Group(tuple(place[c] for c in g.columns), g.positive) for g in at.groups[key]]
-        for key in keys
-    }
-    return columns, groups
-
-
 def grids_of(comparison: Comparison, reach: Array) -> tuple[Remainders, Array]:
     """Remainders, and sizes of an effect."""
     data, variance = comparison.data, comparison.variance
@@ -454,49 +458,19 @@ def grids_of(comparison: Comparison, reach: Array) -> tuple[Remainders, Array]:
     return Remainders.of(covariances, fewer(sizes)), sizes
 
 
-def _anchored(
-    anchor: EstimatedModel,
-    comparison: Comparison,
-    columns: Columns,
-    beside: Sequence[Added],
-    tried: Sequence[Added],
-) -> _At:
-    """Products of residual, unknowns and columns about an anchor, unknowns integrated out."""
-    fit, data = anchor.fit, comparison.data
-    here = linearised(anchor, data)
-    own = here.own
+def _anchored(anchor: EstimatedModel, comparison: Comparison, columns: Columns) -> _At:
+    """Residual, unknowns and columns about an anchor."""
+    here = linearised(anchor, comparison.data)
     # Errors of the inputs are unknowns as well.
-    unknowns = np.concatenate([here.unknowns, comparison.shared])
-    offset = np.concatenate([here.offset, np.zeros(len(comparison.shared))])
-    index: list[int] = []
-
-    def placed(chosen: Sequence[Group]) -> list[Group]:
-        """Groups with their columns in the order in which these are used."""
-        found = []
-        for group in chosen:
-            start = len(own) + len(index)
-            index.extend(group.columns)
-            found.append(Group(tuple(range(start, start + len(group.columns))), group.positive))
-        return found
-
-    groups = {key: placed(columns.groups[key]) for key in beside}
-    curves = {key: placed(columns.curves[key]) for key in tried}
-    scale = comparison.unit(own)[:, None]
-    rows = [here.residual[None], unknowns, own * scale, columns.rows[index], columns.law]
-    remainders, sizes = grids_of(comparison, data.signal(fit))
-    products, logs = remainders.covariances.products(np.concatenate(rows))
-    count, effects = len(own) + len(index), own_groups(anchor, comparison)
-    reduced = Reduced.of(products, logs, len(unknowns), offset)
-    every = [effects, *groups.values(), *curves.values()]
     return _At(
-        reduced.scaled(visible(reduced, [g for some in every for g in some], data.samples)),
-        remainders,
-        Likelihood(comparison.variance.size, comparison.freedom),
-        sizes,
-        effects,
-        groups,
-        curves,
-        list(range(count, count + len(columns.law))),
+        comparison,
+        columns,
+        here.residual,
+        np.concatenate([here.unknowns, comparison.shared]),
+        np.concatenate([here.offset, np.zeros(len(comparison.shared))]),
+        here.own * comparison.unit(here.own)[:, None],
+        own_groups(anchor, comparison),
+        *grids_of(comparison, comparison.data.signal(anchor.fit)),
     )
 
 
@@ -530,10 +504,16 @@ def own_groups(anchor: EstimatedModel, comparison: Comparison) -> tuple[Group, .
 
 def _pairs(at: _At, best: Sequence[Added]) -> Evidences:
     """Log evidence of pairs of some effects with one unknown each."""
-    able = [key for key in best if all(len(group.columns) == 1 for group in at.groups[key])]
-    columns, groups = _local(at, able)
+    every = at.columns.groups
+    able = [key for key in best if all(len(group.columns) == 1 for group in every[key])]
+    flat = [(key, group) for key in able for group in every[key]]
+    local = in_a_row([group for _, group in flat], 0)
+    groups = {
+        key: [one for one, (other, _) in zip(local, flat, strict=True) if other == key]
+        for key in able
+    }
     found: Evidences = {}
-    (parts,), few = at.parts(columns), fewer(at.sizes)
+    (parts,), few = at.parts([group for _, group in flat]), fewer(at.sizes)
     for place, first in enumerate(able[:-1], 1):
         flat = [(second, group) for second in able[place:] for group in groups[second]]
         others = [group for _, group in flat]

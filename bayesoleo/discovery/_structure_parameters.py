@@ -31,6 +31,7 @@ from bayesoleo.discovery._structure_columns import (
     Likelihood,
     Reduced,
     fewer,
+    in_a_row,
     moment_power,
     root_of,
 )
@@ -159,7 +160,7 @@ class _Structure:
         remainders, sizes = grids_of(comparison, data.signal(anchor.fit))
         every = np.concatenate([here.residual[None], unknowns, *rows, law])
         products, logs = remainders.covariances.products(every)
-        effects = _in_a_row([*own_groups(anchor, comparison), *groups], 0)
+        effects = in_a_row([*own_groups(anchor, comparison), *groups], 0)
         reduced = Reduced.of(products, logs, len(unknowns), offset)
         factors = np.concatenate(
             [np.ones(1 + len(unknowns)), visible(reduced, effects, data.samples)]
@@ -174,7 +175,7 @@ class _Structure:
             here.change,
             products * factors[:, None] * factors,
             logs,
-            _in_a_row(effects, len(unknowns)),
+            in_a_row(effects, len(unknowns)),
             len(law),
             offset,
             outside if structure.outside else [(0, None, 1.0)],
@@ -237,16 +238,6 @@ class _Structure:
         log_det = -np.linalg.slogdet(covariance)[1] - np.log(precision).sum() + self.logs[pattern]
         log = float(self.likelihood(square, np.array(log_det)))
         return log, mean, covariance, float(self.likelihood.noise(square))
-
-
-def _in_a_row(groups: Sequence[Group], start: int) -> tuple[Group, ...]:
-    """Groups with their columns one after the other."""
-    found = []
-    for group in groups:
-        end = start + len(group.columns)
-        found.append(Group(tuple(range(start, end)), group.positive))
-        start = end
-    return tuple(found)
 
 
 def _by_side(

@@ -291,6 +291,9 @@ def test_remainders_are_more_variance_on_their_outputs():
         total = variance + level[output] * smooth * unit
         np.testing.assert_allclose(products[q], (rows / total) @ rows.T, rtol=1e-12)
         np.testing.assert_allclose(logs[q], np.log(total).sum(), rtol=1e-12)
+    first, log = covariances.products(rows, 1)
+    np.testing.assert_array_equal(first, products[:1])
+    np.testing.assert_array_equal(log, logs[:1])
 
 
 def test_prior_of_single_effects_adds_up_and_near_copies_share():

@@ -144,6 +144,19 @@ def test_two_effects_are_found_where_none_was_tried_as_a_pair(two, monkeypatch):
     assert all(found.effects[key] > 0.8 for key in PAIR), found.effects
 
 
+def test_effects_are_compared_alike_whatever_is_looked_at_with_them(two, monkeypatch):
+    evidence, (one, *_) = evidence_with(two)
+    evidence.add(one)
+    monkeypatch.setattr("bayesoleo.discovery._structure_comparison.CHUNK", 1)
+    alone = Evidence(evidence.comparison)
+    for anchor in (EstimatedModel(two.base().fit, {}), one):
+        alone.add(anchor)
+    assert alone.found.keys() == evidence.found.keys()
+    # Round-off of logarithms that are hundreds.
+    for key, value in evidence.found.items():
+        assert alone.found[key] == pytest.approx(value, abs=1e-6), key
+
+
 def test_parts_of_a_probable_pair_are_estimated_each(two):
     evidence, (one, _, both, _) = evidence_with(two)
     evidence.add(both)
