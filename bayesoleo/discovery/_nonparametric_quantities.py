@@ -41,8 +41,8 @@ _PREFIX = "quantity_"
 
 #: Courses of a term in one run: at phases ``(N,)`` an array ``(K, N)``.
 Courses = Callable[[Array], Array]
-#: Terms that one model takes at a time.
-TOGETHER = 36
+#: Terms that one model takes at a time: the splines of two fine curves.
+TOGETHER = 38
 #: Velocity at which a direction has half its size, over the largest one.
 TRANSITION = 1 / 200
 #: Step in phase for derivatives of a course.

@@ -25,7 +25,12 @@ from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Added, Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
-from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
+from bayesoleo.discovery._nonparametric_quantities import (
+    TOGETHER,
+    Forced,
+    Motions,
+    quantities_of,
+)
 from bayesoleo.discovery._nonparametric_search import coarser
 from bayesoleo.discovery._refit import new_parameters, quick_fit
 from bayesoleo.discovery._score_basis import Base
@@ -476,31 +481,43 @@ def curves_of(
     """
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
     axes = dict(motions.axes({}))
-    places: list[tuple[str, str, Forced, _Courses]] = []
+    curves = list(_curves(motions, axes))
+    some = max(TOGETHER // coarser(1, COARSE, FINE).shape[0], 1)
+    places: list[tuple[str, Forced, Sequence[tuple[str, _Courses]]]] = []
     for target in balance_places(assembly.native):
         try:
             forced = Forced(base.fit, assembly, target)
         except ModelError:
             continue  # nothing is left to solve for with a term there
-        places += [(name, target, forced, courses) for name, courses in _curves(motions, axes)]
-    found = thread_map(lambda place: _columns(base, place[2], place[3]), places, jobs)
+        parts = [curves[k : k + some] for k in range(0, len(curves), some)]
+        places += [(target, forced, part) for part in parts]
+    found = thread_map(
+        lambda place: _columns(base, place[1], [courses for _, courses in place[2]]), places, jobs
+    )
     return {
         (name, target): (fine, coarser(1, COARSE, FINE).T @ fine)
-        for (name, target, *_), fine in zip(places, found, strict=True)
+        for (target, _, part), columns in zip(places, found, strict=True)
+        for (name, _), fine in zip(part, columns, strict=True)
         if fine is not None
     }
 
 
-def _columns(base: Base, forced: Forced, courses: _Courses) -> Array | None:
-    """Changes of the outputs by each spline (K, n); None where they could not be solved for."""
+def _columns(base: Base, forced: Forced, several: Sequence[_Courses]) -> list[Array | None]:
+    """Changes of the outputs by the splines of some curves, each (K, n), solved for together; None
+    for those that could not be solved for alone."""
     assert base.data is not None
     by_run = []
     for r in range(len(base.runs)):
-        found = forced.responses(r, partial(courses, r))
+        found = forced.responses(r, partial(_after_each_other, several, r))
         if isinstance(found, Status) or not np.isfinite(found).all():
-            return None
+            alone = several if len(several) > 1 else ()
+            return [_columns(base, forced, [one])[0] for one in alone] or [None]
         by_run.append(found)
-    return base.data.columns(by_run)
+    return list(np.split(base.data.columns(by_run), len(several)))
+
+
+def _after_each_other(several: Sequence[_Courses], r: int, phase: Array) -> Array:
+    return np.concatenate([courses(r, phase) for courses in several])
 
 
 def _curves(motions: Motions, axes: Mapping[int, Axis]) -> Iterator[tuple[str, _Courses]]:

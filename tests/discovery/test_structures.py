@@ -19,6 +19,7 @@ from small_campaigns import (
 )
 
 from bayesoleo.discovery import StructurePosterior, StructurePrior
+from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
 from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
@@ -39,11 +40,14 @@ from bayesoleo.discovery._structure_parameters import _summary
 from bayesoleo.discovery._structure_search import (
     Evidence,
     Ground,
+    _columns,
+    _curves,
     _named_as,
     extended,
     structure_posterior,
 )
 from bayesoleo.effects import find_effect
+from bayesoleo.effects._nonparametric import balance_places
 
 FEW = ("coulomb_friction", "quadratic_damping", "preload", "quadratic_stiffness", "sensor_gain")
 FRICTION = ("coulomb_friction", "force")
@@ -142,6 +146,28 @@ def test_two_effects_are_found_where_none_was_tried_as_a_pair(two, monkeypatch):
     assert found.structures[0].estimated
     # The rest is of laws that resemble one of the two, or both.
     assert all(found.effects[key] > 0.8 for key in PAIR), found.effects
+
+
+def test_curves_that_are_solved_together_are_those_solved_alone(plain):
+    """Also where one of them is no number: it is left out, and the other is not."""
+    base, assembly = plain.base(), plain.assembly
+    motions = Motions(base.fit, assembly, quantities_of(assembly.native))
+    curves = [courses for _, courses in _curves(motions, dict(motions.axes({})))]
+    (target,) = balance_places(assembly.native)
+    forced = Forced(base.fit, assembly, target)
+
+    def bad(r, phase):
+        return curves[0](r, phase) * np.nan
+
+    alone = [_columns(base, forced, [courses])[0] for courses in curves[:2]]
+    together = _columns(base, forced, curves[:2])
+    assert len(together) == 2
+    assert not np.allclose(*together)
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(one, other)
+    one, none = _columns(base, forced, [curves[1], bad])
+    assert none is None
+    np.testing.assert_array_equal(one, alone[1])
 
 
 def test_effects_are_compared_alike_whatever_is_looked_at_with_them(two, monkeypatch):
