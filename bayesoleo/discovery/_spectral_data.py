@@ -26,6 +26,7 @@ from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._fit import ModelFit, weights
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.model._priors import LogNormal, LogUniform, Prior
 from bayesoleo.prediction._records import Record
 
 #: Harmonics of a periodic run, and lines of a transient, that are kept at most.
@@ -290,6 +291,7 @@ class LinearisedModel:
         Estimates, SI.
     change : ndarray, shape (l, l)
         Changes of the parameters (rows), SI, by the unknowns.
+    priors : tuple of Prior, length l
     """
 
     residual: Array
@@ -299,6 +301,7 @@ class LinearisedModel:
     names: tuple[str, ...]
     theta: Array
     change: Array
+    priors: tuple[Prior, ...]
 
 
 def linearised(anchor: EstimatedModel, data: SpectralData) -> LinearisedModel:
@@ -316,12 +319,23 @@ def linearised(anchor: EstimatedModel, data: SpectralData) -> LinearisedModel:
     rest = [k for k in range(len(problem.names)) if k not in amplitudes]
     scale = PriorScale.of(problem.priors, problem.names)
     precision = (scale.root.T @ scale.root)[np.ix_(rest, rest)]
-    unit, slope = scale.unit(theta)[rest], np.nan_to_num(scale.slope(theta)[rest])
+    # An estimator's slope is of the density per unit of a parameter. What is integrated out here is
+    # its logarithm where the prior is log-normal.
+    slope = scale.slope(theta) + np.where(scale.logarithmic, scale.spread, 0.0)
+    unit, slope = scale.unit(theta)[rest], np.nan_to_num(slope[rest])
+    priors = [problem.priors[k] for k in rest]
     for k, index in enumerate(rest):
-        scan = anchor.shapes.get(problem.names[index])
+        scan, prior = anchor.shapes.get(problem.names[index]), priors[k]
         if scan is not None:
             centre, spread = scan_prior(scan)
-            unit[k], slope[k] = theta[index] * spread, (centre - np.log(theta[index])) / spread
+            priors[k] = LogNormal(float(np.exp(centre)), spread)
+        elif isinstance(prior, LogUniform):
+            # Near its lower limit its slope is no prior of normal form.
+            centre = 0.5 * float(np.log(prior.low * prior.high))
+            spread = float(np.log(prior.high / prior.low)) / np.sqrt(12.0)
+        else:
+            continue
+        unit[k], slope[k] = theta[index] * spread, (centre - np.log(theta[index])) / spread
     root = np.linalg.cholesky(precision)  # lower, of the precision: root' delta has unit variance
     unknowns = np.linalg.solve(root, rows[rest] * unit[:, None])
     offset = np.linalg.solve(root, slope)
@@ -335,6 +349,7 @@ def linearised(anchor: EstimatedModel, data: SpectralData) -> LinearisedModel:
         tuple(problem.names[k] for k in rest),
         theta[rest],
         unit[:, None] * np.linalg.inv(root).T,
+        tuple(priors),
     )
 
 

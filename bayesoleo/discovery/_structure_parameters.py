@@ -6,6 +6,10 @@ density by which structures are compared. On each side of an amplitude's zero it
 normal density with the same mean and covariance. The mixture of all, weighted by evidence and by
 the structures' probabilities, is the posterior of a parameter given any structure.
 
+A density is normal in the coordinate in which the estimator steps, the logarithm of a parameter
+with a log-normal prior, and lies within the limits of the priors
+(:mod:`bayesoleo.discovery._limited_parameters`).
+
 References
 ----------
 Hoeting, Madigan, Raftery and Volinsky (1999), *Statistical Science* 14(4), eq. 1.
@@ -14,17 +18,19 @@ Hoeting, Madigan, Raftery and Volinsky (1999), *Statistical Science* 14(4), eq. 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 
 import numpy as np
-from scipy import optimize
-from scipy.special import logsumexp, ndtr, ndtri
+from scipy.special import logsumexp, ndtri
 from scipy.stats import qmc
 
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Added
+from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._limited_parameters import ROUGH, STEPS, Coordinates, powers
+from bayesoleo.discovery._parameter_mixture import Mixture, part_of
 from bayesoleo.discovery._spectral_data import EstimatedModel, linearised
 from bayesoleo.discovery._structure_columns import (
     Group,
@@ -46,20 +52,26 @@ from bayesoleo.discovery._structures import AveragedParameter, Structure
 
 #: Structures less probable than this, and parts of a mixture lighter than this, are left out.
 LEAST, LIGHTEST = 0.005, 1e-4
-#: Tail outside a central interval of 90 %, on each side.
-TAIL = 0.05
 #: Nodes of a normal density in one dimension, in each of two, and in all of more; and how many
 #: standard deviations they reach.
 NODES, REACH = (61, 31, 1024), 6.0
+#: Draws of a part of a posterior that reaches a limit: of one heavier than the last, and of others.
+MANY, FEW, HEAVY = 4096, 256, 0.05
 
 
 @dataclass(frozen=True)
 class _Normal:
-    """A part of the posterior of all parameters: weight, means (l,) and standard deviations."""
+    """A part of the posterior of all parameters, in their coordinates: weight, means (l,) and
+    covariance (l, l)."""
 
     weight: float
     mean: Array
-    sd: Array
+    covariance: Array
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations (l,)."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
 def averaged(
@@ -83,32 +95,18 @@ def averaged(
         Parameters of the declared model. Where a structure lets one differ between runs, its value
         is that of each run with equal weight.
     """
-    parts: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
+    parts: dict[str, list[Mixture]] = {name: [] for name in names}
     for structure in structures:
         key = frozenset(structure.effects), structure.outside
         if structure.probability < LEAST or key not in anchors:
             continue
         known = _Structure.of(structure, anchors[key], comparison, columns)
-        for part in known.normals():
-            for name in names:
-                own = [k for k, other in enumerate(known.names) if name == other]
-                own = own or [k for k, n in enumerate(known.names) if n.split("[")[0] == name]
-                weight = structure.probability * part.weight / max(len(own), 1)
-                parts[name] += [(weight, part.mean[k], part.sd[k]) for k in own]
-    return {name: _summary(np.array(found)) for name, found in parts.items() if found}
-
-
-def _summary(parts: Array) -> AveragedParameter:
-    """Moments and interval of a mixture, from rows of weight, mean and standard deviation."""
-    weight, mean, sd = parts[:, 0] / parts[:, 0].sum(), parts[:, 1], np.maximum(parts[:, 2], 1e-300)
-    centre = float(weight @ mean)
-    spread = float(np.sqrt(weight @ (sd**2 + (mean - centre) ** 2)))
-    low, high = float(np.min(mean - 6 * sd)), float(np.max(mean + 6 * sd))
-
-    def at(chance: float) -> float:
-        return float(optimize.brentq(lambda x: weight @ ndtr((x - mean) / sd) - chance, low, high))
-
-    return AveragedParameter(centre, spread, at(TAIL), at(1.0 - TAIL), at(0.5))
+        every = known.mixtures(anchors[key].fit)
+        for name in names if every else ():
+            own = [k for k, other in enumerate(known.names) if name == other]
+            own = own or [k for k, n in enumerate(known.names) if n.split("[")[0] == name]
+            parts[name] += [every[k].scaled(structure.probability / len(own)) for k in own]
+    return {name: Mixture.of(found).summary() for name, found in parts.items() if found}
 
 
 @dataclass(frozen=True)
@@ -121,6 +119,12 @@ class _Structure:
         Of the residual and all columns, by covariance: unknowns, errors of inputs, effects, law.
     logs : ndarray, shape (P,)
         Log determinants.
+    coordinates : Coordinates
+        Of the parameters.
+    theta : ndarray, shape (l,)
+        Coordinates of the estimate.
+    change : ndarray, shape (l, l)
+        Changes of the coordinates (rows) by the unknowns.
     effects : tuple of Group
         Columns of each effect, counted among all columns.
     law : int
@@ -133,6 +137,7 @@ class _Structure:
     """
 
     names: tuple[str, ...]
+    coordinates: Coordinates
     theta: Array
     change: Array
     products: Array
@@ -161,6 +166,10 @@ class _Structure:
         every = np.concatenate([here.residual[None], unknowns, *rows, law])
         products, logs = remainders.covariances.products(every)
         effects = in_a_row([*own_groups(anchor, comparison), *groups], 0)
+        count = len(here.names)
+        coordinates = Coordinates.of(
+            here.priors, here.theta, np.diag(here.change), here.offset[:count]
+        )
         reduced = Reduced.of(products, logs, len(unknowns), offset)
         factors = np.concatenate(
             [np.ones(1 + len(unknowns)), visible(reduced, effects, data.samples)]
@@ -171,8 +180,9 @@ class _Structure:
         ]
         return cls(
             here.names,
-            here.theta,
-            here.change,
+            coordinates,
+            coordinates.place,
+            here.change / coordinates.slope[:, None],
             products * factors[:, None] * factors,
             logs,
             in_a_row(effects, len(unknowns)),
@@ -183,14 +193,62 @@ class _Structure:
             Likelihood(comparison.variance.size, comparison.freedom),
         )
 
+    def mixtures(self, fit: ModelFit | None = None) -> list[Mixture]:
+        """Posterior of each parameter; none if all of it lies outside the limits.
+
+        Parameters
+        ----------
+        fit : ModelFit, optional
+            Of the anchor, by which coordinates are chosen of what is known poorly.
+        """
+        normals, coordinates = self.normals(), self.coordinates
+        if fit is not None:
+            coordinates = replace(coordinates, power=powers(fit, self.names, self._shift(normals)))
+        found, logs = [list[Mixture]() for _ in self.names], list[float]()
+        for part in normals:
+            if coordinates.rough(part.mean, part.sd).any():
+                count = MANY if part.weight > HEAVY else FEW
+                values, log = coordinates.draws(part.mean, part.covariance, count)
+                total = float(logsumexp(log))
+                if not np.isfinite(total):
+                    continue  # none of it lies within the limits
+                rows = [part_of(np.exp(log - total), own, 0.0, False) for own in values.T]
+                logs.append(float(np.log(part.weight / count)) + total)
+            else:
+                each = zip(part.mean, part.sd, coordinates.logarithmic, strict=True)
+                rows = [part_of(1.0, mean, sd, flag) for mean, sd, flag in each]
+                logs.append(float(np.log(part.weight)))
+            for own, row in zip(found, rows, strict=True):
+                own.append(row)
+        if not logs:
+            return []
+        weights = np.exp(np.array(logs) - logsumexp(logs))
+        return [
+            Mixture.of([one.scaled(w) for one, w in zip(own, weights, strict=True)])
+            for own in found
+        ]
+
+    def _shift(self, normals: Sequence[_Normal]) -> Array:
+        """How far the posterior of each logarithm that is known poorly lies, or reaches, from the
+        estimate (l,); zero for the others."""
+        weight = np.array([part.weight for part in normals])
+        mean = weight @ np.array([part.mean for part in normals]) / weight.sum()
+        sd = np.sqrt(weight @ np.array([part.sd**2 for part in normals]) / weight.sum())
+        away = mean - self.theta
+        reach = np.maximum(np.abs(away), sd)
+        # By as much as of a parameter that outputs are linear in.
+        steps = np.where(away < 0.0, -np.minimum(reach, 1.0), np.log1p(reach))
+        steps = np.sign(steps) * np.clip(np.abs(steps), *STEPS)
+        return np.where(self.coordinates.logarithmic & (sd > ROUGH), steps, 0.0)
+
     def normals(self) -> list[_Normal]:
         """Normal densities by remainder, sizes and sides of the effects, with their weights."""
         found = list(self._each())
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(logs - logsumexp(logs))
         return [
-            _Normal(float(w), mean, sd)
-            for w, (_, mean, sd) in zip(weights, found, strict=True)
+            _Normal(float(w), mean, covariance)
+            for w, (_, mean, covariance) in zip(weights, found, strict=True)
             if w > LIGHTEST
         ]
 
@@ -202,7 +260,7 @@ class _Structure:
         return [(size,) * number for size in self.sizes]
 
     def _each(self) -> Iterator[tuple[float, Array, Array]]:
-        """Log weight, means and standard deviations of the parameters."""
+        """Log weight, means and covariances of the parameters' coordinates."""
         members = [k for group in self.effects for k in group.columns]
         count = len(self.names)
         for (pattern, law, weight), sizes in product(self.parts, self._grid()):
@@ -220,9 +278,9 @@ class _Structure:
             rest = rest - follow @ inner @ follow.T
             moved = self.theta + self.change @ mean[:count]
             for share, shift, spread in _by_side(self.effects, power, mean[members] / root, inner):
-                variance = noise * np.diag(rest + follow @ spread @ follow.T)
                 here = moved + root * follow @ shift
-                yield log + np.log(weight) + share, here, np.sqrt(np.maximum(variance, 0.0))
+                spread_out = noise * (rest + follow @ spread @ follow.T)
+                yield log + np.log(weight) + share, here, spread_out
 
     def _posterior(self, pattern: int, precision: Array) -> tuple[float, Array, Array, float]:
         """Log evidence, means and covariance of the columns' coefficients, the latter in units of
@@ -231,13 +289,21 @@ class _Structure:
         gram = self.products[pattern, :size, :size]
         centre = np.zeros(precision.size)
         centre[: self.offset.size] = self.offset
-        right = gram[1:, 0] + precision * centre
-        covariance = np.linalg.inv(gram[1:, 1:] + np.diag(precision))
-        mean = covariance @ right
+
+        def solved(precision: Array) -> tuple[Array, Array, Array]:
+            right = gram[1:, 0] + precision * centre
+            covariance = np.linalg.inv(gram[1:, 1:] + np.diag(precision))
+            return right, covariance, covariance @ right
+
+        right, covariance, mean = solved(precision)
         square = np.array(gram[0, 0] + precision @ centre**2 - right @ mean)
         log_det = -np.linalg.slogdet(covariance)[1] - np.log(precision).sum() + self.logs[pattern]
-        log = float(self.likelihood(square, np.array(log_det)))
-        return log, mean, covariance, float(self.likelihood.noise(square))
+        log, noise = self.likelihood(square, log_det), float(self.likelihood.noise(square))
+        # What is known of an unknown beforehand is not known worse where noise is larger than it
+        # was measured.
+        stated = np.where(np.arange(precision.size) < self.offset.size, noise, 1.0)
+        _, covariance, mean = solved(stated * precision)
+        return float(log), mean, covariance, noise
 
 
 def _by_side(

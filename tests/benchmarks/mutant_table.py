@@ -547,6 +547,16 @@ DISCOVERY: Rows = {
          "here = moved + 0.0 * follow @ shift",
          "discovery/test_averaged_parameters.py"),
     ],
+    "discovery/_limited_parameters.py": [
+        ("limits of priors do not cut a parameter's posterior",
+         "own | reached",
+         "own & reached",
+         "discovery/test_limited_parameters.py"),
+        ("outputs are linear in the logarithm of every positive parameter",
+         "found[place] = np.clip(1.0 + ratio / shift[place], *POWERS)",
+         "found[place] = 0.0",
+         "discovery/test_limited_parameters.py"),
+    ],
     "discovery/_structure_columns.py": [
         ("half the volume of what is integrated out",
          "self.log_det + 2.0 * logs,",

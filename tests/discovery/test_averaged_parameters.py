@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesoleo.discovery._limited_parameters import Coordinates
 from bayesoleo.discovery._structure_columns import Group, Likelihood
-from bayesoleo.discovery._structure_parameters import _Structure, _summary
+from bayesoleo.discovery._structure_parameters import _Structure
+from bayesoleo.model import Normal
 
 SAMPLES, SIZE = 400, 0.2
+STANDARD = Coordinates.of([Normal(0.0, 1.0)], np.zeros(1), np.ones(1), np.zeros(1))
 
 
 def columns(own: float, effects: int, seed: int) -> np.ndarray:
@@ -24,8 +27,9 @@ def of_residual(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]
     """About an estimate of zero, with a prior of unit deviation, under known noise."""
     every = np.concatenate([residual[None], rows])
     effects = tuple(Group((1 + k,), side) for k, side in enumerate(sides))
+    gram = (every @ every.T)[None]
     return _Structure(
-        ("theta",), np.zeros(1), np.eye(1), (every @ every.T)[None], np.zeros(1), effects, 0,
+        ("theta",), STANDARD, np.zeros(1), np.eye(1), gram, np.zeros(1), effects, 0,
         np.zeros(1), [(0, None, 1.0)], np.array([SIZE]), Likelihood(SAMPLES, 1e12),
     )  # fmt: skip
 
@@ -65,8 +69,8 @@ def test_a_parameter_given_a_structure_is_that_of_the_integral(size, own, sides)
     amplitudes = np.full(len(sides), size / np.sqrt(SAMPLES * own))
     noise = np.random.default_rng(3).standard_normal(SAMPLES)
     residual = 0.05 * rows[0] + amplitudes @ rows[1:] + noise
-    parts = [(n.weight, n.mean[0], n.sd[0]) for n in of_residual(residual, rows, sides).normals()]
-    found = _summary(np.array(parts))
+    (mixture,) = of_residual(residual, rows, sides).mixtures()
+    found = mixture.summary()
     mean, sd, low, high = exact(residual, rows, sides)
     # A normal density on each side of zero instead of one with the moment: a tenth of a deviation.
     assert found.mean == pytest.approx(mean, abs=0.02 * sd)
@@ -82,8 +86,8 @@ def test_intervals_cover_where_data_say_little_of_the_structure():
         theta = rng.standard_normal()
         amplitude = SIZE / np.sqrt(3.0) * stats.chi.rvs(3, random_state=rng) * rng.choice([-1, 1])
         residual = theta * rows[0] + amplitude * rows[1] + rng.standard_normal(SAMPLES)
-        known = of_residual(residual, rows, (0.5,))
-        found = _summary(np.array([(n.weight, n.mean[0], n.sd[0]) for n in known.normals()]))
+        (mixture,) = of_residual(residual, rows, (0.5,)).mixtures()
+        found = mixture.summary()
         inside += found.low < theta < found.high
     # Three standard errors of a proportion of 0.9.
     assert inside / draws == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / draws))

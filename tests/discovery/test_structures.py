@@ -20,6 +20,7 @@ from small_campaigns import (
 
 from bayesoleo.discovery import StructurePosterior, StructurePrior
 from bayesoleo.discovery._nonparametric_quantities import Forced, Motions, quantities_of
+from bayesoleo.discovery._parameter_mixture import Mixture, part_of
 from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
 from bayesoleo.discovery._state import State
@@ -36,7 +37,6 @@ from bayesoleo.discovery._structure_comparison import (
     grids_of,
     visible,
 )
-from bayesoleo.discovery._structure_parameters import _summary
 from bayesoleo.discovery._structure_search import (
     Evidence,
     Ground,
@@ -46,6 +46,7 @@ from bayesoleo.discovery._structure_search import (
     extended,
     structure_posterior,
 )
+from bayesoleo.discovery._structures import AveragedParameter
 from bayesoleo.effects import find_effect
 from bayesoleo.effects._nonparametric import balance_places
 
@@ -330,14 +331,18 @@ def test_where_nothing_is_missing_averages_are_those_of_the_fit(plain):
 
 def test_an_average_over_two_structures_contains_both():
     """Two normal densities of equal weight, ten standard deviations apart."""
-    found = _summary(np.array([[0.5, -5.0, 1.0], [0.5, 5.0, 1.0]]))
+
+    def mixed(*parts: tuple[float, float, float]) -> AveragedParameter:
+        return Mixture.of([part_of(*part, False) for part in parts]).summary()
+
+    found = mixed((0.5, -5.0, 1.0), (0.5, 5.0, 1.0))
     assert found.mean == pytest.approx(0.0)
     assert found.sd == pytest.approx(np.sqrt(26.0))
-    far = _summary(np.array([[0.97, 0.0, 1.0], [0.03, 1000.0, 1.0]]))
+    far = mixed((0.97, 0.0, 1.0), (0.03, 1000.0, 1.0))
     assert far.low < far.median < far.high < far.mean
     # Five per cent of the mixture are ten of the lower part, whose quantile is -1.2816.
     assert (found.low, found.high) == pytest.approx((-6.2816, 6.2816), abs=1e-4)
-    alone = _summary(np.array([[0.5, 3.0, 2.0]]))
+    alone = mixed((0.5, 3.0, 2.0))
     assert (alone.low, alone.high) == pytest.approx((3 - 2 * 1.64485, 3 + 2 * 1.64485), abs=1e-4)
 
 
