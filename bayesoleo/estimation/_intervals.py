@@ -32,6 +32,7 @@ from bayesoleo.estimation._objectives import (
 from bayesoleo.estimation._parametric_bootstrap import NoiseBlock
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.estimation._problem import EstimationProblem, measured_of
+from bayesoleo.model._priors import LogNormal, LogUniform, Prior
 
 Form = Literal["posterior", "propagated"]
 Distribution = Literal["t", "normal"]
@@ -242,7 +243,9 @@ def linearised_intervals(
 ) -> LabelledResult:
     """Two-sided normal intervals of the parameters and the error variances.
 
-    Parameters are those of :func:`linearised_covariance`; ``level`` is the coverage.
+    Parameters are those of :func:`linearised_covariance`; ``level`` is the coverage. Intervals of
+    error variances, and of parameters with a log-normal or log-uniform prior, are normal in the
+    logarithm; all end at the limits of their prior's support.
 
     Returns
     -------
@@ -255,7 +258,11 @@ def linearised_intervals(
     names = [*point.names, *(f"variance[{output}]" for output in point.outputs)]
     values = np.concatenate((point.theta, point.variance))
     half = stats.norm.isf((1 - level) / 2) * np.sqrt(np.diag(covariance))
-    data = _dataset(names, values, covariance, half)
+    size = point.theta.size
+    shared = supported_ends(problem.priors, point.theta, half[:size])
+    positive = point.variance * np.exp(np.outer([-1.0, 1.0], half[size:] / point.variance))
+    low, high = np.concatenate((shared, positive), axis=1)
+    data = _dataset(names, values, covariance, low, high)
     data.attrs = {"form": form, "level": level, "prior": int(prior), "exact": int(exact)}
     return LabelledResult(data, intervals_text(data))
 
@@ -312,7 +319,7 @@ def over_experiments(
     factor = stats.t.isf(tail, count - 1) if distribution == "t" else stats.norm.isf(tail)
     share = 1 / count if of == "mean" else 1 + 1 / count
     half = factor * np.sqrt(share * np.diag(covariance))
-    data = _dataset(labels, mean, covariance, half)
+    data = _dataset(labels, mean, covariance, mean - half, mean + half)
     data.attrs = {
         "experiments": count,
         "failed": failed,
@@ -346,7 +353,30 @@ def _table(
     return table[good_rows], labels, int((~good_rows).sum())
 
 
-def _dataset(names: list[str], values: Array, covariance: Array, half: Array) -> xr.Dataset:
+def supported_ends(priors: Sequence[Prior], theta: Array, half: Array) -> Array:
+    """Lower and upper ends of normal intervals of parameters within their supports, shape (2, l).
+
+    Parameters
+    ----------
+    priors : sequence of Prior, length l
+        Where one is log-normal or log-uniform, the interval is normal in the logarithm.
+    theta : ndarray, shape (l,)
+        Estimates.
+    half : ndarray, shape (l,)
+        Half widths, in units of the parameters.
+    """
+    ends = theta + np.outer([-1.0, 1.0], half)
+    for k, prior in enumerate(priors):
+        if isinstance(prior, LogNormal | LogUniform) and theta[k] > 0.0:
+            with np.errstate(over="ignore"):  # a logarithm of which nothing is known
+                ends[:, k] = theta[k] * np.exp(np.array([-1.0, 1.0]) * half[k] / theta[k])
+        ends[:, k] = np.clip(ends[:, k], *prior.support)
+    return ends
+
+
+def _dataset(
+    names: list[str], values: Array, covariance: Array, low: Array, high: Array
+) -> xr.Dataset:
     def variable(numbers: Array, text: str) -> xr.Variable:
         return xr.Variable(
             (schema.PARAMETER,), numbers, {schema.LONG_NAME: text, schema.UNITS: _MIXED}
@@ -358,8 +388,8 @@ def _dataset(names: list[str], values: Array, covariance: Array, half: Array) ->
         {
             schema.ESTIMATE: variable(values, "estimate"),
             schema.SD: variable(np.sqrt(np.diag(covariance)), "standard deviation"),
-            "low": variable(values - half, "lower end of the interval"),
-            "high": variable(values + half, "upper end of the interval"),
+            "low": variable(low, "lower end of the interval"),
+            "high": variable(high, "upper end of the interval"),
             schema.COVARIANCE: xr.Variable(square, covariance, words),
         },
         coords={schema.PARAMETER: names, schema.PARAMETER_COLUMN: names},

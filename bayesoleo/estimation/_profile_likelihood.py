@@ -26,6 +26,7 @@ from bayesoleo._types import Array, Float
 from bayesoleo.error_models._independent import output_counts, staged_variance
 from bayesoleo.errors import InputError, check_level, check_names
 from bayesoleo.estimation._estimate import estimate
+from bayesoleo.estimation._intervals import supported_ends
 from bayesoleo.estimation._objectives import log_prior
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.estimation._problem import EstimationProblem, Held, measured_of
@@ -356,13 +357,14 @@ def _dataset(
     index = [problem.names.index(name) for name in names]
     half = limit * np.sqrt(np.diag(covariance)[index])
     centre = point.theta[index]
+    linear = supported_ends([problem.priors[k] for k in index], centre, half)
     mixed = "unit of each parameter"
     by_parameter = {
         schema.ESTIMATE: (centre, "estimate"),
         "low": (np.array([line.low for line in lines]), "lower limit of the profile"),
         "high": (np.array([line.high for line in lines]), "upper limit of the profile"),
-        "linear_low": (centre - half, "lower limit by linearisation"),
-        "linear_high": (centre + half, "upper limit by linearisation"),
+        "linear_low": (linear[0], "lower limit by linearisation"),
+        "linear_high": (linear[1], "upper limit by linearisation"),
     }
     rows = (schema.PARAMETER, "point")
     attributes = {schema.LONG_NAME: "held value", schema.UNITS: mixed}

@@ -103,6 +103,27 @@ def test_holding_part_of_a_joint_prior_leaves_the_conditional():
     assert prior.sd == pytest.approx(np.sqrt(4.0 - 0.5))
 
 
+def test_intervals_end_at_the_support():
+    """Five samples tell little of three constants of which only one may be negative."""
+    x = np.linspace(0.0, 1.0, 5)
+    y = 0.3 + 0.2 * x + 0.1 * x**2 + np.array([0.3, -0.4, 0.1, 0.5, -0.4])
+    priors = [LogNormal(0.3, 1.5), Uniform(0.0, 2.0), Normal(0.0, 9.0)]
+    problem = FunctionProblem(lambda x, t: t[0] + t[1] * x + t[2] * x**2, x, y, priors, "abc")
+    point = estimate(problem, "be")
+    found = linearised_intervals(problem, point, "posterior")
+    low, high = found["low"].values, found["high"].values
+    assert 0.0 < low[0] < point["a"] < high[0]
+    assert (low[1], high[1]) == (0.0, 2.0)
+    assert low[2] < 0.0 < high[2]
+    assert 0.0 < low[3] < point.variance[0] < high[3]
+    # The ends of a logarithm are as far from it as its deviation says.
+    ratio = 1.959964 * float(found["sd"][0]) / point["a"]
+    np.testing.assert_allclose([low[0], high[0]], point["a"] * np.exp([-ratio, ratio]), rtol=1e-6)
+    lines = profile(problem, point, ["a", "b"])
+    assert (lines["linear_low"].values >= 0.0).all()
+    assert float(lines["linear_high"][1]) <= 2.0
+
+
 def test_profile_of_a_linear_model_is_the_closed_form(line):
     problem, design, point = line
     found = profile(problem, point)
