@@ -28,7 +28,7 @@ from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._function_problem import FunctionProblem
 from bayesoleo.estimation._point_estimate import PointEstimate, to_dataset
 from bayesoleo.estimation._problem import EstimationProblem
-from bayesoleo.model._parameters import Parameter
+from bayesoleo.model._parameters import Parameter, check_start
 from bayesoleo.model._priors import Prior
 from bayesoleo.posterior._comparison import compare
 from bayesoleo.posterior._datatree import block_groups, each_sample, to_datasets
@@ -155,7 +155,7 @@ def parameters_of(given: Mapping[str, Any] | None) -> dict[str, Parameter]:
     Raises
     ------
     InputError
-        If one is neither, or is estimated without a prior.
+        If one is neither, is estimated without a prior, or starts where that has no density.
     """
     if given is not None and not isinstance(given, Mapping):
         raise InputError(
@@ -179,6 +179,7 @@ def parameters_of(given: Mapping[str, Any] | None) -> dict[str, Parameter]:
             )  # fmt: skip
         if item.by_run:
             raise InputError("a function has no runs", key=key, hint="leave by_run out")
+        check_start(name, item)
         found[name] = item
     if not any(item.prior is not None for item in found.values()):
         raise InputError(

@@ -47,8 +47,9 @@ UNKNOWN_SHIFT = (
     "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
     " the estimates"
 )
-#: Shift, error of the motion and of the outputs of a mesh of which nothing is known.
-UNKNOWN_MESH = (float("nan"), float("nan"), np.full((1, 1), np.nan))
+#: Shift, error of the motion and of the outputs of a mesh of which nothing is known, and what a
+#: finer one does to the sum of squares.
+UNKNOWN_MESH = (float("nan"), float("nan"), np.full((1, 1), np.nan), float("nan"))
 #: Error of a motion over its swing below which its estimate resolves nothing more.
 RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
@@ -371,13 +372,14 @@ def fit_model(
         )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
-        shift, error, change = _error_of_mesh(problem, point, predictions, numerics, check_mesh)
+        mesh = _error_of_mesh(problem, point, predictions, numerics, check_mesh)
+        shift, error, change, seen = mesh
         # The mode begins with the estimate, and that on a finer mesh with the last: what is told
         # is where all began.
         begun = mbe.start if begun is None else begun
         steps = problem.predictor.steps
         moved = shift > numerics.policy.mesh_shift
-        if not _wants_finer(problem, point, predictions, numerics, moved, change, check_mesh):
+        if not _wants_finer(problem, point, predictions, numerics, moved, seen, check_mesh):
             mbe, point = replace(mbe, start=begun), replace(point, start=begun)
             return ModelFit(
                 model, problem, mbe, point, predictions, steps, numerics, shift, error, change
@@ -428,10 +430,10 @@ def _error_of_mesh(
     predictions: list[RunPrediction],
     numerics: Numerics,
     check: bool,
-) -> tuple[float, float, Array]:
+) -> tuple[float, float, Array, float]:
     """As :func:`_mesh_shift` gives it, if it is asked for; none where there is no mesh."""
     if not problem.predictor.model.dofs:
-        return 0.0, 0.0, np.zeros((1, 1))
+        return 0.0, 0.0, np.zeros((1, 1)), 0.0
     return _mesh_shift(problem, point, predictions, numerics.policy) if check else UNKNOWN_MESH
 
 
@@ -441,24 +443,24 @@ def _wants_finer(
     predictions: list[RunPrediction],
     numerics: Numerics,
     moved: bool,
-    change: Array,
+    seen: float,
     check: bool,
 ) -> bool:
     """Whether an estimate is to be repeated on half the steps.
 
     That of a model that stands for itself until it moves no more; of long transients also until no
-    difference shows in what the model leaves: the squares of the change alone. Of a model that is
-    only compared with others, what they do to the sum of squares through the residual counts too.
+    difference shows in what the model leaves (``seen``). Of a model that is only compared with
+    others this is all that is asked.
     """
     steps, long = problem.predictor.steps, _can_be_coarser(problem)
     if long and steps < WHOLE and not point.status.ok:
         return True  # steps may be so long that no solution is found, or lost on the way
     if not check:
         return long and steps < MOST_COMPARED and _shows(problem, point, predictions, numerics)
-    if long and not np.isfinite(change).all():
+    if long and not np.isfinite(seen):
         moved = steps < WHOLE
     elif long and steps < MOST_COMPARED:
-        moved = moved or _visible(problem, point, np.square(change)) > numerics.policy.unseen
+        moved = moved or seen > numerics.policy.unseen
     return moved and numerics.steps is None and 2 * steps <= MOST_STEPS
 
 
@@ -536,20 +538,34 @@ def _squares(
 ) -> float:
     """Largest change of the sum of squares by better predictions, over the variances of what is
     left: ``d.d + |2 r.d|`` of their changes ``d`` and residuals ``r``."""
-    squares, along = np.square(_change(predictions, others)), 0.0
-    for r, (run, here, other) in enumerate(
-        zip(problem.predictor.runs, predictions, others, strict=True)
+    squares, along = 0.0, 0.0
+    for record, run, here, other in zip(
+        problem.predictor.records, problem.predictor.runs, predictions, others, strict=True
     ):
-        products = problem.kept(r, (run.measured - other) * (other - here.y)).sum(axis=1)
-        shown = products * _is_shown(run.measured, squares[r])
-        along += float(np.sum(2.0 * shown / np.maximum(point.variance, 1e-300)))
-    return _visible(problem, point, squares) + abs(along)
+        own = changed_squares(run.measured, here.y, other, point.variance, weights(record))
+        squares, along = squares + own[0], along + own[1]
+    return squares + abs(along)
 
 
-def _visible(problem: CampaignProblem, point: PointEstimate, squares: Array) -> float:
-    """The same of mean squares ``(runs, outputs)`` of the change."""
-    rows = zip(problem.predictor.runs, squares, strict=True)
-    return sum(visible(run.measured, row, point.variance) for run, row in rows)
+def changed_squares(
+    measured: Array, here: Array, other: Array, variance: Array, weight: Array
+) -> tuple[float, float]:
+    """``d.d`` and ``2 r.d`` of a change ``d`` of outputs to residuals ``r``, over variances.
+
+    Parameters
+    ----------
+    measured, here, other : ndarray, shape (ny, N)
+        Measured outputs, those predicted, and those that they change to.
+    variance : ndarray, shape (ny,)
+        Of what a model leaves.
+    weight : ndarray, shape (N,)
+        One for samples that count, zero for others.
+    """
+    squares = np.mean((other - here) ** 2, axis=1)
+    products = np.sum(np.where(weight > 0, (measured - other) * (other - here), 0.0), axis=1)
+    shown = products * _is_shown(measured, squares)
+    along = float(np.sum(2.0 * shown / np.maximum(variance, 1e-300)))
+    return visible(measured, squares, variance), along
 
 
 def visible(measured: Array, squares: Array, variance: Array) -> float:
@@ -612,9 +628,10 @@ def _mesh_shift(
     point: PointEstimate,
     predictions: list[RunPrediction],
     policy: SearchPolicy,
-) -> tuple[float, float, Array]:
+) -> tuple[float, float, Array, float]:
     """Shift of the estimate that the discretisation causes, in standard deviations, the largest
-    error of a motion over its swing, and what a finer mesh changes of each output of each run."""
+    error of a motion over its swing, what a finer mesh changes of each output of each run, and of
+    the sum of squares."""
     coarse = problem.predictor
     halved = _halved(problem, point)
     if halved is None:
@@ -625,10 +642,12 @@ def _mesh_shift(
     better = [outputs_of(run, one) for run, one in zip(coarse.runs, found, strict=True)]
     known = [y for y in better if y is not None and np.isfinite(y).all()]
     if len(known) < len(better):
-        return shift, error, _change(predictions, halved)
+        changes = _squares(problem, predictions, halved, point)
+        return shift, error, _change(predictions, halved), changes
     missed = _shift(problem, point, predictions, known)
     clearly = missed > max(policy.missed_factor * shift, policy.mesh_shift)
-    return (missed if clearly else shift), error, _change(predictions, known)
+    changes = _squares(problem, predictions, known, point)
+    return (missed if clearly else shift), error, _change(predictions, known), changes
 
 
 def _change(predictions: list[RunPrediction], better: list[Array]) -> Array:

@@ -43,11 +43,12 @@ class SearchPolicy:
     )
     unseen: float = _value(
         1.0,
-        "Change of the outputs on finer steps of a long transient, squared and summed over its"
-        " samples, in variances of what a model leaves, below which models are compared on a mesh;"
-        " what it changes of the squares along the residual is added.",
-        "twice the log likelihood of the present model changes by less; the part that an effect"
-        " explains may change by more, about twice its root",
+        "Change of the residual sum of squares of a long transient by finer steps, in variances of"
+        " what a model leaves, that is accepted: the sum of the squared changes of the outputs plus"
+        " the size of twice their product with the residual.",
+        "twice the log likelihood of the present model changes by at most this. A candidate that"
+        " reduces the sum of squares by a variances may have its reduction wrong by up to"
+        " 2 sqrt(a) + 1 of them",
     )
     missed_factor: float = _value(
         3.0,

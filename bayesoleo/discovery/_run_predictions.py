@@ -27,7 +27,8 @@ from bayesoleo.discovery._fit import (
     MOST_COMPARED,
     RESOLUTION,
     ModelFit,
-    visible,
+    changed_squares,
+    weights,
     without_masked,
 )
 from bayesoleo.discovery._policy import SearchPolicy
@@ -218,11 +219,11 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
         finer = _single(fit, record, 2 * steps, predictor)
         if found.status.ok:
             solved = finer.set_anchor(found.vector)[0] is Status.CONVERGED
-            halved = finer.simulate(found.vector[None], 0).y[0] if solved else np.nan
-            change = np.mean((halved - found.y) ** 2, axis=1)
+            halved = finer.simulate(found.vector[None], 0).y[0] if solved else np.array(np.nan)
             left = np.mean((run.measured - found.y) ** 2, axis=1)
-            if np.isfinite(change).all():
-                if visible(run.measured, change, left) <= fit.policy.unseen:
+            if np.isfinite(halved).all():
+                own = changed_squares(run.measured, found.y, halved, left, weights(record))
+                if own[0] + abs(own[1]) <= fit.policy.unseen:
                     return found
             elif steps >= WHOLE:  # nothing says that finer steps would be better
                 return found

@@ -425,8 +425,8 @@ _LEAK = "memory/10000"
 
 # Without a rise the slider is rigid, and no deflection tells its force: a rise of zero stands for a
 # ten-thousandth of the gap. A rise of a hundredth of the gap changes by a part in 20,000. With
-# neither there is no length at all; that is Coulomb friction.
-_RISE = "sqrt(rise**2 + (gap/10000)**2)"
+# neither this is Coulomb friction, which builds up over a hundred-thousandth of the stroke's range.
+_RISE = "sqrt(rise**2 + (gap/10000)**2 + ((highest_position - lowest_position)/100000)**2)"
 # The memory is scaled by all that can deflect, so that no gap is singular: without one it is an
 # elastic slider, the Jenkins element.
 _LARGEST = f"(gap + {_RISE})"

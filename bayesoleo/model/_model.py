@@ -22,7 +22,7 @@ from bayesoleo._schema import reserved
 from bayesoleo._units import Unit, in_si, parse_unit
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model._expressions import derivative_symbol, parse, split_derivative, symbol
-from bayesoleo.model._parameters import Condition, Coordinate, Dof, Output, Parameter
+from bayesoleo.model._parameters import Condition, Coordinate, Dof, Output, Parameter, check_start
 
 type Text = str | float | sp.Expr
 type Terms = Mapping[str, sp.Expr]
@@ -171,6 +171,7 @@ class Model:
                     value=parameter,
                     hint='write Parameter(1.0, "kg", sd=0.1)',
                 )
+            check_start(name, parameter)
 
     @property
     def _dynamic(self) -> tuple[str, ...]:

@@ -147,6 +147,36 @@ class Parameter:
         )
 
 
+def check_start(name: str, parameter: Parameter) -> None:
+    """Refuse a start on a limit at which the prior has no density.
+
+    A log-normal parameter that starts at zero has no logarithm, and no estimate leaves there.
+
+    Parameters
+    ----------
+    name : str
+        Of the parameter, for the message.
+    parameter : Parameter
+
+    Raises
+    ------
+    ModelError
+        If it starts there.
+    """
+    prior, value = parameter.prior, parameter.value
+    if prior is None or value not in prior.support or np.isfinite(prior.log_density(value)):
+        return
+    low, high = prior.support
+    where = " and ".join(
+        [f"above {low:g}"] * bool(np.isfinite(low)) + [f"below {high:g}"] * bool(np.isfinite(high))
+    )
+    raise ModelError(
+        f"parameter {name!r} starts where its prior has no density",
+        value=value,
+        hint=f"start {where}, say at the prior's mean: Parameter({prior.mean:.6g}, …)",
+    )
+
+
 @dataclass(frozen=True)
 class Dof:
     """A degree of freedom.

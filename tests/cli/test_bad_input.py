@@ -98,6 +98,11 @@ BAD_MODELS = {
         MODEL.replace("relative_sd=0.5", "bounds=(0.0, 10.0)"),
         "line 11: the bounds exclude the start (got 2000.0); choose a value between 0 and 10",
     ),
+    "start without a logarithm": (
+        "from bayesoleo.model import LogNormal\n"
+        + MODEL.replace("2e3", "0.0").replace("relative_sd=0.5", "prior=LogNormal(2e3, 0.5)"),
+        "parameter 'stiffness' starts where its prior has no density (got 0.0); start above 0",
+    ),
     "unknown keyword": (
         MODEL.replace("relative_sd=0.5", "rel_sd=0.5"),
         "did you mean relative_sd?",

@@ -142,6 +142,61 @@ def test_a_change_along_what_is_left_counts(fitted):
     assert seen(0.0 * along) == 0.0
 
 
+def by_finer_steps(predictor, theta, y, variance):
+    """``d.d`` and ``|2 r.d|`` of twice as many steps than a prediction's, over the variance."""
+    finer = Predictor(predictor.model, predictor.records, steps=2 * predictor.steps, jobs=1)
+    finer.set_anchor(theta)
+    other, measured = finer.simulate(theta[None], 0).y[0], predictor.runs[0].measured
+    change = other - y
+    return np.sum(change**2) / variance, abs(np.sum(2 * (measured - other) * change)) / variance
+
+
+def with_limit(fit, unseen):
+    """A fit under another policy."""
+    policy = replace(fit.policy, unseen=unseen)
+    return replace(fit, numerics=replace(fit.numerics, policy=policy))
+
+
+@pytest.mark.parametrize("fitted", ["oscillator", "lag"], indirect=True)
+def test_a_mesh_is_refused_by_what_it_changes_along_the_residual(fitted):
+    """Alone: the squares of the change are below the limit."""
+    _, _, fit = fitted
+    chosen = for_comparison(with_limit(fit, np.inf))
+    assert chosen.steps == COARSEST
+    y, variance = chosen.predictions[0].y, fit.point.variance[0]
+    change, measured = fit.predictions[0].y - y, fit.predictor.runs[0].measured
+    squares = np.sum(change**2) / variance
+    along = abs(np.sum(2 * (measured - fit.predictions[0].y) * change)) / variance
+    # A limit between both: a mesh of which only the change counted would do.
+    limits = [squares + part * along for part in (0.5, 1.01)]
+    found = [for_comparison(with_limit(fit, unseen)).steps for unseen in limits]
+    assert found[0] > COARSEST
+    assert found[1] == COARSEST
+
+
+@pytest.mark.parametrize("fitted", ["oscillator", "lag"], indirect=True)
+def test_an_estimate_and_a_hold_out_run_are_refined_along_the_residual(fitted):
+    name, truth, fit = fitted
+    free = replace(fit.numerics, policy=replace(fit.policy, unseen=np.inf, mesh_shift=np.inf))
+    coarse = fit_model(fit.model, fit.records, free)
+    assert coarse.steps == COARSEST
+    theta = coarse.problem.full(coarse.point.theta[None])[0]
+    pair = by_finer_steps(
+        coarse.predictor, theta, coarse.predictions[0].y, coarse.point.variance[0]
+    )
+    *_, seen = _fit._mesh_shift(coarse.problem, coarse.point, coarse.predictions, free.policy)
+    # The finest solution of a motion is not that of half the steps: both are near.
+    assert seen == pytest.approx(sum(pair), rel=0.5)
+    between = replace(free.policy, unseen=pair[0] + 0.3 * (seen - pair[0]))
+    assert fit_model(fit.model, fit.records, replace(free, policy=between)).steps > COARSEST
+    other = replace(record(KINDS[name][0], truth, seed=3), label="other")
+    (held,) = predict_held_out(coarse, [other])
+    left = np.mean((held.predictor.runs[0].measured - held.y) ** 2)
+    squares, along = by_finer_steps(held.predictor, held.vector, held.y, left)
+    (finer,) = predict_held_out(with_limit(coarse, squares + 0.5 * along), [other])
+    assert finer.predictor.steps > held.predictor.steps
+
+
 def test_a_candidate_is_refined_where_its_steps_show(fitted):
     """Twice as many steps, and all of them, change little of what it leaves, whatever it began
     with."""
@@ -210,6 +265,9 @@ def test_a_hold_out_run_whose_finer_steps_are_not_solved(fitted, coarse, monkeyp
     """On long steps nothing is known of them, and it goes on; on short ones it ends."""
     name, truth, fit = fitted
     other = replace(record(KINDS[name][0], truth, seed=3), label="other")
+    if coarse:
+        numerics = replace(fit.numerics, policy=replace(fit.policy, unseen=np.inf))
+        fit = fit_model(fit.model, fit.records, numerics)
     assert (fit.steps < WHOLE) == coarse
     failing(monkeypatch, lambda steps, call: steps == 2 * fit.steps and call == 1)
     (found,) = predict_held_out(fit, [other])

@@ -244,14 +244,18 @@ def test_places_of_terms_and_between_bodies_read_as_such():
 # -- backlash, lags, gains -------------------------------------------------------------------------
 
 
+def _slider_values(model: Model, gap: float, rise: float) -> dict[sp.Symbol, float]:
+    """Constants of a slider of unit friction, and of the motion that it was made for."""
+    fixed = {name: item.value for name, item in model.parameters.items() if item.fixed}
+    own = {"": 1.0, "_gap": gap, "_rise": rise}
+    own = {f"backlash_friction{name}": value for name, value in own.items()}
+    return {symbol(name): value for name, value in (fixed | own).items()}
+
+
 def _friction_along(x, v, times, gap: float, rise: float):
     """Force over its amplitude along a motion, by SciPy from the effect's own equation."""
     model = find_effect("backlash_friction").extend(system("duffing"), "position", POSITION).model
-    values = {
-        symbol("backlash_friction"): 1.0,
-        symbol("backlash_friction_gap"): gap,
-        symbol("backlash_friction_rise"): rise,
-    }
+    values = _slider_values(model, gap, rise)
     state, velocity = symbol("backlash_friction_memory"), symbol("dot(position)")
     equation = model.equation("backlash_friction_memory").xreplace(values)
     rate = sp.lambdify([state, velocity], -equation.subs(derivative_symbol(state.name, 1), 0))
@@ -292,7 +296,7 @@ def _marched(x, friction: float, gap: float, rise: float):
     return friction * (deflection - np.clip(deflection, -gap, gap)) / rise
 
 
-LIMITS = [(0.003, 1e-3), (0.0, 2e-3), (1e-7, 5e-4), (0.002, 1e-5), (0.003, 0.0)]
+LIMITS = [(0.003, 1e-3), (0.0, 2e-3), (1e-7, 5e-4), (0.002, 1e-5), (0.003, 0.0), (0.0, 0.0)]
 
 
 @pytest.mark.parametrize(("gap", "rise"), LIMITS)
@@ -303,10 +307,27 @@ def test_backlash_is_its_slider_without_gap_and_without_rise(gap, rise):
     x = amplitude * np.sin(omega * times)
     v = lambda t: amplitude * omega * np.cos(omega * t)  # noqa: E731
     force = _friction_along(x, v, times, gap, rise)
-    # A rigid slider is one whose rise is far below the motion between samples, 1e-5.
-    error = force - _marched(x, 1.0, gap, max(rise, 1e-9))
+    # A rigid slider is one whose rise is far below the motion between samples, 1e-5: here a
+    # hundred-thousandth of the range.
+    error = force - _marched(x, 1.0, gap, max(rise, 2e-7))
     # Where a stiff slider is caught or let go, a sample's instant is a visible part of the rise.
     assert np.mean(np.abs(error)) < 2e-3
+
+
+def test_backlash_without_gap_and_rise_has_a_force_and_derivatives():
+    """It is Coulomb friction: zero over zero before."""
+    model = find_effect("backlash_friction").extend(system("duffing"), "position", POSITION).model
+    force = model.equations["position"]["backlash_friction"]
+    equation = model.equation("backlash_friction_memory")
+    values = _slider_values(model, 0.0, 0.0)
+    shapes = [symbol("backlash_friction_gap"), symbol("backlash_friction_rise")]
+    state = symbol("backlash_friction_memory")
+    at = {state: 0.5, symbol("dot(position)"): 0.1, derivative_symbol(state.name, 1): 0.0}
+    for expression in (force, equation):
+        for one in (expression, *(sp.diff(expression, name) for name in (*shapes, state))):
+            found = complex(one.xreplace(values).xreplace(at).doit())
+            assert np.isfinite(found)
+    assert float(force.xreplace(values).xreplace(at)) == pytest.approx(0.5)
 
 
 def test_a_first_order_lag_answers_a_sine_as_it_should(scales):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import sympy as sp
 
+from bayesoleo._session.function_work import parameters_of
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Condition, LogNormal, Model, Normal, Output, Parameter
 from bayesoleo.model._expressions import derivative_symbol, symbol
@@ -59,6 +60,27 @@ def test_what_is_wrong_is_named(changes, message):
 def test_bad_parameters_are_refused(arguments, message):
     with pytest.raises(ModelError, match=message):
         Parameter(**arguments)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda start: declare(parameters={**declare().parameters, "k": start}),
+        lambda start: declare().with_parameters(slope=start),
+        lambda start: parameters_of({"slope": start}),
+    ],
+)
+def test_a_start_without_a_logarithm_is_refused_by_name(use):
+    start = Parameter(0.0, prior=LogNormal(3400.0, 0.7))
+    words = r"parameter '\w+' starts where its prior has no density \(got 0.0\); start above 0"
+    with pytest.raises(ModelError, match=words + r", say at the prior's mean: Parameter\(4343"):
+        use(start)
+
+
+def test_a_start_on_a_limit_that_its_prior_includes_is_kept():
+    assert (
+        declare().with_parameters(c=Parameter(0.0, bounds=(0.0, 2.0))).parameters["c"].value == 0.0
+    )
 
 
 def test_priors_follow_from_what_is_stated():
