@@ -86,8 +86,9 @@ def assess(
 
 
 def _numbers(data: xr.Dataset) -> xr.Dataset:
-    """The variables with one number for each output and run."""
-    return data[[name for name, item in data.items() if item.ndim == 2]]
+    """The variables with one number for each output and run, and offsets of outputs."""
+    offsets = ("offset", "offset_sd")
+    return data[[name for name, item in data.items() if item.ndim == 2 or name in offsets]]
 
 
 def _drawn(series: list[Series], figure: Path | None, run: str | None) -> list[Series]:
@@ -146,6 +147,13 @@ def predict(
         Path | None,
         options.figure("Draw bands and transforms; one file an output, its name added."),
     ] = None,
+    common_offset: Annotated[
+        bool,
+        typer.Option(
+            "--common-offset",
+            help="Add to outputs that drift the offset that the fitted runs have in common.",
+        ),
+    ] = False,
     *,
     chosen: Settings,
     as_json: options.Json = False,
@@ -177,6 +185,7 @@ def predict(
         draws=draws,
         seed=chosen.seed,
         jobs=chosen.jobs,
+        common_offset=common_offset,
     )
     if as_json:
         shell.print_json(_numbers(found.data).drop_vars(schema.TIME).to_dict())

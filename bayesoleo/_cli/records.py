@@ -270,6 +270,13 @@ def simulate(
             help="From a result: simulate with so many draws of its posterior.",
         ),
     ] = None,
+    common_offset: Annotated[
+        bool,
+        typer.Option(
+            "--common-offset",
+            help="Add to outputs that drift the offset common to the runs fitted by the result.",
+        ),
+    ] = False,
     *,
     chosen: Settings,
     as_json: options.Json = False,
@@ -309,7 +316,9 @@ def simulate(
         )
     changed = pairs(values or [], "--set") or None
     made_from = read_tree(source) if from_result else load_model(source)
-    more = {"noise": amounts} if amounts else {}
+    more: dict[str, Any] = {"noise": amounts} if amounts else {}
+    if common_offset:
+        more["common_offset"] = True
     with only_writer(out):
         folder = workflow.simulate(
             made_from, like, chosen, out=out, values=changed, draws=draws, **more

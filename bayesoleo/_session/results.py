@@ -42,6 +42,7 @@ from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.task import reduce
 from bayesoleo.assessment._assess import assess
 from bayesoleo.errors import InputError, ResultsError, check_path
+from bayesoleo.estimation._baselines import baselines_in, table
 from bayesoleo.estimation._indifference_regions import indifference
 from bayesoleo.estimation._profile_likelihood import profile
 from bayesoleo.estimation._sampling_distribution import sampling_distribution
@@ -77,6 +78,16 @@ class Stored(Showing):
         names = pd.Index(point[schema.PARAMETER].values.astype(str), name=schema.PARAMETER)
         return pd.DataFrame({key: point[key].values for key in keys}, index=names)
 
+    @property
+    def offsets(self) -> pd.DataFrame:
+        """Offsets of outputs that drift, as far as the fitted runs have them in common, SI.
+
+        The mean of such an output is an unknown of each run, so that a prediction of another one
+        lacks the offset of its sensor; ``predict(..., common_offset=True)`` adds it. Columns are
+        ``offset``, ``sd`` (of it in another run), ``unit`` and the ``runs`` that it follows from.
+        """
+        return table(baselines_in(self.tree[schema.POINT].to_dataset())).to_dataframe()
+
     def predict(self, data: Any = None, **options: Any) -> Result:
         """Predict runs, or a function at other inputs, with intervals.
 
@@ -86,7 +97,7 @@ class Stored(Showing):
             Of a campaign: another one; by default the runs of this one, those held out too. Of a
             function: its inputs; by default those of the data.
         **options
-            Of a campaign those of ``predict``, as ``runs`` and ``level``; of
+            Of a campaign those of ``predict``, as ``runs``, ``level`` and ``common_offset``; of
             a function ``level``, and ``noise=False`` for the interval of the function itself.
 
         Returns

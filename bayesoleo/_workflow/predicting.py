@@ -28,6 +28,13 @@ from bayesoleo.discovery._fit import weights
 from bayesoleo.discovery._fit_and_hold_out_error import compared
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.errors import InputError, check_level
+from bayesoleo.estimation._baselines import (
+    Baseline,
+    added_text,
+    baselines_in,
+    check_baselines,
+    with_common_baselines,
+)
 from bayesoleo.estimation._nuisance import uncertain_conditions
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import without_invented
@@ -40,6 +47,8 @@ from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 STEPS, POINTS = 512, 200
 #: Bins of the probability integral transform.
 BINS = 20
+#: Attribute that tells which offsets were added.
+ADDED = "added"
 _NUMBERS = {
     "rms": ("root mean square of what was measured less the mean of the prediction", True),
     "bias": ("mean of it", True),
@@ -87,6 +96,7 @@ def predict(
     solver: str = COLLOCATION,
     steps: int = STEPS,
     jobs: int | None = None,
+    common_offset: bool = False,
 ) -> LabelledResult:
     """Predict runs from a result and hold the prediction against what was measured.
 
@@ -110,6 +120,9 @@ def predict(
         How runs are solved.
     jobs : int, optional
         Threads.
+    common_offset : bool, optional
+        Add to outputs that drift the offset that the fitted runs have in common, with its
+        uncertainty; a fitted run has its own. Nothing is added by default.
 
     Returns
     -------
@@ -120,12 +133,13 @@ def predict(
         draws without a solution, which are left out;
         ``pit(output, run, bin)``, a histogram that is flat where the prediction is calibrated;
         ``time(run, point)``, and ``mean``, ``low``, ``high`` and ``measured``
-        ``(output, run, point)`` over the first period, or the whole of a transient.
+        ``(output, run, point)`` over the first period, or the whole of a transient. With
+        ``common_offset`` what was added is in ``offset`` and ``offset_sd`` ``(output)``.
 
     Raises
     ------
     InputError
-        If there is no such run, or a run cannot be predicted.
+        If there is no such run, a run cannot be predicted, or no output has a common offset.
 
     References
     ----------
@@ -141,6 +155,10 @@ def predict(
     # As inputs the channels count as far as they did in the fit.
     given = [name for name, c in campaign.campaign.channels.items() if c.bandwidth is not None]
     chosen, _ = without_invented(used, chosen, given)
+    added = baselines_in(tree[schema.POINT].to_dataset()) if common_offset else []
+    if common_offset:
+        check_baselines(added, used)
+        chosen = with_common_baselines(chosen, added)
     records = uncertain_conditions(used).complete(chosen)
     found = [
         _one_run(used, record, known, rng, level, scheme, solver, steps, jobs) for record in records
@@ -150,7 +168,23 @@ def predict(
     ]
     data = _dataset(used, records, found)
     data.attrs = {"level": level, "draws": draws, "model": used.name}
+    if added:
+        data = _with_added(data, added)
     return LabelledResult(data, forecast_text(data))
+
+
+def _with_added(data: xr.Dataset, added: Sequence[Baseline]) -> xr.Dataset:
+    """Also what was added to each output, and the sentences that say so."""
+    by_output = {one.output: one for one in added}
+    for key, of in (("offset", "value"), ("offset_sd", "sd")):
+        values = [
+            getattr(by_output[name], of) if name in by_output else 0.0
+            for name in data[schema.OUTPUT].values
+        ]
+        text = "offset added to runs that were not fitted" + ", sd" * (of == "sd")
+        data[key] = variable((schema.OUTPUT,), np.array(values), text, "output's SI unit")
+    data.attrs[ADDED] = added_text(added)
+    return data
 
 
 def draws_of(tree: xr.DataTree, number: int, rng: np.random.Generator) -> Known:
@@ -400,6 +434,8 @@ def forecast_text(data: xr.Dataset) -> str:
             ]
             rows.append([str(output), str(run), *cells])
     lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
+    if data.attrs.get(ADDED):
+        lines.append(str(data.attrs[ADDED]))
     for run in data[schema.RUN].values:
         failed = json.loads(str(data["failed"].sel(run=run).values))
         if failed:

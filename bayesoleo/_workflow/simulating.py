@@ -23,10 +23,18 @@ from bayesoleo._workflow.model_files import from_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, choose_drive, reduce
 from bayesoleo.data._campaign import CampaignData, SimulatedRun, write_campaign
+from bayesoleo.data._disturbances import baseline_of
 from bayesoleo.effects._catalogue import find_effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.errors import InputError, ResultsError
-from bayesoleo.estimation._nuisance import uncertain_conditions
+from bayesoleo.estimation._baselines import (
+    Baseline,
+    added_text,
+    baselines_in,
+    check_baselines,
+    with_common_baselines,
+)
+from bayesoleo.estimation._nuisance import error_of, uncertain_conditions
 from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._records import Record
@@ -95,6 +103,7 @@ def simulate_like(
     scheme: str,
     steps: int | None,
     solver: str = COLLOCATION,
+    about: str = "",
 ) -> Path:
     """Write a campaign with the runs, inputs and conditions of another.
 
@@ -120,6 +129,8 @@ def simulate_like(
         Steps of the mesh.
     solver : str
         See :func:`~bayesoleo.prediction.periodic_orbit`.
+    about : str
+        What else the description says.
 
     Returns
     -------
@@ -142,11 +153,17 @@ def simulate_like(
     return write_campaign(
         out,
         name=f"{campaign.name} simulated",
-        description=f"Simulated with {model.name} like {campaign.name}.{_how_well(errors)}",
+        description=f"Simulated with {model.name} like {campaign.name}.{_how_well(errors)}"
+        + (f" {_sentence(about)}" if about else ""),
         controlled=campaign.controlled if campaign.controlled in channels else None,
         channels=channels,
         runs=runs,
     )
+
+
+def _sentence(text: str) -> str:
+    """Lines as sentences."""
+    return " ".join(f"{line[0].upper()}{line[1:]}." for line in text.splitlines())
 
 
 def _how_well(errors: Sequence[float]) -> str:
@@ -246,6 +263,7 @@ def simulate(
     values: Mapping[str, float] | None = None,
     draws: int | None = None,
     noise: Mapping[str, float] | None = None,
+    common_offset: bool = False,
 ) -> Path:
     """Simulate a campaign with the runs, inputs and conditions of another.
 
@@ -265,6 +283,10 @@ def simulate(
         Simulate with so many draws of the result's posterior, each a copy of every run.
     noise : mapping of str to float, optional
         Standard deviations by channel, SI, instead of the measured ones.
+    common_offset : bool, optional
+        Add to outputs that drift the offset that the runs fitted by the result have in common; a
+        fitted run has its own. The description of the new campaign states it. Each draw of the
+        posterior has a draw of it. Nothing is added by default.
 
     Returns
     -------
@@ -274,7 +296,7 @@ def simulate(
     Raises
     ------
     InputError
-        If a name is unknown, or the model cannot be solved.
+        If a name is unknown, the model cannot be solved, or no output has a common offset.
     """
     folder = check_writable(out)
     reduced = reduce(campaign, jobs=settings.jobs)
@@ -284,10 +306,18 @@ def simulate(
         sets: list[dict[str, float]] = [{}]
     else:
         model, sets = model_of(source), parameter_sets(source, draws, settings.seed)
+    records, added = reduced.records, list[Baseline]()
+    if common_offset:
+        point = {} if isinstance(source, Model) else source.children
+        added = baselines_in(point[schema.POINT].to_dataset()) if point else []
+        check_baselines(added, model)
+        records = with_common_baselines(records, added)
+        if draws is not None:
+            sets = [_with_errors(one, added, settings.seed, k) for k, one in enumerate(sets)]
     return simulate_like(
         model,
         reduced.campaign,
-        uncertain_conditions(model).complete(reduced.records),
+        uncertain_conditions(model).complete(records),
         merged(sets, values, model),
         out=folder,
         noise=noise,
@@ -295,7 +325,17 @@ def simulate(
         scheme=settings.scheme,
         solver=settings.solver,
         steps=settings.steps,
+        about=added_text(added),
     )
+
+
+def _with_errors(
+    values: Mapping[str, float], added: Sequence[Baseline], seed: int, draw: int
+) -> dict[str, float]:
+    """A draw with errors of common offsets, which runs that were fitted have of their own."""
+    rng = np.random.default_rng([seed, draw])
+    errors = {error_of(baseline_of(one.output)): float(rng.standard_normal()) for one in added}
+    return {**errors, **values}
 
 
 #: The model that the demonstration fits, and the effect that it lacks.

@@ -27,6 +27,12 @@ from bayesoleo.discovery._run_predictions import Prediction, predict_fitted
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._summary import in_words, titles_of
 from bayesoleo.error_models._base import ErrorModel, RunSamples
+from bayesoleo.estimation._baselines import (
+    ATTRIBUTE,
+    common_baselines,
+    notes_on,
+    to_attribute,
+)
 from bayesoleo.estimation._point_estimate import to_dataset
 from bayesoleo.model._parameters import Coordinate
 from bayesoleo.posterior._datatree import (
@@ -223,6 +229,11 @@ def records_tree(records: Sequence[Record], campaign: CampaignData) -> dict[str,
 def point_group(fit: ModelFit) -> xr.Dataset:
     """The group ``point``, with the mesh on which it was found and what that may have moved."""
     point = to_dataset(fit.point, mbe=fit.mbe, units=_units(fit))
+    offsets = common_baselines(fit.problem, fit.point.theta, fit.point.covariance)
+    notes = [*fit.point.notes, *(fit.doubts if fit.model.dofs else []), *notes_on(offsets)]
+    point.attrs["notes"] = json.dumps(notes, ensure_ascii=False)
+    if offsets:
+        point.attrs[ATTRIBUTE] = to_attribute(offsets)
     if fit.model.dofs:
         scheme = fit.numerics.scheme
         point.attrs |= {
@@ -231,7 +242,6 @@ def point_group(fit: ModelFit) -> xr.Dataset:
             "steps": fit.steps,
             "mesh_shift": fit.shift,
             "motion_error": fit.motion_error,
-            "notes": json.dumps([*fit.point.notes, *fit.doubts], ensure_ascii=False),
         }
     return point
 

@@ -19,6 +19,7 @@ from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structures import Structure, StructurePosterior
 from bayesoleo.effects._catalogue import titles_for, with_titles
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.estimation._baselines import common_baselines, notes_on
 from bayesoleo.posterior._diagnostics import Samples
 
 #: Structures are listed until their probabilities add up to the first, at most so many; a class is
@@ -81,6 +82,11 @@ def summarise(
             *facts.notes,
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
+            *notes_on(
+                common_baselines(
+                    final.fit.problem, final.fit.point.theta, final.fit.point.covariance
+                )
+            ),
             *_input_noise_notes(final),
             *_sampler_notes(samples),
         ],

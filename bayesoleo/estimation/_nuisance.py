@@ -210,7 +210,7 @@ class Nuisance:
                 conditions={
                     **record.conditions,
                     **{
-                        _sd_of(name): record.condition_sd.get(name, 0.0)
+                        sd_of(name): record.condition_sd.get(name, 0.0)
                         for name in (*self.conditions, *map(baseline_of, self.drifting))
                     },
                 },
@@ -222,7 +222,7 @@ class Nuisance:
 def uncertain_conditions(model: Model) -> Nuisance:
     """The uncertain conditions that a model was extended by."""
     names = model.conditions
-    return Nuisance(tuple(name for name in names if _sd_of(name) in names))
+    return Nuisance(tuple(name for name in names if sd_of(name) in names))
 
 
 def declared_nuisance(
@@ -318,8 +318,14 @@ def _largest(records: Sequence[Record], channel: str) -> float:
     return max(float(np.abs(record.samples[channel]).max()) for record in records)
 
 
-def _sd_of(condition: str) -> str:
+def sd_of(condition: str) -> str:
+    """Name of the condition that holds a run's standard deviation of another condition."""
     return f"{condition}_sd"
+
+
+def error_of(condition: str) -> str:
+    """Name of the unknown error of a condition, in its standard deviations."""
+    return f"{condition}_error"
 
 
 def _with_baseline(model: Model, channel: str) -> Model:
@@ -334,7 +340,7 @@ def _with_baseline(model: Model, channel: str) -> Model:
 
 
 def _uncertain_condition(model: Model, name: str) -> Model:
-    error, sd = f"{name}_error", _sd_of(name)
+    error, sd = error_of(name), sd_of(name)
     declared = model.conditions[name]
     extended = replace(
         model,
