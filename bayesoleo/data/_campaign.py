@@ -573,6 +573,9 @@ def write_campaign(
         raise CampaignError(
             "folder is not empty", file=folder, hint="choose another, or pass overwrite=True"
         )
+    for text in (name, description, *(run.label for run in runs)):
+        if "\0" in text:
+            raise CampaignError("text holds a null character", value=text, hint="leave it out")
     _check_columns(channels)
     files = _file_names([run.label for run in runs])
     text = _head(name, description, controlled, channels)
@@ -584,15 +587,26 @@ def write_campaign(
     return folder
 
 
-#: Folder of files that are being written; and the file by which a process keeps others out.
-_DRAFT, _NOT_COUNTED = ".campaign-draft", (".campaign-draft", ".lock")
+#: Folder of files that are being written, the list of those that are being moved, and the file by
+#: which a process keeps others out.
+_DRAFT, _MOVED, _LOCK = ".campaign-draft", ".campaign-files", ".lock"
+#: Beginning of the names of folders by which ``_storage`` tries whether a folder takes files.
+_TRIAL = ".bayesoleo-"
 
 
 def is_vacant(folder: Path) -> bool:
-    """Whether a new campaign can be written to a folder without touching other files."""
+    """Whether a new campaign can be written to a folder without touching other files.
+
+    Files that a process was moving there when it was killed are no other files.
+    """
     if not folder.exists():
         return True
-    return folder.is_dir() and all(item.name in _NOT_COUNTED for item in folder.iterdir())
+    if not folder.is_dir():
+        return False
+    moved = folder / _MOVED
+    half = moved.read_text(encoding="utf-8").splitlines() if moved.is_file() else []
+    ours = {_DRAFT, _MOVED, _LOCK, *half}
+    return all(item.name in ours or item.name.startswith(_TRIAL) for item in folder.iterdir())
 
 
 @contextmanager
@@ -604,9 +618,13 @@ def _moved_into(folder: Path) -> Iterator[Path]:
         draft.mkdir(parents=True)
         yield draft
         # Last, so that a campaign.toml never stands for runs that are not there yet.
-        for file in sorted(draft.iterdir(), key=lambda path: path.name == FILE):
+        files = sorted(draft.iterdir(), key=lambda path: path.name == FILE)
+        (draft / _MOVED).write_text("\n".join(file.name for file in files), encoding="utf-8")
+        os.replace(draft / _MOVED, folder / _MOVED)
+        for file in files:
             os.replace(file, folder / file.name)
         draft.rmdir()
+        (folder / _MOVED).unlink()
     except OSError as error:
         hint = "choose a folder that you may write to and that has space left"
         problem = f"cannot be written: {error.strerror or error}"

@@ -98,6 +98,9 @@ def get_value(
         raise CampaignError(
             "wrong kind of value", file=FILE, run=run, key=key, value=value, hint=f"write {hint}"
         )
+    if isinstance(value, str) and "\0" in value:  # netCDF cannot keep it
+        problem = "text holds a null character"
+        raise CampaignError(problem, file=FILE, run=run, key=key, value=value, hint=f"write {hint}")
     return float(value) if kind is float else value
 
 

@@ -246,6 +246,12 @@ def test_two_runs_of_the_same_samples(make_campaign):
     assert len(load_campaign(make_campaign(first, table(4.0))).runs) == 2
 
 
+def test_a_null_character_in_a_text(make_campaign):
+    campaign = make_campaign({'label = "a"': 'label = "a\\u0000"'})
+    with pytest.raises(CampaignError, match="key label: text holds a null character"):
+        load_campaign(campaign)
+
+
 def test_two_runs_of_one_label(make_campaign):
     run = TOML[TOML.index("[[runs]]") :]
     with pytest.raises(CampaignError, match="run a, key label: two runs have this label"):

@@ -1,5 +1,6 @@
 """What is written reads back."""
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -7,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from bayesoleo._storage import files
 from bayesoleo.data import SimulatedRun, load_campaign, write_campaign
 from bayesoleo.errors import CampaignError
 
-TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
 NAMES = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=8)
 CHANNELS = {
     "displacement": ("x", "mm"),
@@ -81,6 +83,45 @@ def test_a_full_disk_leaves_no_half_of_a_campaign(tmp_path, monkeypatch):
     with pytest.raises(CampaignError, match="new: cannot be written: No space left on device"):
         write_campaign(tmp_path / "new", name="one", channels=CHANNELS, runs=runs)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("moved", [0, 1, 3])
+def test_what_a_killed_process_was_moving_is_written_anew(tmp_path, monkeypatch, moved):
+    runs = [simulated(label, np.random.default_rng(1)) for label in "abc"]
+    place, done = os.replace, []
+
+    def killed(source, target):
+        if not Path(target).name.startswith("."):
+            if len(done) == moved:
+                raise KeyboardInterrupt
+            done.append(target)
+        place(source, target)
+
+    monkeypatch.setattr("os.replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_campaign(tmp_path, name="one", channels=CHANNELS, runs=runs)
+    monkeypatch.undo()
+    (tmp_path / f"{files._TRIAL}1").mkdir()  # of a process that tried the folder
+    assert not (tmp_path / "campaign.toml").exists()
+    write_campaign(tmp_path, name="two", channels=CHANNELS, runs=runs)
+    assert load_campaign(tmp_path).name == "two"
+    assert not list(tmp_path.glob(".campaign*"))
+
+
+def test_files_of_others_are_spared_beside_those_of_a_killed_process(tmp_path):
+    (tmp_path / ".campaign-files").write_text("a.csv\ncampaign.toml")
+    (tmp_path / "b.csv").write_text("mine")
+    with pytest.raises(CampaignError, match="folder is not empty"):
+        write_campaign(tmp_path, name="one", channels=CHANNELS, runs=[])
+
+
+@pytest.mark.parametrize("place", ["name", "description", "label"])
+def test_a_null_character_is_refused(tmp_path, place):
+    texts = {"name": "one", "description": "", "label": "a"} | {place: "a\0b"}
+    runs = [simulated(texts.pop("label"), np.random.default_rng(1))]
+    with pytest.raises(CampaignError, match="null character"):
+        write_campaign(tmp_path / "new", channels=CHANNELS, runs=runs, **texts)
+    assert not (tmp_path / "new").exists()
 
 
 def test_files_are_not_overwritten(tmp_path):
