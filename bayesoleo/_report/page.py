@@ -351,9 +351,9 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
     summary = _summary(tree)
     units = tables.output_units(tree, summary)
     averaged = reading.averaged_word(tree)
-    figures = _figures(tree, drawing)
-    rounds = list(_rounds(tree, summary, drawing))
-    proposals = list(_proposals(tree, summary, drawing))
+    figures = _figures(tree, summary, drawing)
+    rounds = list(_rounds(summary, figures))
+    proposals = list(_proposals(summary, figures))
     return {
         "summary": summary,
         "attributes": tree.attrs,
@@ -382,7 +382,7 @@ def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
         "diagnostics": tables.diagnostics(tree),
         "diagnostics_by_parameter": tables.diagnostics_by_parameter(tree),
         "point": tables.point_status(tree),
-        "formulas": _formulas(tree),
+        "formulas": figures["formulas"],
         "equations": str(tree.attrs.get(schema.EQUATIONS, "")).strip(),
         "provenance": tables.provenance(tree),
         "figures": figures,
@@ -409,9 +409,7 @@ def _posterior_attributes(tree: xr.DataTree) -> dict[Any, Any]:
     return tree[schema.POSTERIOR].attrs if schema.POSTERIOR in tree.children else {}
 
 
-def _rounds(
-    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
-) -> Iterator[dict[str, Any]]:
+def _rounds(summary: dict[str, Any], figures: Mapping[str, list[Any]]) -> Iterator[dict[str, Any]]:
     """Table, figure and decision of every round."""
     titles = sentences.titles(summary)
     for number, entry in enumerate(summary["rounds"]):
@@ -420,10 +418,7 @@ def _rounds(
             "reason": sentences.reason(entry, titles),
             "table": tables.candidates(entry, titles) if entry["candidates"] else None,
             "failed": tables.failed(entry, titles),
-            "figures": [
-                *drawing.of("the ranking", partial(sections.ranking_figure, tree, number)),
-                *drawing.of("the curve", partial(sections.nonparametric_figure, tree, entry)),
-            ],
+            "figures": [*figures[f"ranking {number}"], *figures[f"curve {number}"]],
         }
 
 
@@ -436,35 +431,58 @@ def _accepted(entry: dict[str, Any], titles: dict[str, str]) -> str:
 
 
 def _proposals(
-    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+    summary: dict[str, Any], figures: Mapping[str, list[Any]]
 ) -> Iterator[dict[str, Any]]:
     """Sentences, table and figure for each set of effects that is left to be told apart."""
-    for entry in summary.get("proposals", []):
+    for number, entry in enumerate(summary.get("proposals", [])):
         yield {
             "lines": proposal_lines(entry, sentences.titles(summary)),
             "table": proposal_table(entry, sentences.titles(summary)),
-            "figures": drawing.of("the next run", partial(sections.proposal_figure, tree, entry)),
+            "figures": figures[f"proposal {number}"],
         }
 
 
+Maker = Callable[[xr.DataTree], list[Any]]
+
+
 def _figures(
-    tree: xr.DataTree, drawing: sections.Drawing
-) -> dict[str, list[sections.CaptionedFigure]]:
-    makers = {
-        "data": ("the data", sections.data_figures),
-        "response": ("the frequency response", sections.response_figures),
-        "fit": ("the fit", sections.fit_figures),
-        "structures": ("the probabilities of structures", sections.structures_figure),
-        "where": ("the residual breakdown", sections.breakdown_figure),
-        "residual": ("the residual", sections.residual_figures),
-        "posterior": ("the posterior", sections.posterior_figures),
-        "predictive": ("the posterior's prediction", sections.predictive_figures),
-        "trace": ("the sampler's chains", sections.trace_figures),
-        "error": ("the error of each run", sections.error_figure),
-    }
+    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+) -> dict[str, list[Any]]:
+    """All that is drawn, by its place on the page; in several processes."""
+    makers = _makers(summary)
     found = process_map(_draw, (tree, _drawing_settings()), list(makers.values()))
     drawing.failed += [text for _, failed in found for text in failed]
     return {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
+
+
+def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
+    """What is drawn in words, and the function that draws it.
+
+    Processes take them from both ends, so that what takes longest stands there.
+    """
+    makers: dict[str, tuple[str, Maker]] = {
+        "residual": ("the residual", sections.residual_figures),
+        "fit": ("the fit", sections.fit_figures),
+        "where": ("the residual breakdown", sections.breakdown_figure),
+        "structures": ("the probabilities of structures", sections.structures_figure),
+        "error": ("the error of each run", sections.error_figure),
+    }
+    for number, entry in enumerate(summary["rounds"]):
+        ranking = partial(sections.ranking_figure, number=number)
+        makers[f"ranking {number}"] = ("the ranking", ranking)
+        curve = partial(sections.nonparametric_figure, entry=entry)
+        makers[f"curve {number}"] = ("the curve", curve)
+    for number, entry in enumerate(summary.get("proposals", [])):
+        proposal = partial(sections.proposal_figure, entry=entry)
+        makers[f"proposal {number}"] = ("the next run", proposal)
+    return makers | {
+        "trace": ("the sampler's chains", sections.trace_figures),
+        "formulas": ("the equations", _formulas),
+        "response": ("the frequency response", sections.response_figures),
+        "data": ("the data", sections.data_figures),
+        "predictive": ("the posterior's prediction", sections.predictive_figures),
+        "posterior": ("the posterior", sections.posterior_figures),
+    }
 
 
 def _drawing_settings() -> dict[str, Any]:
@@ -474,12 +492,9 @@ def _drawing_settings() -> dict[str, Any]:
     return {key: now[key] for key in now if key != "backend" and now[key] != usual.get(key)}
 
 
-Maker = Callable[[xr.DataTree], list[sections.CaptionedFigure]]
-
-
 def _draw(
     shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker]
-) -> tuple[list[sections.CaptionedFigure], list[str]]:
+) -> tuple[list[Any], list[str]]:
     """Figures of one kind, and what could not be drawn; also in another process."""
     (tree, settings), (words, make), drawing = shared, item, sections.Drawing()
     now: Mapping[Any, Any] = matplotlib.rcParams

@@ -80,12 +80,13 @@ def _channel(axes: Axes, tree: xr.DataTree, name: str, run: reading.RunView, las
     else:
         order = position.argsort()
         axes.plot(*reading.thin(position[order], values[order]), color=style.INK, lw=0.4)
-    style.cycles(axes)
     axes.set_ylim(*_limits(scale.factor * data.values))
-    axes.tick_params(labelbottom=last)
-    if not last:
+    if last:
+        style.cycles(axes)
+    else:
+        axes.set_xlim(0.0, 1.0)
+        axes.xaxis.set_visible(False)
         axes.spines["bottom"].set_visible(False)
-        axes.tick_params(bottom=False)
 
 
 def _limits(values: Array) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -18,11 +19,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.markers import TICKDOWN, TICKLEFT
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
 
 from bayesoleo import _schema as schema
+from bayesoleo._types import Array
 from bayesoleo.plots._reading import RunView
 
 # Okabe and Ito (2008), where that is too pale a darker shade: before is vermilion, after is blue,
@@ -98,9 +101,9 @@ def add_axes(figure: Figure, left: float, bottom: float, width: float, height: f
 def name_above(axes: Axes, left: str = "", right: str = "") -> None:
     """Write a bold title on the left of axes, a faint remark on the right."""
     if left:
-        axes.set_title(left, loc="left", fontsize=SMALL, pad=3, fontweight="bold")
+        axes.set_title(left, loc="left", y=1.0, fontsize=SMALL, pad=3, fontweight="bold")
     if right:
-        axes.set_title(right, loc="right", fontsize=SMALL, pad=3, color=FAINT)
+        axes.set_title(right, loc="right", y=1.0, fontsize=SMALL, pad=3, color=FAINT)
 
 
 def row_axes(
@@ -187,15 +190,17 @@ def panels(runs: Sequence[RunView], *, free_x: bool = False) -> Panels:
 
 
 def title(axes: Axes, run: RunView) -> None:
-    """Label on the left, frequency on the right; hold-out runs are marked by weight and word."""
+    """Label on the left, frequency on the right; hold-out runs are marked by weight and word.
+
+    Their height is given: Matplotlib would lay out all numbers of the axes to look for it.
+    """
     held_out = run.role == schema.HOLD_OUT
     text = " · ".join(part for part in ("hold-out" if held_out else "", run.remark) if part)
     width = axes.get_position().width * WIDTH
     label = plain(run.label, max(int((width - 0.065 * len(text)) / 0.085), 6))
-    axes.set_title(label, loc="left", fontsize=SMALL, pad=3, color=INK, fontweight="bold")
-    axes.set_title(
-        text, loc="right", fontsize=SMALL - 0.5, pad=3, color=AFTER if held_out else FAINT
-    )
+    axes.set_title(label, loc="left", y=1.0, fontsize=SMALL, pad=3, color=INK, fontweight="bold")
+    colour = AFTER if held_out else FAINT
+    axes.set_title(text, loc="right", y=1.0, fontsize=SMALL - 0.5, pad=3, color=colour)
 
 
 def label_outside(figure: Figure, x: str, y: str) -> None:
@@ -269,13 +274,49 @@ def _number_left_only(axes: Sequence[Axes], shared: bool) -> None:
     """Numbers on the leftmost panels are enough where the scale is shared."""
     leftmost = min((panel.get_position().x0 for panel in axes), default=0.0)
     for panel in axes:
-        panel.tick_params(labelleft=not shared or panel.get_position().x0 < leftmost + 1e-6)
+        if shared and panel.get_position().x0 > leftmost + 1e-6:
+            places = panel.yaxis.get_major_locator().tick_values(*panel.get_ylim())
+            without_numbers(panel, y=places)
+
+
+#: Where the axis over one period has numbers.
+QUARTERS = {0.0: "0", 0.25: "¼", 0.5: "½", 0.75: "¾", 1.0: "1"}
 
 
 def cycles(axes: Axes) -> None:
     """A horizontal axis over one period."""
     axes.set_xlim(0.0, 1.0)
-    axes.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "¼", "½", "¾", "1"])
+    if axes.xaxis.get_tick_params().get("labelbottom", True):
+        axes.set_xticks(list(QUARTERS), list(QUARTERS.values()))
+    else:
+        without_numbers(axes, x=list(QUARTERS))
+
+
+def without_numbers(
+    axes: Axes, *, x: Sequence[float] | None = None, y: Sequence[float] | None = None
+) -> None:
+    """Ticks at places within the limits of an axis, without numbers, in place of its own.
+
+    They are one artist; an axis has five for each tick, which take most of the time of a figure of
+    many panels.
+    """
+    marks: dict[str, Any] = {"color": FAINT, "ls": "none", "ms": 3, "mew": 0.8, "clip_on": False}
+    if x is not None:
+        axes.xaxis.set_visible(False)
+        inside = _between(x, axes.get_xlim())
+        marks |= {"marker": TICKDOWN, "transform": axes.get_xaxis_transform()}
+        axes.add_artist(Line2D(inside, 0 * inside, **marks))
+    if y is not None:
+        axes.yaxis.set_visible(False)
+        inside = _between(y, axes.get_ylim())
+        marks |= {"marker": TICKLEFT, "transform": axes.get_yaxis_transform()}
+        axes.add_artist(Line2D(0 * inside, inside, **marks))
+
+
+def _between(places: Sequence[float], limits: tuple[float, float]) -> Array:
+    """Places that are within limits."""
+    found = np.asarray(places, dtype=float)
+    return found[(min(limits) <= found) & (found <= max(limits))]
 
 
 def x_name(runs: Sequence[RunView]) -> str:

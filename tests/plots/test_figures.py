@@ -12,13 +12,17 @@ import pytest
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from matplotlib.markers import TICKDOWN, TICKLEFT
+from matplotlib.path import Path
 from matplotlib.text import Text
+from scipy.special import ndtr
 
 from bayesoleo import _schema as schema, plots
 from bayesoleo.errors import InputError
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._discovery import chosen, format_share, similar
 from bayesoleo.plots._estimates import _SHADES
+from bayesoleo.plots._predictions import _quantile
 
 
 def texts(figure):
@@ -143,7 +147,7 @@ def test_of_two_places_the_one_that_was_added_is_marked():
 
 def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo):
     figure = plots.corner(oleo)
-    assert len(figure.axes) == 100
+    assert len(figure.axes) == 55
     assert len(texts(figure)) > 10
     labels = " ".join(texts(figure))
     assert "breakaway" in labels
@@ -158,10 +162,61 @@ def test_long_names_in_a_corner_stay_inside_it_and_apart(oleo):
     figure = plots.corner(tree)
     FigureCanvasAgg(figure).draw()
     below = [axes.xaxis.label.get_window_extent() for axes in figure.axes[-3:]]
-    for box in (*below, *(axes.yaxis.label.get_window_extent() for axes in figure.axes[3::3])):
+    # The lower triangle, row by row.
+    beside = [figure.axes[place].yaxis.label.get_window_extent() for place in (1, 3)]
+    for box in (*below, *beside):
         assert box.x0 > 0
         assert box.y0 > 0
     assert all(left.x1 < right.x0 for left, right in pairwise(below))
+
+
+def test_regions_of_a_corner_hold_the_parts_that_they_say(oleo):
+    rng = np.random.default_rng(5)
+    x = rng.standard_normal((4, 5000))
+    dims = (schema.CHAIN, schema.DRAW)
+    data = {"a": (dims, x), "b": (dims, 0.6 * x + rng.standard_normal(x.shape))}
+    figure = plots.corner(xr.DataTree.from_dict({"posterior": xr.Dataset(data)}))
+    (regions,) = figure.axes[1].collections
+    points = np.column_stack([data["a"][1].ravel(), data["b"][1].ravel()])
+    held = [
+        Path(path.to_polygons()[0]).contains_points(points).mean() for path in regions.get_paths()
+    ]
+    np.testing.assert_allclose(held, [0.865, 0.393], atol=0.04)  # the histogram is smoothed
+
+
+def test_a_region_reaches_the_edge_of_its_panel_where_most_draws_are_there():
+    rng = np.random.default_rng(6)
+    x = rng.exponential(size=(4, 5000))
+    data = {"a": ((schema.CHAIN, schema.DRAW), x)}
+    data["b"] = ((schema.CHAIN, schema.DRAW), rng.standard_normal(x.shape))
+    axes = plots.corner(xr.DataTree.from_dict({"posterior": xr.Dataset(data)})).axes[1]
+    (regions,) = axes.collections
+    assert regions.get_paths()[0].get_extents().x0 < axes.get_xlim()[0]
+
+
+def test_panels_without_numbers_have_ticks_where_those_with_numbers_have_them(oleo):
+    figure = plots.residual(oleo, "force")
+    FigureCanvasAgg(figure).draw()
+    first, inner, last = figure.axes[0], figure.axes[1], figure.axes[-1]
+    assert (first.yaxis.get_visible(), inner.yaxis.get_visible()) == (True, False)
+    assert (last.xaxis.get_visible(), inner.xaxis.get_visible()) == (True, False)
+    marks = {line.get_marker(): line.get_data() for line in inner.lines}
+    low, high = first.get_ylim()
+    numbered = [tick for tick in first.get_yticks() if low <= tick <= high]
+    assert len(numbered) > 1
+    np.testing.assert_allclose(marks[TICKLEFT][1], numbered)
+    np.testing.assert_allclose(marks[TICKDOWN][0], last.get_xticks())
+
+
+def test_the_band_of_averages_is_that_of_the_mixture():
+    rng = np.random.default_rng(7)
+    centres, sd = rng.normal(size=(60, 5)), rng.uniform(0.5, 2.0, 60)
+    for probability in (0.025, 0.5, 0.975):
+        limit = _quantile(centres, sd, probability)
+        reached = ndtr((limit - centres) / sd[:, None]).mean(axis=0)
+        np.testing.assert_allclose(reached, probability, atol=5e-4)
+    # A single draw is a normal distribution, and nothing is left to be found.
+    np.testing.assert_allclose(_quantile(centres[:1], sd[:1], 0.5), centres[0], rtol=1e-12)
 
 
 def test_a_posterior_of_zero_width_is_no_error(oleo):

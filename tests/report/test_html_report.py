@@ -347,6 +347,15 @@ def test_a_browser_draws_one_run(two_runs, tmp_path):
     assert "NaN" not in viewer
 
 
+def test_shortened_paths_are_the_same_but_for_a_hundredth_of_a_point():
+    svg = b'<path d="M 1.23456 2 \nL 3 4.98765 \nL 5 6 \nz\nM 7 8 \nL 9 1 \n" style="a: 1.2345"/>'
+    short = '<path d="M 1.23 2 3 4.98 5 6 \nz\nM 7 8 9 1 \n" style="a: 1.2345"/>'
+    assert sections._short(svg).decode() == short
+    # After a curve, pairs would be further curves.
+    curve = b'<path d="M 1 2 \nQ 3 4 5 6 \nL 7 8 \n"/>'
+    assert sections._short(curve) == curve
+
+
 @pytest.mark.slow
 def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
