@@ -104,6 +104,16 @@ def _registry() -> Any:
 
 
 @cache
+def base_unit(text: str) -> Any:
+    """Unit of a text as pint reads it, in base units, to calculate with; a number where empty.
+
+    Pint raises errors of many types on bad input.
+    """
+    with _lock:
+        return _registry().Quantity(1.0, text or "dimensionless").to_base_units().units
+
+
+@cache
 def parse_unit(name: str) -> Unit:
     """Read a unit.
 

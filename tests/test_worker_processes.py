@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -50,6 +51,21 @@ def test_a_process_is_kept_for_the_next_call(eager):
     again = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(12), 2)}
     assert len(first) == 2
     assert again == first
+
+
+def test_what_a_process_loads_is_kept_out_of_searches_for_garbage(tmp_path):
+    (tmp_path / "lasting.py").write_text("kept = [[number] for number in range(1000)]\n")
+    code = (
+        "import gc; from bayesoleo._worker_processes import load; before = gc.get_freeze_count();"
+        " load(['lasting']); import lasting; loaded = gc.get_freeze_count();"
+        " later = [[]]; load(['lasting']); assert gc.isenabled();"
+        " print(before, loaded - before >= 1000, gc.get_freeze_count() == loaded)"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["0", "True", "True"]
 
 
 def test_short_work_starts_no_process(monkeypatch):

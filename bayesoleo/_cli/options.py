@@ -99,7 +99,7 @@ def of_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., No
         @wraps(command)
         def called(**given: Any) -> None:
             if "quick" in names and "campaign" in given:  # it takes long
-                shell.announce(command.__name__, given)
+                shell.begin(command.__name__, given, search="max_effects" in names)
             chosen = settings(**{name: given.pop(name) for name in names})
             command(**given, chosen=chosen)
 

@@ -295,8 +295,8 @@ def _unfinished(results: Path) -> bool:
     return schema.UNFINISHED in read_attributes(results)
 
 
-def announce(command: str, given: Mapping[str, Any]) -> None:
-    """Say at once that a command has begun: to load numerical libraries takes seconds.
+def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
+    """Say at once that a command has begun, and load numerical libraries, which takes seconds.
 
     Parameters
     ----------
@@ -304,12 +304,20 @@ def announce(command: str, given: Mapping[str, Any]) -> None:
         Its name.
     given : mapping of str to object
         Its arguments and options; ``quiet`` says nothing.
+    search : bool
+        Whether another process will help: it loads them at the same time.
     """
     campaign = given.get("campaign")
-    missing = isinstance(campaign, Path) and not campaign.expanduser().exists()
-    if not given.get("quiet") and not missing:  # an error is told in one line
+    if isinstance(campaign, Path) and not campaign.expanduser().exists():
+        return  # an error is told in one line
+    if not given.get("quiet"):
         of = f" {campaign}" if campaign is not None else ""
         complain(f"{command}{of}: loading libraries")
+    from bayesoleo._worker_processes import load, start_ahead
+
+    if search:
+        start_ahead(jobs=given.get("jobs"))
+    load(["bayesoleo._workflow.closing"])
 
 
 def console() -> Console:

@@ -116,7 +116,7 @@ def close(
         summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
     output = ResultFolder.checked(out)
-    start_ahead(["bayesoleo.discovery._loop", "bayesoleo._report.page"], settings.jobs)
+    start_ahead(jobs=settings.jobs)
     task = prepare(campaign, model, settings, progress=progress)
     _check_aim(task)
     with output.alone():

@@ -148,30 +148,12 @@ def force_effect(
         unit if isinstance(unit, Amplitude) else Amplitude(name, unit, name, f"{id}: {name}")
         for name, unit in parameters.items()
     )
-    states = dict(states or {})
-    texts = [expression, *(state.equation for state in states.values())]
-    used = set[str]().union(*(_names_in(text, id) for text in texts))
-    own = {item.name for item in amplitudes} | {shape.name for shape in shapes} | set(states)
-    check_names(used, own, set(requires), id)
-    check_states(states, used, id)
-    in_force = _names_in(expression, id)
-    check_null(expression, in_force, amplitudes, id)
-    check_unit(expression, in_force, amplitudes, shapes, states, id)
-    if "direction" in used:
-        shapes = (*shapes, _SMOOTHING)
-    return Effect(
-        id=id,
-        family=family,
-        title=title or id.replace("_", " ").capitalize(),
-        formula=formula or _latex(expression, used, id),
-        amplitudes=amplitudes,
-        places=_places_for(used, requires),
-        change=_adding_term(id, expression, states),
-        shapes=shapes,
-        constants=tuple(item for item in _MOTION_CONSTANTS if item.name in used),
-        source=source,
-        applies_to=applies_to or _applies_to(used, requires),
-    )
+    term = AddedTerm(id, expression, tuple((states or {}).items()), requires)
+    term.check(amplitudes, shapes)
+    return term.as_effect(
+        family, amplitudes, formula=formula, title=title, shapes=shapes, source=source,
+        applies_to=applies_to,
+    )  # fmt: skip
 
 
 def resisting_side(model: Model, target: str) -> int:
@@ -181,8 +163,13 @@ def resisting_side(model: Model, target: str) -> int:
 
 
 def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any) -> Effect:
-    """A :func:`force_effect` with one amplitude, after which it is named."""
-    return force_effect(amplitude.name, family, expression, {amplitude.name: amplitude}, **more)
+    """A built-in :func:`force_effect` with one amplitude, after which it is named.
+
+    Its checks are made by the tests: they would take a sixth of the time in which libraries load.
+    """
+    states, requires = more.pop("states", {}), more.pop("requires", ())
+    term = AddedTerm(amplitude.name, expression, tuple(states.items()), requires)
+    return term.as_effect(family, (amplitude,), **more)
 
 
 def _latex(expression: str, used: set[str], effect: str) -> str:
@@ -220,7 +207,7 @@ def transition_velocity(name: str) -> ShapeParameter:
 
 
 #: Velocity over which the sign of a dry friction force changes, where the model states no slope.
-_SMOOTHING = replace(
+SMOOTHING = replace(
     transition_velocity("smoothing"), needed=lambda model: FRICTION_SLOPE not in model.parameters
 )
 
@@ -271,26 +258,92 @@ def _pressure(model: Model) -> sp.Symbol | None:
     return None
 
 
-def _adding_term(
-    effect: str, expression: str, states: Mapping[str, InternalState]
-) -> Callable[[Model, str, Names], Model]:
-    """The change that adds the states and the force."""
+@dataclass(frozen=True)
+class AddedTerm:
+    """The change that adds the states and the force of an effect.
 
-    def change(model: Model, target: str, names: Names) -> Model:
-        place = place_at(model, target)
-        dofs = {own: free_name(f"{effect}_{own}", model) for own in states}
+    Parameters
+    ----------
+    effect : str
+        Id of the effect.
+    expression : str
+        The force.
+    states : tuple of (str, InternalState)
+        New dofs by name.
+    requires : tuple of str
+        Names that a model must declare.
+    """
+
+    effect: str
+    expression: str
+    states: tuple[tuple[str, InternalState], ...] = ()
+    requires: tuple[str, ...] = ()
+
+    def used(self) -> set[str]:
+        """All names in the force and in the equations of the states."""
+        texts = [self.expression, *(state.equation for _, state in self.states)]
+        return set[str]().union(*(_names_in(text, self.effect) for text in texts))
+
+    def check(
+        self, amplitudes: tuple[Amplitude, ...], shapes: tuple[ShapeParameter, ...] = ()
+    ) -> None:
+        """Check names, states, null and unit.
+
+        Raises
+        ------
+        InputError
+            See :func:`force_effect`.
+        """
+        used, id_ = self.used(), self.effect
+        states = dict(self.states)
+        own = {item.name for item in amplitudes} | {shape.name for shape in shapes} | set(states)
+        check_names(used, own, set(self.requires), id_)
+        check_states(states, used, id_)
+        in_force = _names_in(self.expression, id_)
+        check_null(self.expression, in_force, amplitudes, id_)
+        check_unit(self.expression, in_force, amplitudes, shapes, states, id_)
+
+    def as_effect(
+        self,
+        family: str,
+        amplitudes: tuple[Amplitude, ...],
+        *,
+        formula: str = "",
+        title: str = "",
+        shapes: tuple[ShapeParameter, ...] = (),
+        source: str = "",
+        applies_to: str = "",
+    ) -> Effect:
+        """The effect; parameters as of :func:`force_effect`."""
+        used = self.used()
+        return Effect(
+            id=self.effect,
+            family=family,
+            title=title or self.effect.replace("_", " ").capitalize(),
+            formula=formula or _latex(self.expression, used, self.effect),
+            amplitudes=amplitudes,
+            places=_places_for(used, self.requires),
+            change=self,
+            shapes=(*shapes, SMOOTHING) if "direction" in used else shapes,
+            constants=tuple(item for item in _MOTION_CONSTANTS if item.name in used),
+            source=source,
+            applies_to=applies_to or _applies_to(used, self.requires),
+        )
+
+    def __call__(self, model: Model, target: str, names: Names) -> Model:
+        """The model with the term at one place."""
+        place, effect = place_at(model, target), self.effect
+        dofs = {own: free_name(f"{effect}_{own}", model) for own, _ in self.states}
         known = _vocabulary(model, place, names) | {own: symbol(n) for own, n in dofs.items()}
         dynamic = (*model.dofs, *model.inputs, *dofs.values())
         where = f"effect {effect}"
-        for own, state in states.items():
+        for own, state in self.states:
             equation = {"memory": parse(state.equation, known, dynamic, where)}
             dof = Dof(state.unit, 0.0, state.description)
             model = model.with_dof(dofs[own], dof, equation)
-        force = parse(expression, known, dynamic, where)
+        force = parse(self.expression, known, dynamic, where)
         # An output shows the force itself; in an equation the force has the sign of the inertia.
         return with_force(model, place, _free_term(effect, model, place), force)
-
-    return change
 
 
 def _free_term(name: str, model: Model, place: Coordinate) -> str:

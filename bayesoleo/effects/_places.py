@@ -10,13 +10,13 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from bayesoleo._units import dimensions
+from bayesoleo._units import base_unit, dimensions
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
@@ -27,17 +27,10 @@ from bayesoleo.model._parameters import Coordinate
 _USUAL = ("N", "Pa", "W", "J", "V", "N*m", "V/s")
 
 
-@cache
-def _registry() -> Any:
-    import pint
-
-    return pint.UnitRegistry()
-
-
 def parse_unit(text: str) -> Any:
     """Unit of a text as pint reads it, in base units; a number where the text is empty."""
     try:
-        return _registry().Quantity(1.0, text or "dimensionless").to_base_units().units
+        return base_unit(text)
     except Exception as error:
         hint = "write it as pint reads it, e.g. N*s/m"
         raise ModelError("unknown unit", value=text, hint=hint) from error

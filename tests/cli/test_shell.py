@@ -12,7 +12,7 @@ import warnings
 
 import pytest
 
-from bayesoleo import _workflow as workflow
+from bayesoleo import _worker_processes as processes, _workflow as workflow
 from bayesoleo._cli import shell
 from bayesoleo.errors import DataWarning, InputError, ModelError
 
@@ -134,3 +134,23 @@ def test_linear_algebra_has_one_thread_unless_asked_for_more(asked, threads, tmp
     if found == "[]":
         pytest.skip("no library of linear algebra that is known")
     assert set(json.loads(found)) == {min(threads, os.cpu_count() or 1)}
+
+
+@pytest.mark.parametrize("command", ["close", "sample"])
+def test_libraries_load_in_both_processes_of_a_search_at_once(
+    run, monkeypatch, campaign, model, command
+):
+    begun = []
+    monkeypatch.setattr(processes, "start_ahead", lambda **given: begun.append(given))
+    monkeypatch.setattr(processes, "load", begun.append)
+
+    def stopped(*_, **__):
+        raise InputError("stop here")
+
+    monkeypatch.setattr(workflow, command, stopped)
+    result = run(command, campaign, "--model", model, "--jobs", 2)
+    assert result.stderr.splitlines()[-1] == "error: stop here"
+    loaded = ["bayesoleo._workflow.closing"]
+    assert begun == ([{"jobs": 2}, loaded] if command == "close" else [loaded])
+    assert run(command, campaign / "nowhere", "--model", model).exit_code == 2
+    assert len(begun) == (2 if command == "close" else 1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 
+import cloudpickle
 import pytest
 from matplotlib.mathtext import MathTextParser
 
@@ -19,6 +21,7 @@ from bayesoleo.effects import (
     find_effect,
     force_effect,
 )
+from bayesoleo.effects._forces import SMOOTHING, AddedTerm
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.systems import system
@@ -160,6 +163,22 @@ def test_names_do_not_collide(scales):
 def test_bad_effects_are_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         force_effect(*arguments)
+
+
+def test_built_in_forces_pass_the_checks_of_one_s_own():
+    """They are made without them, so that libraries load sooner."""
+    terms = [effect for effect in catalogue() if isinstance(effect.change, AddedTerm)]
+    assert len(terms) > 20
+    for effect in terms:
+        scanned = tuple(shape for shape in effect.shapes if shape is not SMOOTHING)
+        effect.change.check(effect.amplitudes, scanned)
+        assert effect.change.effect == effect.id
+
+
+def test_effects_survive_a_pickle_as_equals():
+    effects = [find_effect("coulomb_friction"), find_effect("dahl_friction")]
+    assert pickle.loads(cloudpickle.dumps(effects[0])).change == effects[0].change
+    assert len({*effects, *effects}) == 2
 
 
 def test_a_state_without_its_rate_is_refused():
