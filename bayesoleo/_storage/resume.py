@@ -24,7 +24,7 @@ from functools import cache
 from io import BytesIO
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
-from typing import Any
+from typing import IO, Any
 from zipfile import BadZipFile
 
 import cloudpickle
@@ -155,10 +155,31 @@ def keep_state(path: str | os.PathLike[str], key: Key, state: Any) -> None:
     ResultsError
         If the place cannot be written to.
     """
-    content = cloudpickle.dumps(state)
-    head = {"format": _FORMAT, "key": dict(key), "sha256": hashlib.sha256(content).hexdigest()}
-    with replacing(path) as draft:
-        draft.write_bytes(json.dumps(head).encode() + b"\n" + content)
+    with replacing(path) as draft, draft.open("wb") as stream:
+        # The sum comes first in the file, and is known last: room is left for it.
+        stream.write(_head(key, hashlib.sha256()))
+        content = _Summed(stream)
+        cloudpickle.dump(state, content)
+        stream.seek(0)
+        stream.write(_head(key, content.sum))
+
+
+def _head(key: Key, content: Any) -> bytes:
+    """First line of a state, of the same length for every sum of its content."""
+    head = {"format": _FORMAT, "key": dict(key), "sha256": content.hexdigest()}
+    return json.dumps(head).encode() + b"\n"
+
+
+class _Summed:
+    """A stream whose content is summed as it is written: a state of hundreds of megabytes is not
+    held a second time."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self.stream, self.sum = stream, hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.sum.update(data)
+        return self.stream.write(data)
 
 
 def kept_state(path: str | os.PathLike[str], key: Key) -> tuple[Any, str]:

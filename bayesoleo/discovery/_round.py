@@ -100,6 +100,8 @@ def examine(
         base, state.assembly, effects, numerics.jobs, callback=callback
     )
     tests = effective_tests(scores, seed, policy=policy)
+    # They have served, and are half of what a round takes in memory and where it is kept.
+    scores = [replace(one, columns=np.empty((0, one.columns.shape[1]))) for one in scores]
     ranking = rank(scores, tests, {}, policy=policy)
     stop = _stopping_reason(state, ranking, tests, policy)
     if stop is not None or limit:

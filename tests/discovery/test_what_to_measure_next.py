@@ -76,6 +76,14 @@ def proposals(springs):
     return propose_runs(rivals, reduced.records, outcome.before.fit_errors, limits, jobs=1)
 
 
+def test_a_round_keeps_no_columns_that_have_served(springs):
+    _, outcome, _ = springs
+    assert len(outcome.ranking) == 2
+    for item in outcome.ranking:
+        assert item.score.columns.base is None
+        assert item.score.columns.size == 0 < item.score.contribution.size
+
+
 def test_springs_alike_in_small_motions_are_told_apart_by_a_large_one(proposals):
     best = proposals.trials[0]
     assert best.amplitude == pytest.approx(0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -24,6 +25,26 @@ def test_a_state_comes_back_as_it_was(tmp_path):
     found, reason = kept_state(path, KEY)
     assert reason == ""
     assert found["function"](found["values"][2]) == 4.0
+
+
+def test_a_large_state_is_written_without_a_copy_in_memory(tmp_path):
+    path, size = tmp_path / "state.pickle", 20_000_000
+    state = {"values": np.arange(size // 8, dtype=float)}
+    tracemalloc.start()
+    keep_state(path, KEY, state)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size / 4
+    np.testing.assert_array_equal(kept_state(path, KEY)[0]["values"], state["values"])
+
+
+def test_what_cannot_be_kept_leaves_the_older_state(tmp_path):
+    path = tmp_path / "state.pickle"
+    keep_state(path, KEY, "older")
+    with pytest.raises(TypeError, match="cannot pickle"):
+        keep_state(path, KEY, [np.zeros(100_000), (number for number in range(3))])
+    assert kept_state(path, KEY) == ("older", "")
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_another_calculation_or_a_damaged_file_has_none_and_a_reason(tmp_path):
