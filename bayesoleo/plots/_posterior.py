@@ -8,11 +8,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
-from scipy import ndimage, stats
+from scipy import stats
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array
@@ -112,27 +111,40 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
     Figure
         Contours hold 39 and 86 % of the draws (one and two standard deviations of a normal).
     """
+    import corner as corner_package
+
     names = chosen(tree, CORNER_MOST) if parameters is None else list(parameters)
     values = [draws(tree, name).ravel() for name in names]
     scales = [
         engineering(unit_of(tree, n), style.magnitude(v))
         for n, v in zip(names, values, strict=True)
     ]
-    shown = [s.factor * v for s, v in zip(scales, values, strict=True)]
+    shown = np.column_stack([s.factor * v for s, v in zip(scales, values, strict=True)])
     point = point_table(tree)
     truths = [
         s.factor * point[n][0] if n in point else None for n, s in zip(names, scales, strict=True)
     ]
-    ranges = [_range(v, truth) for v, truth in zip(shown, truths, strict=True)]
     labels = [_label(name, scale) for name, scale in zip(names, scales, strict=True)]
-    figure, panels = _triangle(labels)
-    for (row, column), axes in panels.items():
-        if row == column:
-            _density(axes, shown[row], ranges[row])
-        else:
-            _contours(axes, shown[column], shown[row], ranges[column], ranges[row])
-        _mark(axes, truths[column], None if row == column else truths[row])
-    _tidy(panels, labels, figure.get_figwidth())
+    margin = 0.59 + LINE * max(text.count("\n") + 1 for text in labels)
+    size = max(1.05 * len(names) + margin, 3.2)
+    figure = style.blank(size, size)
+    corner_package.corner(
+        shown,
+        fig=figure,
+        bins=24,
+        range=[_range(column, truth) for column, truth in zip(shown.T, truths, strict=True)],
+        smooth=1.0,
+        levels=(0.393, 0.865),
+        plot_datapoints=False,
+        plot_density=False,
+        fill_contours=True,
+        color=style.AFTER,
+        max_n_ticks=3,
+        quiet=True,
+    )
+    _arrange(figure, margin)
+    _mark(figure, truths)
+    _tidy(figure, labels, shown)
     handles = [
         style.band(style.AFTER, "posterior"),
         style.line(style.BEFORE, "point estimate", 1.2),
@@ -140,64 +152,6 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
     if len(names) > 1:
         figure.legend(handles=handles, loc="upper right", frameon=False, fontsize=style.TEXT)
     return figure
-
-
-def _triangle(labels: list[str]) -> tuple[Figure, dict[tuple[int, int], Axes]]:
-    """A square figure with panels on and below its diagonal, by row and column."""
-    count = len(labels)
-    margin = 0.59 + LINE * max(text.count("\n") + 1 for text in labels)
-    size = max(1.05 * count + margin, 3.2)
-    figure = style.blank(size, size)
-    wide, high = ((size - margin - far) / (count + 0.07 * (count - 1)) for far in (0.15, 0.4))
-    panels = {
-        (row, column): style.add_axes(
-            figure,
-            margin + 1.07 * wide * column,
-            margin + 1.07 * high * (count - 1 - row),
-            wide,
-            high,
-        )
-        for row in range(count)
-        for column in range(row + 1)
-    }
-    return figure, panels
-
-
-#: Bins of the draws along each axis of a panel, and parts of the draws that its contours hold.
-CORNER_BINS, HELD = 24, (0.865, 0.393)
-
-
-def _density(axes: Axes, values: Array, limits: tuple[float, float]) -> None:
-    """The histogram of one parameter's draws, below their mean and standard deviation."""
-    counts, edges = np.histogram(values, CORNER_BINS, limits)
-    axes.stairs(counts, edges, color=style.AFTER, lw=1.2)
-    axes.set_xlim(limits)
-    axes.set_ylim(0, 1.1 * max(float(counts.max()), 1.0))
-    mean, sd = values.mean(), values.std()
-    text = f"{format_number(mean, sd)} ± {format_number(sd, sd)}"
-    axes.set_title(text, y=1.0, fontsize=style.SMALL - 0.5, color=style.INK, pad=4)
-
-
-def _contours(
-    axes: Axes, x: Array, y: Array, across: tuple[float, float], along: tuple[float, float]
-) -> None:
-    """Regions that hold given parts of the draws of two parameters, from a smoothed histogram."""
-    counts = np.histogram2d(x, y, CORNER_BINS, (across, along))[0]
-    density = ndimage.gaussian_filter(counts, 1.0)
-    falling = np.sort(density, axis=None)[::-1]
-    held = np.cumsum(falling) / falling.sum()
-    levels = [float(falling[np.searchsorted(held, part)]) for part in HELD]
-    levels[0] = min(levels[0], levels[1] * (1 - 1e-4))  # all draws may lie in one bin
-    # Bins reach from edge to edge, their centres do not; beyond the edges a region is clipped.
-    density = np.pad(density, 1, mode="edge")
-    place = (np.arange(-1, CORNER_BINS + 1) + 0.5) / CORNER_BINS
-    centres = [low + (high - low) * place for low, high in (across, along)]
-    colours = [to_rgba(style.AFTER, 1 / 3), style.AFTER]
-    top = falling[0] * (1 + 1e-4)
-    # One artist fills the regions and draws their outlines.
-    regions = axes.contourf(*centres, density.T, [*levels, top], colors=colours)
-    regions.set(edgecolor=style.AFTER, linewidth=1.2)
-    axes.set(xlim=across, ylim=along)
 
 
 def _range(values: Array, truth: float | None) -> tuple[float, float]:
@@ -211,26 +165,43 @@ def _range(values: Array, truth: float | None) -> tuple[float, float]:
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 
-def _mark(axes: Axes, x: float | None, y: float | None) -> None:
-    """Lines at the point estimate."""
-    if x is not None:
-        axes.axvline(x, color=style.BEFORE, lw=1.0)
-    if y is not None:
-        axes.axhline(y, color=style.BEFORE, lw=1.0)
+def _mark(figure: Figure, truths: list[float | None]) -> None:
+    """Lines at the point estimate; corner's own marks fail on a single parameter."""
+    count = len(truths)
+    axes = np.array(figure.axes).reshape(count, count)
+    for row in range(count):
+        for column in range(row + 1):
+            x, y = truths[column], truths[row]
+            if x is not None:
+                axes[row, column].axvline(x, color=style.BEFORE, lw=1.0)
+            if y is not None and column < row:
+                axes[row, column].axhline(y, color=style.BEFORE, lw=1.0)
 
 
-def _tidy(panels: dict[tuple[int, int], Axes], labels: list[str], size: float) -> None:
-    """Names, units and readable numbers on the outer axes of a figure of ``size`` inches."""
-    last = len(labels) - 1
-    for (row, column), axes in panels.items():
-        axes.tick_params(length=2.5, color=style.FAINT)
-        axes.spines[:].set_color(style.NEUTRAL)
-        axes.xaxis.set_visible(row == last)
-        axes.yaxis.set_visible(column == 0 < row)
-        if row == last:
-            _axis(axes, "x", labels[column], size)
-        if column == 0 < row:
-            _axis(axes, "y", labels[row], size)
+def _arrange(figure: Figure, margin: float) -> None:
+    """Margins in inches, as everywhere."""
+    size = figure.get_figwidth()
+    figure.subplots_adjust(
+        left=margin / size, right=1 - 0.15 / size, bottom=margin / size, top=1 - 0.4 / size,
+        wspace=0.07, hspace=0.07,
+    )  # fmt: skip
+
+
+def _tidy(figure: Figure, labels: list[str], shown: Array) -> None:
+    """Titles with value and spread, names and units on the outer axes, readable numbers."""
+    count, size = len(labels), figure.get_figwidth()
+    axes = np.array(figure.axes).reshape(count, count)
+    for i in range(count):
+        mean, sd = shown[:, i].mean(), shown[:, i].std()
+        text = f"{format_number(mean, sd)} ± {format_number(sd, sd)}"
+        axes[i, i].set_title(text, y=1.0, fontsize=style.SMALL - 0.5, color=style.INK, pad=4)
+        _axis(axes[count - 1, i], "x", labels[i], size)
+        if i > 0:
+            _axis(axes[i, 0], "y", labels[i], size)
+    for panel in axes.ravel():
+        panel.tick_params(length=2.5, color=style.FAINT)
+        for spine in panel.spines.values():
+            spine.set_color(style.NEUTRAL)
 
 
 def _label(name: str, scale: Scale) -> str:

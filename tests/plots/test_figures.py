@@ -13,7 +13,6 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.markers import TICKDOWN, TICKLEFT
-from matplotlib.path import Path
 from matplotlib.text import Text
 from scipy.special import ndtr
 
@@ -147,7 +146,7 @@ def test_of_two_places_the_one_that_was_added_is_marked():
 
 def test_corner_shows_at_most_ten_parameters_new_ones_and_shared_ones_first(oleo):
     figure = plots.corner(oleo)
-    assert len(figure.axes) == 55
+    assert len(figure.axes) == 100
     assert len(texts(figure)) > 10
     labels = " ".join(texts(figure))
     assert "breakaway" in labels
@@ -162,36 +161,10 @@ def test_long_names_in_a_corner_stay_inside_it_and_apart(oleo):
     figure = plots.corner(tree)
     FigureCanvasAgg(figure).draw()
     below = [axes.xaxis.label.get_window_extent() for axes in figure.axes[-3:]]
-    # The lower triangle, row by row.
-    beside = [figure.axes[place].yaxis.label.get_window_extent() for place in (1, 3)]
-    for box in (*below, *beside):
+    for box in (*below, *(axes.yaxis.label.get_window_extent() for axes in figure.axes[3::3])):
         assert box.x0 > 0
         assert box.y0 > 0
     assert all(left.x1 < right.x0 for left, right in pairwise(below))
-
-
-def test_regions_of_a_corner_hold_the_parts_that_they_say(oleo):
-    rng = np.random.default_rng(5)
-    x = rng.standard_normal((4, 5000))
-    dims = (schema.CHAIN, schema.DRAW)
-    data = {"a": (dims, x), "b": (dims, 0.6 * x + rng.standard_normal(x.shape))}
-    figure = plots.corner(xr.DataTree.from_dict({"posterior": xr.Dataset(data)}))
-    (regions,) = figure.axes[1].collections
-    points = np.column_stack([data["a"][1].ravel(), data["b"][1].ravel()])
-    held = [
-        Path(path.to_polygons()[0]).contains_points(points).mean() for path in regions.get_paths()
-    ]
-    np.testing.assert_allclose(held, [0.865, 0.393], atol=0.04)  # the histogram is smoothed
-
-
-def test_a_region_reaches_the_edge_of_its_panel_where_most_draws_are_there():
-    rng = np.random.default_rng(6)
-    x = rng.exponential(size=(4, 5000))
-    data = {"a": ((schema.CHAIN, schema.DRAW), x)}
-    data["b"] = ((schema.CHAIN, schema.DRAW), rng.standard_normal(x.shape))
-    axes = plots.corner(xr.DataTree.from_dict({"posterior": xr.Dataset(data)})).axes[1]
-    (regions,) = axes.collections
-    assert regions.get_paths()[0].get_extents().x0 < axes.get_xlim()[0]
 
 
 def test_panels_without_numbers_have_ticks_where_those_with_numbers_have_them(oleo):
