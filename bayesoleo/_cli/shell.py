@@ -180,7 +180,7 @@ class Commands(TyperGroup):
                 raise
             complain(f"error: {error}")
             raise typer.Exit(UNUSABLE) from None
-        except (MemoryError, OSError) as error:
+        except (MemoryError, OSError, ImportError) as error:
             text = machine_text(error)
             if not text or os.environ.get(DEBUG, "0") not in ("", "0"):
                 raise
@@ -192,10 +192,17 @@ class Commands(TyperGroup):
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.ENAMETOOLONG)
 
 
-def machine_text(error: MemoryError | OSError) -> str:
+#: What the loader of the C library says where a library finds no room in memory.
+_NO_ROOM = ("failed to map segment", "cannot allocate memory", "cannot map zero-fill")
+
+
+def machine_text(error: MemoryError | OSError | ImportError) -> str:
     """What is told where memory or a disk has come to its limit; empty for other errors."""
     if isinstance(error, MemoryError):
         return memory_text(error)
+    if isinstance(error, ImportError):
+        full = any(words in str(error).lower() for words in _NO_ROOM)
+        return memory_text(MemoryError("a library cannot be loaded")) if full else ""
     if error.errno not in _DISK:
         return ""
     where = f"file {error.filename}: " if error.filename else ""

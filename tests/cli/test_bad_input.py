@@ -204,6 +204,10 @@ def test_a_folder_to_which_another_process_writes_is_refused(
 
 LIMITS = {
     "memory": (MemoryError("Unable to allocate 9 GiB"), "not enough memory: unable to allocate 9"),
+    "library": (
+        ImportError("a.so: failed to map segment from shared object"),
+        "not enough memory: a library cannot be loaded",
+    ),
     "disk": (OSError(errno.ENOSPC, "No space left on device", "a"), "file a: No space left on"),
 }
 
