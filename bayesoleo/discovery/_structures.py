@@ -43,6 +43,10 @@ COMMON_EFFECTS = frozenset(
 )
 
 
+#: Probability of a further effect where the numbers of a prior end, over that of the last number.
+FURTHER = 0.25
+
+
 @dataclass(frozen=True)
 class StructurePrior:
     """Prior probabilities of structures.
@@ -53,7 +57,8 @@ class StructurePrior:
         That nothing is missing, that effects of the catalogue are, and that only something outside
         of it is. They are divided by their sum.
     numbers : tuple of float
-        Of one, two, three... effects, given that some act. They are divided by their sum.
+        Of one, two, three... effects, given that some act. Beyond the last, each further effect is
+        a quarter as probable. They are divided by the sum of all.
     families : mapping of str to float
         Weights of families of effects. By default they are one, but less for parameters that vary
         from run to run and forces that repeat with the drive, because these absorb a part of
@@ -77,8 +82,14 @@ class StructurePrior:
         A second thing is missing as often as a second effect of the catalogue is, and lies outside
         as often as the first.
         """
-        more = 1.0 - self.numbers[0] / sum(self.numbers)
+        more = 1.0 - self.share_of(1)
         return more * self.outside / (self.catalogue + self.outside)
+
+    def share_of(self, count: int) -> float:
+        """Probability of so many effects, given that some act."""
+        beyond = count - len(self.numbers)
+        own = self.numbers[-1] * FURTHER**beyond if beyond > 0 else self.numbers[count - 1]
+        return own / (sum(self.numbers) + self.numbers[-1] * FURTHER / (1.0 - FURTHER))
 
     def weights(self, families: Mapping[Added, str]) -> dict[Added, float]:
         """Prior probability of each effect as the only one."""
@@ -116,8 +127,7 @@ class StructurePrior:
     def log_of_set(self, weights: Sequence[float]) -> float:
         """Logarithm of the probability of a set of effects, given that some act or are resembled,
         from those of its members; it comes about in any order."""
-        number = self.numbers[min(len(weights), len(self.numbers)) - 1] / sum(self.numbers)
-        share = number * math.prod(weights) * math.factorial(len(weights))
+        share = self.share_of(len(weights)) * math.prod(weights) * math.factorial(len(weights))
         return math.log(share) if share > 0.0 else -math.inf
 
     def log_probability(

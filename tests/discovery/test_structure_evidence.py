@@ -307,8 +307,20 @@ def test_prior_of_single_effects_adds_up_and_near_copies_share():
         for key in families
         for outside in (False, True)
     ]
-    share = prior.numbers[0] / sum(prior.numbers)
-    assert np.exp(logsumexp(single)) == pytest.approx(prior.catalogue * share)
+    assert np.exp(logsumexp(single)) == pytest.approx(prior.catalogue * prior.share_of(1))
+
+
+@pytest.mark.parametrize("numbers", [(0.75, 0.2, 0.04, 0.01), (1.0,), (2.0, 1.0)])
+def test_numbers_of_effects_have_probabilities_that_add_up(numbers):
+    prior = StructurePrior(numbers=numbers)
+    shares = [prior.share_of(count) for count in range(1, 40)]
+    assert sum(shares) == pytest.approx(1.0)
+    assert shares[0] / shares[1] == pytest.approx(
+        4.0 if len(numbers) == 1 else numbers[0] / numbers[1]
+    )
+    # With members of equal weight five effects come about in five times as many orders as four.
+    five, four = (prior.log_of_set([0.1] * count) for count in (5, 4))
+    assert np.exp(five - four) == pytest.approx(0.25 * 0.1 * 5)
 
 
 def test_common_laws_weigh_more_within_their_family_and_a_user_can_say_otherwise():
@@ -394,7 +406,7 @@ def test_a_set_of_two_effects_comes_about_in_either_order():
     """Two draws from all effects: pairs, and those that are drawn twice, add up to all."""
     weights, prior = np.array([0.5, 0.3, 0.2]), StructurePrior()
     pairs = [(0, 1), (0, 2), (1, 2)]
-    two = prior.numbers[1] / sum(prior.numbers)
+    two = prior.share_of(2)
     total = sum(np.exp(prior.log_of_set(weights[list(pair)])) for pair in pairs)
     assert total + two * np.sum(weights**2) == pytest.approx(two)
 
