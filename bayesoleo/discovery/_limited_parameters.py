@@ -1,11 +1,11 @@
 r"""Posterior of parameters whose likelihood is normal, under the priors that they have.
 
-A structure gives normal densities of the parameters, in the coordinates in which an estimator
-steps: the logarithm where the prior is log-normal or log-uniform. The priors in it are normal in
-the same coordinates. That is all where data determine a parameter well within its support.
-Elsewhere the normal part of a prior is taken off again, and what is left, the likelihood, is
-multiplied by the prior itself. Parameters are drawn one after the other, each from the likelihood
-given those before times its own prior, with the weight of the integral of both.
+A structure gives normal densities of the parameters, or of their logarithms where a prior has
+nothing below zero. The priors in it are normal in the same coordinates. That is all where data
+determine a parameter well within its support. Elsewhere the normal part of a prior is taken off
+again, and what is left, the likelihood, is multiplied by the prior itself. Parameters are drawn one
+after the other, each from the likelihood given those before times its own prior, with the weight of
+the integral of both.
 
 Where a logarithm is known to a tenth at best, it matters in which coordinate the likelihood is
 normal. Outputs are linear in a force's size, hardly change with a slope that is steep already, and
@@ -34,7 +34,7 @@ from scipy.stats import qmc
 
 from bayesoleo._types import Array, Flags
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.estimation._problem import Evaluation
+from bayesoleo.estimation._problem import Evaluation, undisturbed
 from bayesoleo.estimation._sensitivity import quantile
 from bayesoleo.model._correlated_priors import Correlated
 from bayesoleo.model._priors import LogNormal, Normal, Prior
@@ -308,11 +308,12 @@ def powers(fit: ModelFit, names: Sequence[str], shift: Array) -> Array:
     for place, k in asked:
         moved = theta.copy()
         moved[k] *= np.exp(shift[place])
+        with undisturbed(problem):
+            there = _sizes(problem.evaluate(moved), fit.point.variance)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.log(_sizes(problem.evaluate(moved), fit.point.variance)[k] / here[k])
+            ratio = np.log(there[k] / here[k])
         if np.isfinite(ratio):
             found[place] = np.clip(1.0 + ratio / shift[place], *POWERS)
-    problem.evaluate(theta)  # a solver starts where it solved last
     return found
 
 

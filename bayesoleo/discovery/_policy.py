@@ -47,8 +47,8 @@ class SearchPolicy:
         " what a model leaves, that is accepted: the sum of the squared changes of the outputs plus"
         " the size of twice their product with the residual.",
         "twice the log likelihood of the present model changes by at most this. A candidate that"
-        " reduces the sum of squares by a variances may have its reduction wrong by up to"
-        " 2 sqrt(a) + 1 of them",
+        " reduces the sum of squares by `a` variances may have its reduction wrong by up to"
+        " `2 sqrt(a) + 1` of them",
     )
     missed_factor: float = _value(
         3.0,

@@ -6,8 +6,8 @@ density by which structures are compared. On each side of an amplitude's zero it
 normal density with the same mean and covariance. The mixture of all, weighted by evidence and by
 the structures' probabilities, is the posterior of a parameter given any structure.
 
-A density is normal in the coordinate in which the estimator steps, the logarithm of a parameter
-with a log-normal prior, and lies within the limits of the priors
+A density is normal in the parameter, or in its logarithm where its prior has nothing below zero,
+and lies within the limits of the priors
 (:mod:`bayesoleo.discovery._limited_parameters`).
 
 References

@@ -101,6 +101,20 @@ class CampaignProblem:
             for run, watched in zip(self.predictor.runs, before, strict=True):
                 run.watched = watched
 
+    @contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """Evaluate elsewhere meanwhile; solvers then start where they did, on their branch."""
+        runs, last = self.predictor.runs, self._last
+        before = [(run.found(), run.jumps) for run in runs]
+        try:
+            with self.unwatched():
+                yield
+        finally:
+            for run, (found, jumps) in zip(runs, before, strict=True):
+                run.restore(found)
+                run.jumps = jumps
+            self._last = last
+
     def full(self, theta: Array) -> Array:
         """All unknowns of the predictor, shape (L, all), from the free ones, shape (L, l)."""
         vectors = np.repeat(self._full[None], theta.shape[0], axis=0)

@@ -81,6 +81,18 @@ def unwatched(problem: object) -> AbstractContextManager[None]:
     return found
 
 
+def undisturbed(problem: object) -> AbstractContextManager[None]:
+    """Evaluate a problem elsewhere meanwhile; afterwards it is as it was.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        A campaign's starts each solution from the last one, and may come back to another branch.
+    """
+    found: AbstractContextManager[None] = getattr(problem, "undisturbed", nullcontext)()
+    return found
+
+
 class Named(Protocol):
     """A problem with named unknowns."""
 

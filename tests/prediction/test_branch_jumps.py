@@ -173,3 +173,23 @@ def test_what_is_not_known_is_not_unstable():
     assert count_unstable(np.empty((3, 0), dtype=complex)).tolist() == [-1, -1, -1]
     assert count_unstable(np.array([[1.0 + 1e-12, 0.5]], dtype=complex)).tolist() == [0]
     assert np.isinf(swings(np.array([[3.0, 1.0], [3.0 + 1e-12, 2.0]]), 2)).tolist() == [True, False]
+
+
+def test_a_problem_that_was_evaluated_elsewhere_is_on_its_branch_again():
+    """Beyond a fold the way back from elsewhere leads to the other branch."""
+    made, theta = predictor(95.0)
+    problem = CampaignProblem(made)
+    problem.freeze(theta)
+    residual = problem.evaluate(theta).residual[0].copy()
+    before = problem.misfit(theta[None]).sum_of_squares
+    moved = theta.copy()
+    moved[problem.names.index("stiffness")] *= np.exp(0.3)
+    with problem.undisturbed():
+        problem.evaluate(moved)
+    np.testing.assert_array_equal(problem.misfit(theta[None]).sum_of_squares, before)
+    np.testing.assert_array_equal(problem.evaluate(theta).residual[0], residual)
+    assert not problem.branch_jumps.any()
+    # Without it, the misfit is that of the other branch.
+    problem.evaluate(moved)
+    problem.evaluate(theta)
+    assert problem.misfit(theta[None]).sum_of_squares.sum() > 2 * before.sum()
