@@ -353,13 +353,20 @@ def _table(
     return table[good_rows], labels, int((~good_rows).sum())
 
 
+#: Half width of an interval, over its estimate, up to which it may be normal in the logarithm. A
+#: small estimate with a wide interval says how large a parameter is at most, and its logarithm next
+#: to nothing.
+SHORT = 0.5
+
+
 def supported_ends(priors: Sequence[Prior], theta: Array, half: Array) -> Array:
     """Lower and upper ends of normal intervals of parameters within their supports, shape (2, l).
 
     Parameters
     ----------
     priors : sequence of Prior, length l
-        Where one is log-normal or log-uniform, the interval is normal in the logarithm.
+        Where one is log-normal or log-uniform, and the interval is short beside the estimate, it is
+        normal in the logarithm.
     theta : ndarray, shape (l,)
         Estimates.
     half : ndarray, shape (l,)
@@ -367,9 +374,8 @@ def supported_ends(priors: Sequence[Prior], theta: Array, half: Array) -> Array:
     """
     ends = theta + np.outer([-1.0, 1.0], half)
     for k, prior in enumerate(priors):
-        if isinstance(prior, LogNormal | LogUniform) and theta[k] > 0.0:
-            with np.errstate(over="ignore"):  # a logarithm of which nothing is known
-                ends[:, k] = theta[k] * np.exp(np.array([-1.0, 1.0]) * half[k] / theta[k])
+        if isinstance(prior, LogNormal | LogUniform) and half[k] <= SHORT * theta[k]:
+            ends[:, k] = theta[k] * np.exp(np.array([-1.0, 1.0]) * half[k] / theta[k])
         ends[:, k] = np.clip(ends[:, k], *prior.support)
     return ends
 

@@ -14,12 +14,13 @@ from bayesoleo.estimation._intervals import (
     linearised_covariance,
     linearised_intervals,
     over_experiments,
+    supported_ends,
 )
 from bayesoleo.estimation._objectives import curvature, prior_precision
 from bayesoleo.estimation._problem import Held
 from bayesoleo.estimation._profile_likelihood import profile
 from bayesoleo.model._correlated_priors import JointNormal
-from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal, Uniform
+from bayesoleo.model._priors import LogNormal, LogUniform, Normal, TruncatedNormal, Uniform
 
 SIZE = 40
 
@@ -103,6 +104,19 @@ def test_holding_part_of_a_joint_prior_leaves_the_conditional():
     assert prior.sd == pytest.approx(np.sqrt(4.0 - 0.5))
 
 
+@pytest.mark.parametrize(
+    "prior", [LogNormal(1.0, 1.5), LogNormal(1.0, 5.0), LogUniform(1e-6, 10.0)]
+)
+def test_the_logarithm_counts_only_where_it_is_known(prior):
+    """Of what is near zero the data say how large it is at most, and hardly its logarithm."""
+    half = np.array([0.005])
+    low, high = supported_ends([prior], np.array([1e-3]), half)
+    assert low[0] == prior.support[0]
+    assert high[0] == pytest.approx(6e-3)
+    low, high = supported_ends([prior], np.array([0.1]), half)
+    np.testing.assert_allclose([low[0], high[0]], 0.1 * np.exp([-0.05, 0.05]))
+
+
 def test_intervals_end_at_the_support():
     """Five samples tell little of three constants of which only one may be negative."""
     x = np.linspace(0.0, 1.0, 5)
@@ -112,13 +126,12 @@ def test_intervals_end_at_the_support():
     point = estimate(problem, "be")
     found = linearised_intervals(problem, point, "posterior")
     low, high = found["low"].values, found["high"].values
-    assert 0.0 < low[0] < point["a"] < high[0]
+    assert 0.0 <= low[0] < point["a"] < high[0]
     assert (low[1], high[1]) == (0.0, 2.0)
     assert low[2] < 0.0 < high[2]
     assert 0.0 < low[3] < point.variance[0] < high[3]
-    # The ends of a logarithm are as far from it as its deviation says.
-    ratio = 1.959964 * float(found["sd"][0]) / point["a"]
-    np.testing.assert_allclose([low[0], high[0]], point["a"] * np.exp([-ratio, ratio]), rtol=1e-6)
+    half = 1.959964 * float(found["sd"][0])
+    np.testing.assert_allclose(high[0], point["a"] + half, rtol=1e-6)
     lines = profile(problem, point, ["a", "b"])
     assert (lines["linear_low"].values >= 0.0).all()
     assert float(lines["linear_high"][1]) <= 2.0
