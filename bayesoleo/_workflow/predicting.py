@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -19,7 +20,7 @@ from scipy import stats
 from bayesoleo import _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
-from bayesoleo._workflow.simulating import model_of, parameter_sets
+from bayesoleo._workflow.simulating import model_of, parameter_sets, same_noise, same_samples
 from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
 from bayesoleo.data._noise import local_means
@@ -158,7 +159,7 @@ def predict(
     added = baselines_in(tree[schema.POINT].to_dataset()) if common_offset else []
     if common_offset:
         check_baselines(added, used)
-        chosen = with_common_baselines(chosen, added)
+        chosen = with_common_baselines(chosen, added, partial(same_noise, tree))
     records = uncertain_conditions(used).complete(chosen)
     found = [
         _one_run(used, record, known, rng, level, scheme, solver, steps, jobs) for record in records
@@ -325,17 +326,9 @@ def _as_judged(tree: xr.DataTree, record: Record, run: _Run, model: Model) -> _R
     one answer. It knows more: what each run said of its own parameters."""
     if schema.RECORDS not in tree.children:
         return run
-    observed = tree[schema.RECORDS].to_dataset()
     errors = []
     for output, computed in zip(model.outputs, run.errors, strict=True):
-        same = output in observed and record.label in observed[schema.RUN].values
-        if same:
-            there = observed[output].sel({schema.RUN: record.label}).values
-            here = record.samples[output]
-            same = (
-                np.array_equal(there[: here.size], here)
-                and not np.isfinite(there[here.size :]).any()
-            )
+        same = same_samples(tree, record, output)
         known = judged_errors(tree, output, record.label) if same else {}
         errors.append({key: known.get(key, value) for key, value in computed.items()})
     return replace(run, errors=errors)

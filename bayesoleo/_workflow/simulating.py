@@ -11,14 +11,17 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
+from typing import cast
 
 import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._storage.files import check_writable
+from bayesoleo._types import Array
 from bayesoleo._workflow.model_files import from_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, choose_drive, reduce
@@ -311,9 +314,12 @@ def simulate(
         point = {} if isinstance(source, Model) else source.children
         added = baselines_in(point[schema.POINT].to_dataset()) if point else []
         check_baselines(added, model)
-        records = with_common_baselines(records, added)
+        records = with_common_baselines(
+            records, added, partial(same_noise, cast(xr.DataTree, source))
+        )
         if draws is not None:
-            sets = [_with_errors(one, added, settings.seed, k) for k, one in enumerate(sets)]
+            runs = [record.label for record in records]
+            sets = [_with_errors(one, added, runs, settings.seed, k) for k, one in enumerate(sets)]
     return simulate_like(
         model,
         reduced.campaign,
@@ -329,12 +335,49 @@ def simulate(
     )
 
 
+def same_samples(tree: xr.DataTree, record: Record, output: str) -> bool:
+    """Whether a result knows a run of this label with the very same samples of an output."""
+    there, here = _stored(tree, record, output), record.samples[output]
+    return there is not None and bool(np.array_equal(there, here))
+
+
+def same_noise(tree: xr.DataTree, record: Record, output: str) -> bool:
+    """The same but for a drift, which is taken off before a run is fitted: two runs differ from
+    sample to sample by the noise of both."""
+    there, here = _stored(tree, record, output), record.samples[output]
+    if there is None:
+        return False
+    noise = max(record.signal_noise.get(output, 0.0), 1e-6 * float(np.ptp(here)))
+    return bool(np.sqrt(np.mean(np.diff(there - here) ** 2)) < noise)
+
+
+def _stored(tree: xr.DataTree, record: Record, output: str) -> Array | None:
+    """Samples of the run of the same label in a result, if they are as many."""
+    if schema.RECORDS not in tree.children:
+        return None
+    observed = tree[schema.RECORDS].to_dataset()
+    if output not in observed or record.label not in observed[schema.RUN].values:
+        return None
+    there, size = observed[output].sel({schema.RUN: record.label}).values, record.time.size
+    whole = there.size >= size and not np.isfinite(there[size:]).any()
+    return np.asarray(there[:size]) if whole else None
+
+
 def _with_errors(
-    values: Mapping[str, float], added: Sequence[Baseline], seed: int, draw: int
+    values: Mapping[str, float],
+    added: Sequence[Baseline],
+    runs: Sequence[str],
+    seed: int,
+    draw: int,
 ) -> dict[str, float]:
-    """A draw with errors of common offsets, which runs that were fitted have of their own."""
+    """A draw with an error of the common offset for each run; those that were fitted have one of
+    their own."""
     rng = np.random.default_rng([seed, draw])
-    errors = {error_of(baseline_of(one.output)): float(rng.standard_normal()) for one in added}
+    errors = {
+        f"{error_of(baseline_of(one.output))}[{run}]": float(rng.standard_normal())
+        for one in added
+        for run in runs
+    }
     return {**errors, **values}
 
 

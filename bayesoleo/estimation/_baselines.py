@@ -8,7 +8,7 @@ fitted runs have in common stands for it, with their scatter as its uncertainty.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -77,19 +77,23 @@ def common_baselines(problem: CampaignProblem, theta: Array, covariance: Array) 
         name = baseline_of(output)
         if sd_of(name) not in model.conditions:
             continue
-        rows = []
+        rows, columns = [], list[int]()
         for record in problem.predictor.records:
             prior = record.conditions.get(sd_of(name), 0.0)
             error = f"{error_of(name)}[{record.label}]"
             if prior > 0.0 and error in names:
                 k = names.index(error)
-                rows.append((record.label, prior, prior * theta[k], prior**2 * covariance[k, k]))
+                rows.append((record.label, prior, prior * theta[k]))
+                columns.append(k)
         if not rows:
             continue
-        labels, priors, means, errors = zip(*rows, strict=True)
+        labels, priors, means = zip(*rows, strict=True)
         value, count = float(np.mean(means)), len(rows)
         between = min(_scatter(means), float(np.sqrt(np.mean(np.square(priors)))))
-        sd = float(np.hypot(between * np.sqrt(1.0 + 1.0 / count), np.sqrt(np.mean(errors) / count)))
+        # What all runs share, such as an error of a preload, does not show in their scatter.
+        part = np.array(priors) / count
+        errors = float(part @ covariance[np.ix_(columns, columns)] @ part)
+        sd = float(np.hypot(between * np.sqrt(1.0 + 1.0 / count), np.sqrt(max(errors, 0.0))))
         found.append(Baseline(output, declared.unit, value, sd, labels, tuple(map(float, priors))))
     return found
 
@@ -139,8 +143,9 @@ def check_baselines(found: Sequence[Baseline], model: Model) -> None:
     """
     if not found:
         raise InputError(
-            "no output of the fitted runs drifts, so that there is no common offset",
-            key="common_offset", hint="leave it out",
+            "no common offset is known: a model has none, and in the fitted runs of this result no"
+            " output drifts, or it is of an earlier version",
+            key="common_offset", hint="leave it out, or fit again",
         )  # fmt: skip
     for one in found:
         if baseline_of(one.output) not in model.conditions:
@@ -151,12 +156,33 @@ def check_baselines(found: Sequence[Baseline], model: Model) -> None:
 
 
 def with_common_baselines(
-    records: Sequence[Record], found: Sequence[Baseline]
+    records: Sequence[Record],
+    found: Sequence[Baseline],
+    same: Callable[[Record, str], bool] = lambda record, output: True,
 ) -> tuple[Record, ...]:
     """Records with the offsets as known conditions and their uncertainty.
 
     A run that was fitted has the mean that was estimated on it.
+
+    Parameters
+    ----------
+    records : sequence of Record
+    found : sequence of Baseline
+    same : callable
+        Whether the samples of an output are those of the fitted run of this label.
+
+    Raises
+    ------
+    InputError
+        If a run has the label of a fitted one, and is another.
     """
+    for record in records:
+        for one in found:
+            if record.label in one.runs and not same(record, one.output):
+                raise InputError(
+                    "another run of this label was fitted, with a mean of its own",
+                    run=record.label, key="common_offset", hint="give this run another label",
+                )  # fmt: skip
     return tuple(_with_baselines(record, found) for record in records)
 
 

@@ -80,9 +80,10 @@ def test_its_deviation_is_that_of_one_more_run():
                 for run, sd in zip("pqr", (2.0, 2.0, 1.0), strict=True)
             )
 
-    def of(theta, runs):
+    def of(theta, runs, shared=0.0):
         few = {"names": Problem.names[:runs], "predictor": Problem.predictor}
-        (found,) = common_baselines(type("Few", (), few)(), np.array(theta), 0.01 * np.eye(runs))
+        covariance = 0.01 * np.eye(runs) + shared
+        (found,) = common_baselines(type("Few", (), few)(), np.array(theta), covariance)
         return found
 
     found = of([1.0, 1.1, 2.4], 3)
@@ -93,6 +94,9 @@ def test_its_deviation_is_that_of_one_more_run():
     # Two runs far apart, and one, have the priors.
     assert of([1.0, 9.0], 2).sd == pytest.approx(np.sqrt(1.5 * 4.0 + 0.04 / 2))
     assert of([1.0], 1).sd == pytest.approx(np.sqrt(2 * 4.0 + 0.04))
+    # An error that moves all runs alike moves their mean as far: in volts, 2 and 2 times 0.5.
+    more = of([1.0, 9.0], 2, shared=0.25).sd ** 2 - of([1.0, 9.0], 2).sd ** 2
+    assert more == pytest.approx(1.0)
 
 
 def test_a_prediction_has_it_where_that_is_asked_for(fit, saved, folder):
@@ -121,12 +125,36 @@ def test_a_fitted_run_keeps_its_own_mean(saved, folder):
     assert abs(float(found.data["bias"].sel(output="force", run="b"))) < 0.15
 
 
+def test_another_run_of_the_same_label_is_refused(saved, folder):
+    damper_campaign(folder / "namesake", still, runs=(("b", 1.2, 0.011, "fit"),), seed=4)
+    other = bo.load_campaign(folder / "namesake", progress=False)
+    with pytest.raises(InputError, match="run b, key common_offset: another run of this label"):
+        bo.load_result(saved).predict(other, common_offset=True)
+    with pytest.raises(InputError, match="give this run another label"):
+        simulate(
+            bo.load_result(saved).tree, folder / "namesake", out=folder / "no", common_offset=True
+        )
+
+
+def test_each_new_run_has_an_offset_of_its_own(fit, folder, monkeypatch):
+    runs = (("new", 1.2, 0.011, "fit"), ("next", 1.5, 0.011, "fit"))
+    damper_campaign(folder / "two", still, runs=runs, seed=4)
+    (values,) = simulating.parameter_sets(fit.tree, None, 0)
+    monkeypatch.setattr(simulating, "parameter_sets", lambda *_: [values] * 20)
+    out = folder / "two drawn"
+    simulate(fit.tree, folder / "two", out=out, draws=20, noise={"force": 0}, common_offset=True)
+    records = bo.load_campaign(out, progress=False).reduced.records
+    means = np.array([record.samples["force"].mean() for record in records])
+    kind = np.array(["next" in record.label for record in records])
+    assert abs(np.corrcoef(means[kind], means[~kind])[0, 1]) < 0.7
+
+
 def test_where_there_is_none_that_is_said(folder):
     fit = bo.Problem(folder / "plain", damper(), progress=False).fit(progress=False)
     assert fit.offsets.empty
-    with pytest.raises(InputError, match="key common_offset: no output of the fitted runs drifts"):
+    with pytest.raises(InputError, match="key common_offset: no common offset is known"):
         fit.predict(common_offset=True)
-    with pytest.raises(InputError, match="no output of the fitted runs drifts"):
+    with pytest.raises(InputError, match="no common offset is known"):
         simulate(damper(), folder / "plain", out=folder / "nowhere", common_offset=True)
 
 
