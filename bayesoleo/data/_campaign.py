@@ -573,7 +573,8 @@ def write_campaign(
         raise CampaignError(
             "folder is not empty", file=folder, hint="choose another, or pass overwrite=True"
         )
-    for text in (name, description, *(run.label for run in runs)):
+    own = [text for run in runs for text in (run.label, run.group, *run.conditions)]
+    for text in (name, description, *channels, *own):
         if "\0" in text:
             raise CampaignError("text holds a null character", value=text, hint="leave it out")
     _check_columns(channels)
@@ -597,16 +598,23 @@ _TRIAL = ".bayesoleo-"
 def is_vacant(folder: Path) -> bool:
     """Whether a new campaign can be written to a folder without touching other files.
 
-    Files that a process was moving there when it was killed are no other files.
+    Files that a process was moving there when it was killed are no other files. It moves
+    ``campaign.toml`` last: where that stands, the campaign is whole.
     """
     if not folder.exists():
         return True
     if not folder.is_dir():
         return False
-    moved = folder / _MOVED
-    half = moved.read_text(encoding="utf-8").splitlines() if moved.is_file() else []
-    ours = {_DRAFT, _MOVED, _LOCK, *half}
+    ours = {_DRAFT, _MOVED, _LOCK, *_half_moved(folder)}
     return all(item.name in ours or item.name.startswith(_TRIAL) for item in folder.iterdir())
+
+
+def _half_moved(folder: Path) -> list[str]:
+    """Files that a process was moving to a folder when it was killed, some of them there."""
+    moved = folder / _MOVED
+    if (folder / FILE).exists() or not moved.is_file():
+        return []
+    return moved.read_text(encoding="utf-8", errors="replace").splitlines()
 
 
 @contextmanager
@@ -619,8 +627,13 @@ def _moved_into(folder: Path) -> Iterator[Path]:
         yield draft
         # Last, so that a campaign.toml never stands for runs that are not there yet.
         files = sorted(draft.iterdir(), key=lambda path: path.name == FILE)
-        (draft / _MOVED).write_text("\n".join(file.name for file in files), encoding="utf-8")
+        names = [file.name for file in files]
+        older = set(_half_moved(folder)) - set(names)
+        (draft / _MOVED).write_text("\n".join([*names, *sorted(older)]), encoding="utf-8")
         os.replace(draft / _MOVED, folder / _MOVED)
+        (folder / FILE).unlink(missing_ok=True)  # of what is overwritten, before its runs go
+        for name in older:
+            (folder / name).unlink(missing_ok=True)
         for file in files:
             os.replace(file, folder / file.name)
         draft.rmdir()

@@ -48,11 +48,27 @@ def load_table(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise _no_campaign(path)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CampaignError(
             f"not valid TOML: {error}", file=path.name, hint=_slip(path, str(error))
         ) from error
+    _check_texts(table)
+    return table
+
+
+def _check_texts(table: Mapping[str, Any], run: str | None = None) -> None:
+    """Refuse null characters in keys and texts: netCDF cannot keep them."""
+    for key, value in table.items():
+        items = value if isinstance(value, list) else [value]
+        if any("\0" in text for text in (key, *items) if isinstance(text, str)):
+            raise CampaignError(
+                "text holds a null character", file=FILE, run=run, key=key, value=value,
+                hint="leave it out",
+            )  # fmt: skip
+        for item in items:
+            if isinstance(item, Mapping):
+                _check_texts(item, str(item.get("label", run)) if key == "runs" else run)
 
 
 def _slip(path: Path, problem: str) -> str | None:
@@ -98,9 +114,6 @@ def get_value(
         raise CampaignError(
             "wrong kind of value", file=FILE, run=run, key=key, value=value, hint=f"write {hint}"
         )
-    if isinstance(value, str) and "\0" in value:  # netCDF cannot keep it
-        problem = "text holds a null character"
-        raise CampaignError(problem, file=FILE, run=run, key=key, value=value, hint=f"write {hint}")
     return float(value) if kind is float else value
 
 

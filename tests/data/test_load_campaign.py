@@ -246,10 +246,16 @@ def test_two_runs_of_the_same_samples(make_campaign):
     assert len(load_campaign(make_campaign(first, table(4.0))).runs) == 2
 
 
-def test_a_null_character_in_a_text(make_campaign):
-    campaign = make_campaign({'label = "a"': 'label = "a\\u0000"'})
-    with pytest.raises(CampaignError, match="key label: text holds a null character"):
-        load_campaign(campaign)
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ('label = "a"', 'label = "a\\u0000"', "label"),
+        ("initial_pressure =", '"initial\\u0000pressure" =', "initial"),
+    ],
+)
+def test_a_null_character_is_refused(make_campaign, old, new, key):
+    with pytest.raises(CampaignError, match=f"key {key}.*: text holds a null character"):
+        load_campaign(make_campaign({old: new}))
 
 
 def test_two_runs_of_one_label(make_campaign):

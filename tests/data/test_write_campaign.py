@@ -108,6 +108,48 @@ def test_what_a_killed_process_was_moving_is_written_anew(tmp_path, monkeypatch,
     assert not list(tmp_path.glob(".campaign*"))
 
 
+def test_a_campaign_that_is_whole_is_not_written_over(tmp_path):
+    runs = [simulated("a", np.random.default_rng(1))]
+    write_campaign(tmp_path, name="one", channels=CHANNELS, runs=runs)
+    # A process was killed before it removed its list.
+    (tmp_path / ".campaign-files").write_text("a.csv\ncampaign.toml")
+    with pytest.raises(CampaignError, match="folder is not empty"):
+        write_campaign(tmp_path, name="two", channels=CHANNELS, runs=runs)
+    assert load_campaign(tmp_path).name == "one"
+
+
+def test_a_process_that_is_killed_while_it_overwrites_leaves_no_mixture(tmp_path, monkeypatch):
+    write_campaign(
+        tmp_path, name="one", channels=CHANNELS,
+        runs=[simulated(label, np.random.default_rng(1)) for label in "ab"],
+    )  # fmt: skip
+    place = os.replace
+
+    def killed(source, target):
+        if Path(target).name == "d.csv":
+            raise KeyboardInterrupt
+        place(source, target)
+
+    monkeypatch.setattr("os.replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_campaign(
+            tmp_path, name="two", channels=CHANNELS, overwrite=True,
+            runs=[simulated(label, np.random.default_rng(2)) for label in "acd"],
+        )  # fmt: skip
+    monkeypatch.undo()
+    with pytest.raises(CampaignError, match="no such file"):
+        load_campaign(tmp_path)
+
+
+def test_files_of_two_processes_that_were_killed_are_swept(tmp_path):
+    for name in ("a.csv", "b.csv", "x.csv"):
+        (tmp_path / name).write_text("half")
+    (tmp_path / ".campaign-files").write_text("a.csv\nx.csv\nb.csv\ncampaign.toml")
+    runs = [simulated("a", np.random.default_rng(1))]
+    write_campaign(tmp_path, name="one", channels=CHANNELS, runs=runs)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "campaign.toml"]
+
+
 def test_files_of_others_are_spared_beside_those_of_a_killed_process(tmp_path):
     (tmp_path / ".campaign-files").write_text("a.csv\ncampaign.toml")
     (tmp_path / "b.csv").write_text("mine")
