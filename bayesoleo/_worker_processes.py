@@ -156,13 +156,15 @@ def load(modules: Sequence[str]) -> None:
     """
     if all(name in sys.modules for name in modules):
         return
+    was_on = gc.isenabled()
     gc.disable()
     try:
         for name in modules:
             importlib.import_module(name)
     finally:
         gc.freeze()
-        gc.enable()
+        if was_on:
+            gc.enable()
 
 
 def _usable() -> bool:

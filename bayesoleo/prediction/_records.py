@@ -110,9 +110,10 @@ def _sum_of_harmonics(cycles: Array, orders: Integers, rates: ComplexArray) -> A
 
     The exponentials take the time. Each of many is the product of one whose order is a multiple of
     ``TABLE`` and one whose order is below: as many are computed as a table has rows and columns,
-    and not as it has fields.
+    and not as it has fields. Where most fields would be empty, that is no gain.
     """
-    if orders.size <= 2 * TABLE:
+    highest = int(orders[-1]) if orders.size else 0
+    if orders.size <= TABLE + highest // TABLE:  # few, or far apart
         return np.asarray((np.exp(2j * np.pi * np.outer(cycles, orders)) @ rates).real)
     high, low = np.divmod(orders, TABLE)
     table = np.zeros((TABLE, int(high[-1]) + 1), dtype=complex)

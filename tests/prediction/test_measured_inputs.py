@@ -81,11 +81,13 @@ def test_of_a_transient_noise_above_the_band_of_the_motion_is_not_fed_back():
     assert np.std((shown - slow)[20:-20]) < 0.6 * noise.std()
 
 
-@pytest.mark.parametrize("highest", [40, 130, 900])
+@pytest.mark.parametrize(
+    ("highest", "count"), [(40, 40), (130, 130), (900, 900), (900, 100), (900, 30)]
+)
 @pytest.mark.parametrize("derivative", [0, 2])
-def test_many_harmonics_are_the_sum_of_each(highest, derivative):
+def test_many_harmonics_are_the_sum_of_each(highest, count, derivative):
     rng = np.random.default_rng(highest)
-    orders = np.sort(rng.choice(highest + 1, size=highest, replace=False))
+    orders = np.sort(rng.choice(highest + 1, size=count, replace=False))
     value = rng.standard_normal((2, orders.size)) / (1.0 + orders**derivative)
     signal = Harmonics(orders, value[0] + 1j * value[1] * (orders > 0), np.ones(orders.size))
     phase, expected = rng.uniform(0.0, 3.0, 700), np.zeros(700)
