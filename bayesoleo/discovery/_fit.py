@@ -561,8 +561,12 @@ def changed_squares(
     weight : ndarray, shape (N,)
         One for samples that count, zero for others.
     """
+    counts = weight > 0
+    if not counts.any():
+        return 0.0, 0.0
+    measured, here, other = (values[:, counts] for values in (measured, here, other))
     squares = np.mean((other - here) ** 2, axis=1)
-    products = np.sum(np.where(weight > 0, (measured - other) * (other - here), 0.0), axis=1)
+    products = np.sum((measured - other) * (other - here), axis=1)
     shown = products * _is_shown(measured, squares)
     along = float(np.sum(2.0 * shown / np.maximum(variance, 1e-300)))
     return visible(measured, squares, variance), along

@@ -220,7 +220,8 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
         if found.status.ok:
             solved = finer.set_anchor(found.vector)[0] is Status.CONVERGED
             halved = finer.simulate(found.vector[None], 0).y[0] if solved else np.array(np.nan)
-            left = np.mean((run.measured - found.y) ** 2, axis=1)
+            counts = weights(record) > 0
+            left = np.mean((run.measured - found.y)[:, counts] ** 2, axis=1)
             if np.isfinite(halved).all():
                 own = changed_squares(run.measured, found.y, halved, left, weights(record))
                 if own[0] + abs(own[1]) <= fit.policy.unseen:

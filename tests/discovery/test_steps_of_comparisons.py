@@ -7,7 +7,13 @@ import pytest
 from scipy.fft import irfft
 
 from bayesoleo.discovery import _fit
-from bayesoleo.discovery._fit import Numerics, fit_model, for_comparison, visible
+from bayesoleo.discovery._fit import (
+    Numerics,
+    changed_squares,
+    fit_model,
+    for_comparison,
+    visible,
+)
 from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.discovery._score_basis import sensitivities_of
 from bayesoleo.model import Dof, Model, Output, Parameter
@@ -317,3 +323,20 @@ def test_what_has_settled_does_not_show():
     measured = np.random.default_rng(0).standard_normal((1, 100))
     assert visible(measured, np.array([1e-12]), np.array([1e-30])) == 0.0
     assert visible(measured, np.array([1e-6]), np.array([1e-4])) == pytest.approx(1.0)
+
+
+def test_masked_samples_change_nothing():
+    """A few masked spikes make the variance of a record so large that no change would show."""
+    rng = np.random.default_rng(3)
+    measured = rng.standard_normal((2, 500))
+    here, other = (measured + 0.1 * rng.standard_normal((2, 500)) for _ in range(2))
+    weight, variance = np.ones(500), np.array([0.5, 2.0])
+    weight[::100] = 0.0
+    counts = weight > 0
+    expected = changed_squares(
+        measured[:, counts], here[:, counts], other[:, counts], variance, weight[counts]
+    )
+    measured[:, ~counts], other[:, ~counts] = 1e9, -1e3
+    assert expected[0] > 0
+    assert changed_squares(measured, here, other, variance, weight) == expected
+    assert changed_squares(measured, here, other, variance, np.zeros(500)) == (0.0, 0.0)
