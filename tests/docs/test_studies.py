@@ -59,7 +59,7 @@ def test_study_without_data_says_so_and_shows_its_last_run(
     assert "not on this machine" in capsys.readouterr().out
     assert study.run(lambda: 1 / 0) is None
     study.text("rounds", lambda: 1 / 0)
-    assert "cubic_stiffness" in capsys.readouterr().out
+    assert "cubic stiffness" in capsys.readouterr().out
     width, height = study.figure("spectrum", lambda: 1 / 0).get_size_inches()
     assert (width, height) == (10.0, 4.2)
 
