@@ -33,6 +33,11 @@ from bayesoleo.model._model import Model
 #: slope of its root would be infinite at zero, and no number beyond, where it is zero.
 _LEAST_BASE = sp.Float(1e-100)
 
+#: Rows of a result above which those that are the same at all points are written one after the
+#: other. All rows at one point lie so many cache lines apart that they share eight places in the
+#: nearest cache, of eight lines each: more rows push each other out before a line is full.
+MANY_ROWS = 64
+
 _CALLS = {name: name for name in ("exp", "log", "sin", "cos", "tan", "tanh")} | {"atan": "arctan"}
 
 
@@ -547,21 +552,46 @@ def machine_code(items: Sequence[sp.Expr], derived: Derived) -> str:
     made = _Instructions(_rows(derived))
     for name, body in shared:
         made.define(name, body)
+    constant: dict[str, list[int]] = {}
     for row, expression in enumerate(reduced):
-        made.store(row, made.value(expression))
-    return _LOOP.format(outside="\n  ".join(made.outside), inside="\n  ".join(made.inside))
+        value = made.value(expression)
+        if value.fixed and len(reduced) > MANY_ROWS:
+            constant.setdefault(value.name, []).append(row)
+        else:
+            made.store(row, value)
+    places = [
+        f"@places{k} = internal constant [{len(rows)} x i64] "
+        f"[{', '.join(f'i64 {row * BLOCK}' for row in rows)}]"
+        for k, rows in enumerate(constant.values())
+    ]
+    fills = [
+        _FILL.format(k=k, after=k + 1, value=value, rows=len(rows))
+        for k, (value, rows) in enumerate(constant.items())
+    ]
+    return _KERNEL.format(
+        places="\n".join(places),
+        outside="\n  ".join(made.outside),
+        fills="".join(fills),
+        last=len(fills),
+        inside="\n  ".join(made.inside),
+    )
 
 
-#: The arrays of a call do not overlap.
-_LOOP = """
+#: The arrays of a call do not overlap. Loops stay loops: a function of the C library, which the
+#: compiler would call to write zeros, may be unknown where the code is loaded.
+_KERNEL = """
+{places}
 define void @kernel(ptr noalias readonly %z, ptr noalias readonly %u, ptr noalias readonly %p,
-                    ptr noalias %out, i64 %count) {{
+                    ptr noalias %out, i64 %count) "no-builtin-memset" {{
 entry:
   {outside}
   %any = icmp sgt i64 %count, 0
-  br i1 %any, label %loop, label %end
+  br i1 %any, label %fill0, label %end
+{fills}
+fill{last}:
+  br label %loop
 loop:
-  %i = phi i64 [ 0, %entry ], [ %next, %loop ]
+  %i = phi i64 [ 0, %fill{last} ], [ %next, %loop ]
   {inside}
   %next = add nuw nsw i64 %i, 1
   %more = icmp slt i64 %next, %count
@@ -569,6 +599,28 @@ loop:
 end:
   ret void
 }}
+"""
+#: Rows of one value that is the same at all points.
+_FILL = """
+fill{k}:
+  br label %row{k}
+row{k}:
+  %at{k} = phi i64 [ 0, %fill{k} ], [ %following{k}, %row{k}_end ]
+  %entry{k} = getelementptr i64, ptr @places{k}, i64 %at{k}
+  %place{k} = load i64, ptr %entry{k}
+  %row{k}_out = getelementptr double, ptr %out, i64 %place{k}
+  br label %point{k}
+point{k}:
+  %i{k} = phi i64 [ 0, %row{k} ], [ %next{k}, %point{k} ]
+  %to{k} = getelementptr double, ptr %row{k}_out, i64 %i{k}
+  store double {value}, ptr %to{k}
+  %next{k} = add nuw nsw i64 %i{k}, 1
+  %more{k} = icmp slt i64 %next{k}, %count
+  br i1 %more{k}, label %point{k}, label %row{k}_end
+row{k}_end:
+  %following{k} = add nuw nsw i64 %at{k}, 1
+  %others{k} = icmp slt i64 %following{k}, {rows}
+  br i1 %others{k}, label %row{k}, label %fill{after}
 """
 
 

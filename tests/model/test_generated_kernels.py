@@ -1,5 +1,6 @@
 """Generated kernels compute what SymPy does, in both back ends, on both sides of every kink."""
 
+import ctypes
 import importlib.util
 import pickle
 import shutil
@@ -11,13 +12,20 @@ import sympy as sp
 from hypothesis import HealthCheck, assume, given, settings, strategies as st
 from llvmlite import binding as llvm
 
-from bayesoleo._compiled import BlockKernel
+from bayesoleo._compiled import BLOCK, BlockKernel
 from bayesoleo._machine_code import _target_machine, address_of, cache_folder, unsealed
 from bayesoleo.errors import ModelError
 from bayesoleo.model import Condition, Model, Output, Parameter
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._expressions import FUNCTIONS, symbol
-from bayesoleo.model._kernels import _counts, _results, kernels, machine_code, statements
+from bayesoleo.model._kernels import (
+    MANY_ROWS,
+    _counts,
+    _results,
+    kernels,
+    machine_code,
+    statements,
+)
 from bayesoleo.systems import system
 from bayesoleo.systems._oleo import thermomechanical_oleo
 
@@ -435,3 +443,31 @@ def test_a_ratio_of_two_numbers_near_zero_is_a_number():
     tiny = np.array([1e-310, 3e-310])
     y, _ = evaluated(model_of("x/w"), "numba", tiny, tiny[::-1], np.array([[1.0, 1.0]]))
     np.testing.assert_allclose(y[0, 0], [1 / 3, 3.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 3, 48, 64])
+def test_rows_that_are_the_same_at_all_points_are_written_apart_where_rows_are_many(count):
+    """With each value in its row, and nothing beyond the points that are asked for. Written point
+    by point, hundreds of rows push each other out of the cache."""
+    rng = np.random.default_rng(11)
+    derived = derive(model_of("a*x + b*w"))
+    x, w, a, b = (symbol(name) for name in NAMES)
+    shapes = [sp.Integer(0), sp.Integer(1), a, a * b, x, a * x * w, sp.Float(-2.5)]
+    items = [shapes[k] for k in rng.integers(len(shapes), size=MANY_ROWS + 33)]
+    moving = sum(item.has(x) or item.has(w) for item in items)
+    source = machine_code(items, derived)
+    assert source[source.index("\nloop:") :].count("store") == moving
+    u = np.zeros((len(derived.inputs), BLOCK))
+    table = {row: k for k, row in enumerate(derived.inputs)}
+    u[:] = rng.standard_normal(u.shape)
+    p = np.array([{"a": 0.7, "b": -1.3}[name] for name in derived.constants])
+    out = np.full((len(items), BLOCK), np.nan)
+    signature = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_ssize_t)
+    signature(address_of(source))(None, *[part.ctypes.data for part in (u, p, out)], count)
+    assert np.isnan(out[:, count:]).all()
+    known = dict(zip((symbol(name) for name in derived.constants), p, strict=True))
+    for row, item in enumerate(items):
+        at = {symbol(name): u[k] for (name, _), k in table.items()}
+        function = sp.lambdify(list(at), item.subs(known))
+        expected = np.broadcast_to(function(*at.values()), BLOCK)[:count]
+        np.testing.assert_allclose(out[row, :count], expected, rtol=1e-14)
