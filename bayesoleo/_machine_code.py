@@ -145,6 +145,11 @@ def _target() -> tuple[str, str, str]:
     return llvm.get_process_triple(), _SETTINGS.CPU_NAME or llvm.get_host_cpu_name(), features
 
 
+def has_wide_registers() -> bool:
+    """Whether eight numbers fill one register (AVX-512), of which there are 32."""
+    return "+avx512f" in _target()[2].split(",")
+
+
 def _target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

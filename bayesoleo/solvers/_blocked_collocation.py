@@ -4,8 +4,9 @@ Straight-line code for a step grows as the cube of its unknowns. Here the lines 
 dofs: loops go over them, and each number of a loop is a vector of the same step in all chunks. The
 stages of a dof are one block of the matrix, and blocks are eliminated in the registers. Equations
 of most systems couple few dofs with each other; a block in which all numbers are zero is passed by,
-at run time, since code is made for a scheme and the orders of the dofs alone. Nothing but zeros
-would be subtracted, so the result is the same to the last bit.
+at run time, since code is made for a scheme and the orders of the dofs alone. It is neither written
+nor read, but where an elimination fills it. Nothing but zeros would be subtracted, so the result is
+the same to the last bit.
 
 A row of steps keeps, one behind the other: the stages' equations ``(s d, s d + D + 1)``, with the
 factors on the left and on the right what stages owe to the components of the first state and to the
@@ -20,12 +21,16 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from bayesoleo._compiled import BLOCK
+from bayesoleo._machine_code import has_wide_registers
 from bayesoleo.solvers._elimination import SMALL_PIVOT
 from bayesoleo.solvers._mesh import Tableau
 from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH, Source, joined, literal
 
-#: Rows and columns of a matrix product whose sums stand in registers at once.
-TILE = 2, 4
+#: Rows and columns of a matrix product whose sums stand in registers at once: of vectors that fill
+#: one of 32 registers each, and of vectors that fill two of 16. Sums that find no register are
+#: written and read in every step, which takes half as long again. The result is the same to the
+#: last bit.
+WIDE_TILE, TILE = (2, 4), (3, 2)
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,14 @@ class _Rows(Source):
         start = f"base + {(self.layout.sizes + which * self.layout.own) * WIDTH}"
         return vector("transfer", f"{start} + ({line})*{WIDTH}")
 
+    def flag(self, line: str, column: str) -> str:
+        """Whether a block of the factors is not zero."""
+        return f"transfer[base + {self.layout.flags * WIDTH} + {line}*{self.layout.d} + {column}]"
+
+    def where(self, line: str, column: str) -> None:
+        """Begin what is done only where a block is not zero."""
+        self.loop(f"if {self.flag(line, column)} != 0.0:")
+
 
 def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     """Stages from the first state, and the last state from it: ``eliminate`` of a program."""
@@ -146,7 +159,7 @@ def elimination(orders: Sequence[int], method: Tableau, steps: int) -> str:
     source.add("h2 = h1*h1")
     _assemble(source, method, steps)
     _factorise(source)
-    _back(source, layout.own, known=False)
+    _back(source, layout.own)
     _ends(source, method, 0)
     source.end()
     source.add("return failed")
@@ -165,7 +178,8 @@ def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     for q in range(s):
         source.add(f"x{q} = -{vector('out', f'e*{BLOCK} + {q * steps} + at')}")
     source.loop("for c in range(e):")
-    _unless_zero(source, "e", "c", known=True)
+    source.where("e", "c")
+    _block(source, "e", "c")
     for p in range(s):
         source.add(f"r{p} = {source.own(f'c*{s} + {p}', str(constant))}")
     for q in range(s):
@@ -178,7 +192,7 @@ def substitution(orders: Sequence[int], method: Tableau, steps: int) -> str:
     for q in range(s):
         source.add(f"{source.own(f'e*{s} + {q}', str(constant))} = x{q}")
     source.end()
-    _back(source, constant, known=True)
+    _back(source, constant)
     _ends(source, method, layout.state)
     return "\n".join(source.lines)
 
@@ -187,43 +201,62 @@ def _assemble(source: _Rows, method: Tableau, steps: int) -> None:
     """Emit the equations of the stages, the stages of a dof next to each other, and sums of squares
     of their residuals and of their terms."""
     layout, s = source.layout, method.stages
-    nz, aa, stages = layout.state + layout.d, method.a @ method.a, range(s)
+    stages = range(s)
     source.loop(f"for e in range({layout.d}):")
     for i in stages:
         source.add(f"l{i} = {vector('out', f'e*{BLOCK} + {i * steps} + at')}")
         source.add(f"t{i} = l{i}*l{i}")
+        # A pivot is looked at whether it is zero or not.
+        for k in stages:
+            source.add(f"{source.own(f'e*{s} + {i}', f'e*{s} + {k}')} = 0.0")
     _add_to(source, "e", stages)
     for run in layout.runs:
         source.loop(f"for j in range({run.count}):")
-        for i in stages:
-            row = f"{layout.d} + e*{nz} + {run.row} + j*{run.order + 1}"
-            for k in range(run.order + 1):
-                place = f"({row} + {k})*{BLOCK} + {i * steps} + at"
-                source.add(f"g{k} = {vector('out', place)}")
-                place = f"({run.row} + j*{run.order + 1} + {k})*{BLOCK} + {i * steps} + at"
-                source.add(f"term = g{k}*{vector('z', place)}")
-                source.add(f"t{i} = t{i} + term*term")
-            source.add(f"once = h1*g{run.order - 1}")
-            if run.order == 2:
-                source.add("twice = h2*g0")
-            for st in stages:
-                terms = [f"{literal(method.a[i, st])}*once"]
-                terms += [f"{literal(aa[i, st])}*twice"] if run.order == 2 else []
-                terms += [f"g{run.order}"] if st == i else []
-                column = f"({run.first} + j)*{s} + {st}"
-                source.add(f"{source.own(f'e*{s} + {i}', column)} = {joined(terms)}")
-            column = f"{layout.own + run.state} + j*{run.order}"
-            source.add(f"{source.own(f'e*{s} + {i}', column)} = -g0")
-            if run.order == 2:
-                slope = f"-({literal(method.c[i])}*h1*g0 + g1)"
-                source.add(f"{source.own(f'e*{s} + {i}', f'{column} + 1')} = {slope}")
+        _assemble_block(source, run, method, steps)
         source.end()
+    source.add(f"{source.flag('e', 'e')} = 1.0")
     _add_to(source, f"{layout.d} + e", stages)
     for i in stages:
         source.add(f"{source.own(f'e*{s} + {i}', str(layout.width - 1))} = -l{i}")
         source.add(f"size = abs({source.own(f'e*{s} + {i}', f'e*{s} + {i}')})")
         source.add(f"{source.size(f'e*{s} + {i}')} = size")
         source.add(f"{source.size(f'e*{s} + {i}', 1)} = size")
+    source.end()
+
+
+def _assemble_block(source: _Rows, run: Run, method: Tableau, steps: int) -> None:
+    """Emit how the stages of equation ``e`` depend on those of dof ``j`` of a run, and on its first
+    state. Where they do not, only the latter is written."""
+    layout, s = source.layout, method.stages
+    nz, aa, stages = layout.state + layout.d, method.a @ method.a, range(s)
+    derivatives = [(i, k) for i in stages for k in range(run.order + 1)]
+    for i, k in derivatives:
+        row = f"{layout.d} + e*{nz} + {run.row + k} + j*{run.order + 1}"
+        source.add(f"g{i}_{k} = {vector('out', f'({row})*{BLOCK} + {i * steps} + at')}")
+    for i in stages:
+        line, column = f"e*{s} + {i}", f"{layout.own + run.state} + j*{run.order}"
+        source.add(f"{source.own(line, column)} = -g{i}_0")
+        if run.order == 2:
+            slope = f"-({literal(method.c[i])}*h1*g{i}_0 + g{i}_1)"
+            source.add(f"{source.own(line, f'{column} + 1')} = {slope}")
+    flag = source.flag("e", f"({run.first} + j)")
+    source.add(f"{flag} = 0.0")
+    source.loop(f"if any({joined([f'abs(g{i}_{k})' for i, k in derivatives])} != 0.0):")
+    source.add(f"{flag} = 1.0")
+    for i, k in derivatives:
+        place = f"({run.row} + j*{run.order + 1} + {k})*{BLOCK} + {i * steps} + at"
+        source.add(f"term = g{i}_{k}*{vector('z', place)}")
+        source.add(f"t{i} = t{i} + term*term")
+    for i in stages:
+        source.add(f"once = h1*g{i}_{run.order - 1}")
+        if run.order == 2:
+            source.add(f"twice = h2*g{i}_0")
+        for st in stages:
+            terms = [f"{literal(method.a[i, st])}*once"]
+            terms += [f"{literal(aa[i, st])}*twice"] if run.order == 2 else []
+            terms += [f"g{i}_{run.order}"] if st == i else []
+            column = f"({run.first} + j)*{s} + {st}"
+            source.add(f"{source.own(f'e*{s} + {i}', column)} = {joined(terms)}")
     source.end()
 
 
@@ -258,7 +291,47 @@ def _factorise(source: _Rows) -> None:
                 if o == q:
                     source.add(f"s{q} = s{q} + abs(g)")
                 source.add(f"{source.own(f'c*{s} + {q}', f'c*{s} + {o}')} = m{q}_{o}")
-    source.loop(f"for k in range((c + 1)*{s}, {layout.width}):")
+    source.loop(f"for j in range(c + 1, {layout.d}):")
+    source.where("c", "j")
+    _within(source, f"j*{s}", f"(j + 1)*{s}")
+    source.end(2)
+    _within(source, str(layout.own), str(layout.width))
+    source.loop(f"for e in range(c + 1, {layout.d}):")
+    source.where("e", "c")
+    _block(source, "e", "c")
+    for q in range(s):
+        for p in range(s):
+            terms = [f"b{q}_{o}*m{o}_{p}" for o in range(p)]
+            left = f"b{q}_{p}" if not terms else f"(b{q}_{p} - ({joined(terms)}))"
+            source.add(f"b{q}_{p} = {left}*v{p}")
+            source.add(f"{source.own(f'e*{s} + {q}', f'c*{s} + {p}')} = b{q}_{p}")
+    source.where("c", "e")
+    for q in range(s):
+        source.add(f"size = {source.size(f'e*{s} + {q}')}")
+        for p in range(s):
+            above = source.own(f"c*{s} + {p}", f"e*{s} + {q}")
+            source.add(f"size = size + abs(b{q}_{p}*{above})")
+        # Within a dof's own block what its stages take from each other comes later.
+        source.add(f"{source.size(f'e*{s} + {q}')} = size")
+    source.end()
+    source.loop(f"for j in range(c + 1, {layout.d}):")
+    source.where("c", "j")
+    source.loop(f"if {source.flag('e', 'j')} < 1.0:")
+    for q in range(s):
+        for p in range(s):
+            source.add(f"{source.own(f'e*{s} + {q}', f'j*{s} + {p}')} = 0.0")
+    source.add(f"{source.flag('e', 'j')} = 1.0")
+    source.end()
+    _subtract(source, "e", "c", f"j*{s}", f"(j + 1)*{s}")
+    source.end(2)
+    _subtract(source, "e", "c", str(layout.own), str(layout.width))
+    source.end(3)
+
+
+def _within(source: _Rows, first: str, end: str) -> None:
+    """Subtract from the lines of a dof what the stages before them have in the same columns."""
+    s = source.layout.stages
+    source.loop(f"for k in range({first}, {end}):")
     for q in range(s):
         source.add(f"r{q} = {source.own(f'c*{s} + {q}', 'k')}")
         for p in range(q):
@@ -266,43 +339,17 @@ def _factorise(source: _Rows) -> None:
         if q:
             source.add(f"{source.own(f'c*{s} + {q}', 'k')} = r{q}")
     source.end()
-    source.loop(f"for e in range(c + 1, {layout.d}):")
-    _unless_zero(source, "e", "c")
-    for q in range(s):
-        source.add(f"size = {source.size(f'e*{s} + {q}')}")
-        for p in range(s):
-            terms = [f"b{q}_{o}*m{o}_{p}" for o in range(p)]
-            left = f"b{q}_{p}" if not terms else f"(b{q}_{p} - ({joined(terms)}))"
-            source.add(f"b{q}_{p} = {left}*v{p}")
-            source.add(f"{source.own(f'e*{s} + {q}', f'c*{s} + {p}')} = b{q}_{p}")
-            above = source.own(f"c*{s} + {p}", f"e*{s} + {q}")
-            source.add(f"size = size + abs(b{q}_{p}*{above})")
-        # Within a dof's own block what its stages take from each other comes later.
-        source.add(f"{source.size(f'e*{s} + {q}')} = size")
-    _subtract(source, "e", "c", f"(c + 1)*{s}", layout.width)
-    source.end(3)
 
 
-def _unless_zero(source: _Rows, line: str, column: str, known: bool = False) -> None:
-    """Load a block into ``b``, and go on where any of its numbers is not zero.
-
-    Whether that is so is kept: what is not looked at again need not come from memory.
-    """
-    s, layout, blocks = source.layout.stages, source.layout, []
-    flag = f"transfer[base + {layout.flags * WIDTH} + {line}*{layout.d} + {column}]"
-    if known:
-        source.loop(f"if {flag} != 0.0:")
+def _block(source: _Rows, line: str, column: str) -> None:
+    """Load a block into ``b``."""
+    s = source.layout.stages
     for q in range(s):
         for p in range(s):
             source.add(f"b{q}_{p} = {source.own(f'{line}*{s} + {q}', f'{column}*{s} + {p}')}")
-            blocks.append(f"abs(b{q}_{p})")
-    if not known:
-        source.add(f"{flag} = 0.0")
-        source.loop(f"if any({joined(blocks)} != 0.0):")
-        source.add(f"{flag} = 1.0")
 
 
-def _subtract(source: _Rows, line: str, other: str, first: str, end: int) -> None:
+def _subtract(source: _Rows, line: str, other: str, first: str, end: str) -> None:
     """Subtract the block ``b`` times the rows of another dof from those of one dof."""
     s = source.layout.stages
     source.loop(f"for k in range({first}, {end}):")
@@ -316,14 +363,15 @@ def _subtract(source: _Rows, line: str, other: str, first: str, end: int) -> Non
     source.end()
 
 
-def _back(source: _Rows, first: int, *, known: bool) -> None:
+def _back(source: _Rows, first: int) -> None:
     """Emit back substitution of the right-hand sides from one column on."""
     layout, s = source.layout, source.layout.stages
     source.loop(f"for backwards in range({layout.d}):")
     source.add(f"e = {layout.d - 1} - backwards")
     source.loop(f"for c in range(e + 1, {layout.d}):")
-    _unless_zero(source, "e", "c", known)
-    _subtract(source, "e", "c", str(first), layout.width)
+    source.where("e", "c")
+    _block(source, "e", "c")
+    _subtract(source, "e", "c", str(first), str(layout.width))
     source.end(2)
     for q in range(s):
         for p in range(q, s):
@@ -394,7 +442,8 @@ def chain(orders: Sequence[int], stages: int, *, constants_only: bool = False) -
     source = _Rows(name, "transfer, history, rows, width", layout)
     source.rows("rows")
     source.add(f"before = t*{D * (D + 1) * WIDTH}")
-    high, wide = (4, 1) if constants_only else TILE
+    tile = WIDE_TILE if has_wide_registers() else TILE
+    high, wide = (4, 1) if constants_only else tile
     lines, columns = _tiles(D, high), [(D, 1, 1)] if constants_only else _tiles(D + 1, wide)
     for i0, i_count, rows in lines:
         source.loop(f"for i in range({i_count}):")

@@ -46,7 +46,9 @@ _COMPARISONS = {
 _Value = tuple[str, str]
 
 
-def instructions(source: str, pointers: Collection[str], returned: str = "void") -> str:
+def instructions(
+    source: str, pointers: Collection[str], returned: str = "void", *, apart: bool = False
+) -> str:
     """LLVM's text of a function for :func:`~bayesoleo._machine_code.address_of`.
 
     Parameters
@@ -57,10 +59,13 @@ def instructions(source: str, pointers: Collection[str], returned: str = "void")
         Arguments that are arrays of numbers; the others are whole numbers.
     returned : str
         Type of what it returns.
+    apart : bool
+        Tell the compiler that no two of the arrays overlap. It need not ask before each loop, and
+        may read ahead of what is written.
     """
     (function,) = ast.parse(source).body
     assert isinstance(function, ast.FunctionDef)
-    return _Function(function, pointers).text(returned)
+    return _Function(function, pointers, apart).text(returned)
 
 
 class _Function:
@@ -69,8 +74,8 @@ class _Function:
     Variables stand in memory; the compiler brings them into registers.
     """
 
-    def __init__(self, function: ast.FunctionDef, pointers: Collection[str]):
-        self._function = function
+    def __init__(self, function: ast.FunctionDef, pointers: Collection[str], apart: bool):
+        self._function, self._array = function, "ptr noalias" if apart else "ptr"
         self._pointers = set(pointers)
         self._variables: dict[str, str] = {}
         self._first: list[str] = []
@@ -82,7 +87,7 @@ class _Function:
         arguments = []
         for item in self._function.args.args:
             if item.arg in self._pointers:
-                arguments.append(f"ptr %{item.arg}")
+                arguments.append(f"{self._array} %{item.arg}")
             else:
                 arguments.append(f"{_WHOLE} %given_{item.arg}")
                 self._assign(item.arg, (f"%given_{item.arg}", _WHOLE))

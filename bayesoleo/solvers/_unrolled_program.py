@@ -48,8 +48,9 @@ LARGEST = 6
 #: Dofs up to which there are loops for collocation; the matrices of a period's steps, which are
 #: kept, grow as their square.
 LARGEST_BLOCKED = 16
-#: Steps with old derivatives that cost less than one with new ones: of short code, and of long.
-FEW_CHORDS, MOST_CHORDS = 2, 3
+#: Steps with old derivatives before new ones are made: of short code, where one with new ones costs
+#: less than two, and of long, where it costs two to five.
+FEW_CHORDS, MOST_CHORDS = 2, 5
 _P, _I = types.CPointer(types.float64), types.intp
 #: Of the pieces, see :class:`Program`.
 SIGNATURES = {
@@ -243,10 +244,19 @@ class Program:
 
 
 def _compile(parts: Sequence[str]) -> dict[str, int]:
-    """Addresses of the pieces, in their order."""
+    """Addresses of the pieces, in their order.
+
+    Arrays of a call never overlap. The chain of many dofs is not told so: the compiler would read
+    so far ahead that the sums of a tile lose their registers.
+    """
     return {
         name: address_of(
-            instructions(part, ARRAYS, returned="i64" if name == "eliminate" else "void")
+            instructions(
+                part,
+                ARRAYS,
+                returned="i64" if name == "eliminate" else "void",
+                apart=name != "chain",
+            )
         )
         for name, part in zip(SIGNATURES, parts, strict=True)
     }

@@ -12,6 +12,7 @@ from bayesoleo.model import Model, Parameter
 from bayesoleo.solvers import (
     _period_arrangement as arrangement,
     _periodic as periodic,
+    _periodic_newton as newton,
     _unrolled_program as program,
 )
 from bayesoleo.solvers._mesh import tableau
@@ -22,13 +23,21 @@ FORCE, FREQUENCY = harmonics(h0=0.1, h1=0.5 + 0.1j, h2=0.1j), 0.2
 NOMINAL = np.array([0.3, 0.7, 0.5])
 
 
+def linked(d: int, ties: str) -> np.ndarray:
+    """Which masses are tied to each other."""
+    apart = abs(np.subtract.outer(np.arange(d), np.arange(d)))
+    one = np.minimum.outer(np.arange(d), np.arange(d)) == 0
+    return {"next": apart == 1, "all": apart > 0, "first": one & (apart > 0)}[ties]
+
+
 @cache
-def chain(d: int, everyone: bool = False) -> Model:
-    """Masses on cubic springs, each tied to the next, or to all others; the first is driven."""
+def chain(d: int, ties: str = "next") -> Model:
+    """Masses on cubic springs, each tied to the next, to all others, or to the first; the first is
+    driven."""
     names = [f"q{k}" for k in range(d)]
     equations = {}
     for k, q in enumerate(names):
-        others = [o for i, o in enumerate(names) if i != k and (everyone or abs(i - k) == 1)]
+        others = [o for i, o in enumerate(names) if linked(d, ties)[k, i]]
         terms = [f"ddot({q}) + damping*dot({q}) + {q} + cubic*{q}**3"]
         terms += [f"tie*({q} - {o})" for o in others] + (["-force"] if k == 0 else [])
         equations[q] = " + ".join(terms)
@@ -50,11 +59,10 @@ class Dense:
     """The same as a system of first order, all steps in one matrix: ``y' = f(y)``, with values
     before velocities, and unknowns ``(n, 1 + s, 2 d)`` of nodes and stages."""
 
-    def __init__(self, d: int, n: int, everyone: bool, name: str = "radau3"):
+    def __init__(self, d: int, n: int, ties: str = "next", name: str = "radau3"):
         self.d, self.n, self.method = d, n, tableau(name)
-        apart = abs(np.subtract.outer(np.arange(d), np.arange(d)))
-        linked = (apart > 0) if everyone else (apart == 1)
-        self.ties = np.diag(linked.sum(axis=1)) - linked
+        pairs = linked(d, ties)
+        self.ties = np.diag(pairs.sum(axis=1)) - pairs
         self.h = 1.0 / FREQUENCY / n
         phases = ((np.arange(n)[:, None] + self.method.c) / n).ravel()
         self.force = FORCE.evaluate(phases, FREQUENCY, 0).reshape(n, -1)
@@ -110,8 +118,8 @@ class Dense:
         return x[:, 0], -np.linalg.solve(matrix, moved).reshape(*x.shape, 3)[:, 0]
 
 
-def discretised(d, n, everyone=False):
-    boundary, p = problem(chain(d, everyone), FORCE, FREQUENCY, "radau3", n, "numba")
+def discretised(d, n, ties="next"):
+    boundary, p = problem(chain(d, ties), FORCE, FREQUENCY, "radau3", n, "numba")
     assert boundary.arranged is not None, "the loops are what is tested"
     return boundary, p
 
@@ -122,15 +130,24 @@ def in_order(d):
 
 
 @pytest.mark.parametrize(
-    ("d", "everyone", "n"),
-    [(3, False, 13), (3, True, 24), (4, False, 16), (6, False, 11), (6, True, 8)],
+    ("d", "ties", "n"),
+    [
+        (3, "next", 13),
+        (3, "all", 24),
+        (4, "next", 16),
+        (5, "first", 9),
+        (6, "next", 11),
+        (6, "all", 8),
+    ],
 )
-def test_motion_and_derivatives_are_those_of_a_dense_solution(d, everyone, n):
-    boundary, p = discretised(d, n, everyone)
+def test_motion_and_derivatives_are_those_of_a_dense_solution(d, ties, n):
+    """Where equations couple few dofs: the first in a chain, whose elimination couples no others,
+    and one to which all are tied, whose elimination couples all."""
+    boundary, p = discretised(d, n, ties)
     solution = solve_periodic(boundary, p, rest(boundary, n))
     assert solution.status[0] == Status.CONVERGED
     _, by_p, _ = sensitivities(boundary, p, solution)
-    values, slopes = Dense(d, n, everyone).solved(NOMINAL)
+    values, slopes = Dense(d, n, ties).solved(NOMINAL)
     found = solution.x[0, :, : 2 * d][:, in_order(d)]
     np.testing.assert_allclose(found, values, rtol=0, atol=1e-12)
     np.testing.assert_allclose(by_p[0][:, in_order(d)], slopes, rtol=0, atol=1e-11)
@@ -184,12 +201,53 @@ def test_first_steps_with_old_derivatives_end_at_the_same_motion(d):
     np.testing.assert_allclose(found.x, general.run().x, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("ties", ["next", "all", "first"])
+def test_nothing_is_left_of_the_solve_before(ties):
+    """Blocks that are zero are not written, and so must not be read."""
+    boundary, p = discretised(5, 16, ties)
+    start = rest(boundary, 16)
+    first = solve_periodic(boundary, p, start)
+    arrangement._kept.work.transfer[:] = np.nan
+    again = solve_periodic(boundary, p, start)
+    assert again.status[0] == Status.CONVERGED
+    np.testing.assert_array_equal(again.x, first.x)
+
+
+@pytest.mark.parametrize("d", [2, 3, 4])
+def test_near_a_solution_derivatives_are_made_once(d, monkeypatch):
+    """A first step of a thousandth of the motion is what a prediction leaves; three more with the
+    same derivatives suffice. Steps with new ones cost several times as much."""
+    n = 40
+    boundary, p = discretised(d, n)
+    start = 1.001 * solve_periodic(boundary, p, rest(boundary, n)).x
+    made = []
+
+    def evaluate(*arguments, original=newton.evaluate):
+        made.append(1)
+        return original(*arguments)
+
+    def as_written(pieces, sizes, sweep, work, options, p, x, line, status, iterations):
+        """One lane, without being compiled, so that it can be watched."""
+        work.constants[:] = p[0]
+        work.now[:] = x[0][sweep.source].T
+        found = newton._iterate.py_func(pieces, sizes, sweep, work, options)
+        status[0], iterations[0] = found
+
+    monkeypatch.setattr(newton, "evaluate", evaluate)
+    monkeypatch.setattr(newton, "_advance", newton._advance.py_func)
+    monkeypatch.setattr(newton, "solve_lanes", as_written)
+    found = solve_periodic(boundary, p, start)
+    assert found.status[0] == Status.CONVERGED
+    assert len(made) == 1
+    assert found.iterations[0] <= 4
+
+
 def test_what_does_not_fit_into_memory_takes_the_general_iteration(monkeypatch):
     monkeypatch.setattr(arrangement, "MOST_BYTES", 1e4)
     boundary, p = problem(chain(3), FORCE, FREQUENCY, "radau3", 13, "numba")
     assert boundary.arranged is None
     solution = solve_periodic(boundary, p, rest(boundary, 13))
-    values, _ = Dense(3, 13, False).solved(NOMINAL)
+    values, _ = Dense(3, 13).solved(NOMINAL)
     np.testing.assert_allclose(solution.x[0, :, :6][:, in_order(3)], values, rtol=0, atol=1e-12)
 
 
