@@ -20,7 +20,7 @@ from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_of
-from bayesoleo.discovery._transient_variance import Influence, coloured_variance
+from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -282,14 +282,12 @@ def inflation_along(
     if not all(np.isfinite(item).all() for pair in runs for item in pair):
         return None
     covariance, worst, freedom = fit.point.covariance, 1.0, 0
+    noise = [RunNoise(residual, columns, covariance) for columns, residual in runs]
     for k, name in enumerate(fit.problem.names):
         if name not in names:
             continue
-        parts = [
-            Influence(np.einsum("l,lbn->bn", covariance[k], columns), residual, columns)
-            for columns, residual in runs
-        ]
-        variance, degrees = coloured_variance(parts, covariance)
+        moved = [np.tensordot(covariance[k], columns, axes=1) for columns, _ in runs]
+        variance, degrees = coloured_variance(moved, noise)
         ratio = variance / covariance[k, k]
         if ratio > worst:
             worst, freedom = ratio, max(1, int(degrees))

@@ -21,8 +21,11 @@ Biometrics Bulletin 2(6), 110-114.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import cast
 
 import numpy as np
 import scipy.fft
@@ -38,97 +41,161 @@ LEAST = 1e-3
 
 
 @dataclass(frozen=True)
-class Influence:
-    """What the samples of one run do to an estimate, in units of the noise of each output.
+class RunNoise:
+    """Noise of one run's samples as its residual tells it, in units of the noise of each output.
+
+    What does not depend on the unknown whose variance is asked for is computed once.
 
     Parameters
     ----------
-    weights : ndarray, shape (ny, N)
-        ``a``: movement of the estimate by an error of a sample; zero for samples without weight.
     residual : ndarray, shape (ny, N)
         Zero for samples without weight.
     columns : ndarray, shape (l, ny, N)
         Sensitivities with respect to all that was estimated.
+    covariance : ndarray, shape (l, l)
+        Of all that was estimated, in white noise of unit variance.
     """
 
-    weights: Array
     residual: Array
     columns: Array
+    covariance: Array
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.residual.shape[1]
+
+    @cached_property
+    def lines(self) -> _Lines:
+        """Lines of the spectrum and their neighbours."""
+        return _Lines(self.samples)
+
+    @cached_property
+    def transformed(self) -> Array:
+        """Fourier transform of the columns, shape (l, ny, K)."""
+        return cast(Array, scipy.fft.rfft(self.columns))
+
+    @cached_property
+    def remains(self) -> Array:
+        """Part of each line of white noise that an estimate leaves, shape (K,)."""
+        columns = self.transformed
+        parts = (_quadratic(self.covariance, part) for part in (columns.real, columns.imag))
+        taken = sum(parts, np.zeros(columns.shape[1:])) / self.samples
+        kept = np.mean(self.columns.any(axis=0) | (self.residual != 0.0), axis=1)
+        # An output without weight or noise tells nothing of what is left of the others.
+        left: Array = np.clip(kept[:, None] - taken, LEAST, 1.0)[kept > 0.0].mean(axis=0)
+        return left
+
+    @cached_property
+    def counted(self) -> Array:
+        """Coefficients that each average stands on, shape (K,)."""
+        return self.lines.sums(self.lines.weights * self.remains)
+
+    @cached_property
+    def level(self) -> Array:
+        """Spectra and cross spectra of the outputs, shape (ny, ny, K)."""
+        left = scipy.fft.rfft(self.residual)
+        cross = left[:, None] * left[None].conj() * self.lines.weights
+        return self.lines.sums(cross) / (self.counted * self.samples)
+
+    @cached_property
+    def own_level(self) -> Array:
+        """Spectrum of each output, shape (ny, K)."""
+        return cast(Array, np.einsum("bbk->bk", self.level).real)
+
+    @cached_property
+    def variance(self) -> Array:
+        """Variance of the noise of a sample, shape (ny, 1)."""
+        total: Array = np.sum(self.own_level * self.lines.weights, axis=1, keepdims=True)
+        return total / self.samples
+
+    @cached_property
+    def expected(self) -> Array:
+        """Squares of the residual that the spectrum lets expect, shape (ny, N).
+
+        With the noise's covariance ``G`` the residual has the diagonal of ``(I - H) G (I - H)'``.
+        """
+        coloured = scipy.fft.irfft(self.transformed * self.own_level, n=self.samples)
+        solved = _times(self.covariance, self.columns)
+        inner = _rows(self.columns) @ _rows(coloured).T
+        found = (
+            self.variance
+            - 2.0 * np.einsum("lbn,lbn->bn", solved, coloured)
+            + _quadratic(inner, solved)
+        )
+        return cast(Array, np.maximum(found, LEAST * self.variance))
+
+    @cached_property
+    def correlation(self) -> Array:
+        """Spectrum of the squared autocovariance of each output, shape (ny, K).
+
+        Squares of normal variables with the correlation rho are correlated by its square.
+        """
+        return cast(Array, scipy.fft.rfft(scipy.fft.irfft(self.own_level, n=self.samples) ** 2))
 
 
-def coloured_variance(runs: Sequence[Influence], covariance: Array) -> tuple[float, float]:
+def _rows(columns: Array) -> Array:
+    """Columns ``(l, ...)`` as rows of one matrix."""
+    return columns.reshape(columns.shape[0], math.prod(columns.shape[1:]))
+
+
+def _times(matrix: Array, columns: Array) -> Array:
+    """A matrix ``(l, l)`` times columns ``(l, ...)``."""
+    return (matrix @ _rows(columns)).reshape(columns.shape)
+
+
+def _quadratic(matrix: Array, columns: Array) -> Array:
+    """``c' M c`` of each entry of columns ``(l, ny, n)``, shape (ny, n)."""
+    return cast(Array, np.einsum("lbn,lbn->bn", columns, _times(matrix, columns)))
+
+
+def coloured_variance(weights: Sequence[Array], runs: Sequence[RunNoise]) -> tuple[float, float]:
     """Variance of an estimate and its degrees of freedom.
 
     Parameters
     ----------
-    runs : sequence of Influence
+    weights : sequence of ndarray, shape (ny, N)
+        ``a`` by run: movement of the estimate by an error of a sample; zero for samples without
+        weight.
+    runs : sequence of RunNoise
         Their noise is independent.
-    covariance : ndarray, shape (l, l)
-        Of all that was estimated, in white noise of unit variance.
 
     Returns
     -------
     variance, freedom : float
         The degrees of freedom are those of the chi-square variate with the same mean and variance.
     """
-    parts = [_of_run(run, covariance) for run in runs if np.any(run.weights)]
+    parts = [_of_run(own, run) for own, run in zip(weights, runs, strict=True) if np.any(own)]
     variance = sum(value for value, _ in parts)
     scatter = sum(value**2 / free for value, free in parts)
     return variance, variance**2 / scatter if scatter > 0 else 0.0
 
 
-def _of_run(run: Influence, covariance: Array) -> tuple[float, float]:
-    samples = run.weights.shape[1]
-    along, left, columns = (scipy.fft.rfft(x) for x in (run.weights, run.residual, run.columns))
-    taken = np.einsum("lbk,lm,mbk->bk", columns.conj(), covariance, columns).real / samples
-    kept = np.mean(run.columns.any(axis=0) | (run.residual != 0.0), axis=1)
-    # An output without weight or noise tells nothing of what is left of the others.
-    remains = np.clip(kept[:, None] - taken, LEAST, 1.0)[kept > 0.0].mean(axis=0)
-    lines = _Lines(samples)
-    counted = lines.sums(lines.weights * remains)
-    cross = left[:, None] * left[None].conj() * lines.weights
-    level = lines.sums(cross) / (counted * samples)
-    parts = np.einsum("ak,abk,bk->k", along.conj(), level, along).real * lines.weights / samples
+def _of_run(weights: Array, run: RunNoise) -> tuple[float, float]:
+    along, lines = scipy.fft.rfft(weights), run.lines
+    power = np.einsum("ak,abk,bk->k", along.conj(), run.level, along).real
+    parts = power * lines.weights / run.samples
     variance = float(parts.sum())
-    measured = lines.spread(parts / counted) * lines.weights * remains
+    measured = lines.spread(parts / run.counted) * lines.weights * run.remains
     scatter = float(np.sum(2.0 * measured**2 / lines.weights))
     if not (variance > 0 and scatter > 0):
         return 0.0, 1.0
     free = 2.0 * float(measured.sum()) ** 2 / scatter
-    own = np.einsum("bbk->bk", level).real
-    excess, known = _where_it_acts(run, covariance, own, lines)
+    excess, known = _where_it_acts(weights, run)
     if excess > 1.0:
         variance, free = variance * excess, 1.0 / (1.0 / free + 1.0 / known)
     return variance, free
 
 
-def _where_it_acts(
-    run: Influence, covariance: Array, level: Array, lines: _Lines
-) -> tuple[float, float]:
-    """Weighted square of the residual over what the spectrum lets expect, and its degrees of
-    freedom.
-
-    With the noise's covariance ``G`` the residual has ``(I - H) G (I - H)'``, whose diagonal is
-    summed with the squared influence of each sample.
-    """
-    samples = run.weights.shape[1]
-    weight = run.weights**2
-    variance = np.sum(level * lines.weights, axis=1) / samples
-    coloured = scipy.fft.irfft(scipy.fft.rfft(run.columns) * level, n=samples)
-    solved = np.einsum("lm,mbn->lbn", covariance, run.columns)
-    inner = np.einsum("lbn,mbn->lm", run.columns, coloured)
-    expected = (
-        variance[:, None]
-        - 2.0 * np.einsum("lbn,lbn->bn", solved, coloured)
-        + np.einsum("lbn,lm,mbn->bn", solved, inner, solved)
-    )
-    expected = np.maximum(expected, LEAST * variance[:, None])
-    found = float(np.sum(weight * run.residual**2)) / float(np.sum(weight * expected))
-    # Squares of normal variables with the correlation rho are correlated by its square.
-    squares = scipy.fft.rfft(scipy.fft.irfft(level, n=samples) ** 2)
+def _where_it_acts(weights: Array, run: RunNoise) -> tuple[float, float]:
+    """Square of the residual, weighted with the squared influence of each sample, over what the
+    spectrum lets expect, and its degrees of freedom."""
+    weight = weights**2
+    found = float(np.sum(weight * run.residual**2)) / float(np.sum(weight * run.expected))
     power = np.abs(scipy.fft.rfft(weight)) ** 2
-    scatter = 2.0 * float(np.sum(scipy.fft.irfft(power * squares, n=samples)[:, 0]))
-    whole = float(np.sum(weight * variance[:, None]))
+    squares = scipy.fft.irfft(power * run.correlation, n=run.samples)
+    scatter = 2.0 * float(np.sum(squares[:, 0]))
+    whole = float(np.sum(weight * run.variance))
     return found, max(1.0, 2.0 * whole**2 / scatter)
 
 

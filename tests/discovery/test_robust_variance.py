@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from bayesoleo.discovery._transient_variance import Influence, coloured_variance
+from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 
 SAMPLES, DRAWS = 400, 400
 #: Rates at a nominal 5 %: 800 draws know them to 0.8 %. A test that never speaks is as wrong as one
@@ -63,8 +63,8 @@ def wrongly_significant(rng, columns, colour, where):
     residual = errors - (errors @ wide.T) @ covariance @ wide
     shape = (outputs, SAMPLES)
     weights = influence.reshape(shape)
-    runs = [Influence(weights, r.reshape(shape), columns) for r in residual]
-    found = [coloured_variance([run], covariance) for run in runs]
+    runs = [RunNoise(r.reshape(shape), columns, covariance) for r in residual]
+    found = [coloured_variance([weights], [run]) for run in runs]
     t = np.array([m / np.sqrt(v) for m, (v, _) in zip(moved, found, strict=True)])
     free = np.array([f for _, f in found])
     return np.mean(2 * stats.t.sf(np.abs(t), free) < 0.05), np.median(free)
@@ -101,14 +101,14 @@ def test_runs_add_up_and_samples_without_weight_say_nothing():
     columns /= np.linalg.norm(columns, axis=(1, 2))[:, None, None]
     covariance = np.linalg.inv(columns[:, 0] @ columns[:, 0].T)
     weights = np.einsum("l,lbn->bn", covariance[-1], columns)
-    run = Influence(weights, rng.standard_normal((1, SAMPLES)), columns)
-    variance, freedom = coloured_variance([run], covariance)
-    twice = coloured_variance([run, run], covariance)
+    run = RunNoise(rng.standard_normal((1, SAMPLES)), columns, covariance)
+    variance, freedom = coloured_variance([weights], [run])
+    twice = coloured_variance([weights, weights], [run, run])
     assert twice == pytest.approx((2 * variance, 2 * freedom))
-    nothing = Influence(0 * weights, 0 * run.residual, 0 * columns)
-    assert coloured_variance([run, nothing], covariance) == (variance, freedom)
-    scaled = Influence(7 * weights, 3 * run.residual, columns)
-    assert coloured_variance([scaled], covariance) == pytest.approx((441 * variance, freedom))
+    nothing = RunNoise(0 * run.residual, 0 * columns, covariance)
+    assert coloured_variance([weights, 0 * weights], [run, nothing]) == (variance, freedom)
+    scaled = RunNoise(3 * run.residual, columns, covariance)
+    assert coloured_variance([7 * weights], [scaled]) == pytest.approx((441 * variance, freedom))
 
 
 def test_noise_that_outputs_share_counts_along_both():
@@ -119,8 +119,8 @@ def test_noise_that_outputs_share_counts_along_both():
     for _ in range(50):
         residual = np.stack([rng.standard_normal(SAMPLES)] * 2)
         for sign in found:
-            run = Influence(wave * [[1.0], [sign]], residual, np.zeros((0, 2, SAMPLES)))
-            found[sign].append(coloured_variance([run], np.zeros((0, 0)))[0])
+            run = RunNoise(residual, np.zeros((0, 2, SAMPLES)), np.zeros((0, 0)))
+            found[sign].append(coloured_variance([wave * [[1.0], [sign]]], [run])[0])
     assert np.mean(found[1]) == pytest.approx(2 * np.sum(wave**2), rel=0.15)
     assert np.max(found[-1]) < 1e-9
 
@@ -133,10 +133,9 @@ def test_an_output_that_nothing_moves_does_not_change_the_variance():
     residual = rng.standard_normal(size)
     residual -= column * (column @ residual) * covariance[0, 0]
     weights = covariance[0, 0] * column
-    alone = Influence(weights[None], residual[None], column[None, None])
     dead = np.zeros(size)
-    beside = Influence(
-        np.stack([weights, dead]), np.stack([residual, dead]), np.stack([column, dead])[None]
-    )
-    one, two = (coloured_variance([run], covariance)[0] for run in (alone, beside))
+    alone = RunNoise(residual[None], column[None, None], covariance)
+    beside = RunNoise(np.stack([residual, dead]), np.stack([column, dead])[None], covariance)
+    one, _ = coloured_variance([weights[None]], [alone])
+    two, _ = coloured_variance([np.stack([weights, dead])], [beside])
     assert two == pytest.approx(one, rel=1e-6)
