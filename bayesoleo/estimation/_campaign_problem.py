@@ -16,7 +16,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation._problem import Evaluation, Misfit
 from bayesoleo.model._priors import Prior
-from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._predictor import Predictor, RunPrediction
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
 
@@ -131,19 +131,31 @@ class CampaignProblem:
             self._last = (np.array(theta), self._evaluate(theta))
         return self._last[1]
 
+    def residuals_first(self, theta: Array) -> Evaluation | None:
+        """Residuals at one vector without sensitivities, where they cost far less; else None.
+
+        The solvers stay where they are. Asked for the same vector next, :meth:`evaluate` goes on
+        from here.
+        """
+        runs = self.predictor.outputs_first(self.full(theta[None])[0])
+        return None if runs is None else self._of_runs(runs)
+
     def _evaluate(self, theta: Array) -> Evaluation:
-        full = self.full(theta[None])[0]
-        runs = self.predictor.evaluate(full)
+        return self._of_runs(self.predictor.evaluate(self.full(theta[None])[0]), self._free)
+
+    def _of_runs(self, runs: Sequence[RunPrediction], free: Integers | None = None) -> Evaluation:
+        """Residuals of predictions, and the sensitivities by some unknowns."""
         residual: Sequence[Sequence[Array]] = [
             list(self.kept(r, record.measured - run.y))
             for r, (record, run) in enumerate(zip(self.predictor.runs, runs, strict=True))
         ]
         outputs = range(len(self.outputs))
+        chosen = np.arange(0) if free is None else free
         return Evaluation(
             residual=tuple(np.concatenate([r[b] for r in residual]) for b in outputs),
             sensitivity=tuple(
                 np.concatenate(
-                    [self.kept(r, run.sensitivity[b][self._free]).T for r, run in enumerate(runs)]
+                    [self.kept(r, run.sensitivity[b][chosen]).T for r, run in enumerate(runs)]
                 )
                 for b in outputs
             ),

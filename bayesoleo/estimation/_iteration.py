@@ -29,7 +29,7 @@ from bayesoleo.estimation._bayesian_estimators import Step
 from bayesoleo.estimation._damping import Damping
 from bayesoleo.estimation._least_squares import PriorScale, WhitenedEquations, is_cut
 from bayesoleo.estimation._objectives import Objective, log_prior, newton_equations
-from bayesoleo.estimation._problem import EstimationProblem, Evaluation
+from bayesoleo.estimation._problem import EstimationProblem, Evaluation, residuals_first
 from bayesoleo.solvers._orbit import Status
 
 # A step that reverses more than this part of the last one overshoots. Equations that lack the
@@ -279,12 +279,28 @@ class _Loop:
         self.point: _Point
 
     def look(self, theta: Array) -> _Point:
-        self.evaluations += 1
-        evaluation = self.problem.evaluate(theta)
+        return self.counted(self.point_of(theta, self.problem.evaluate(theta)))
+
+    def look_first(self, theta: Array, variance: Array, least: float) -> _Point:
+        """A point as of :meth:`look`; without sensitivities where its residuals already show that
+        it fails or its merit is below the least."""
+        found = residuals_first(self.problem, theta)
+        if found is not None:
+            point = self.point_of(theta, found)
+            if not (point.status.ok and self.merit(point, variance) >= least):
+                return self.counted(point)
+        return self.look(theta)
+
+    def point_of(self, theta: Array, evaluation: Evaluation) -> _Point:
         point = _Point(theta, evaluation, np.array([np.nan]))
         if evaluation.status.ok:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
                 point = _Point(theta, evaluation, self.objective.errors.moments(evaluation))
+        return point
+
+    def counted(self, point: _Point) -> _Point:
+        """A point, counted among the evaluations and the failures."""
+        self.evaluations += 1
         if not point.status.ok:
             self.failures[point.status.name.lower()] += 1
         return point
@@ -375,7 +391,8 @@ class _Loop:
         merit = self.merit(self.point, variance) - _ROUNDING * float(self.counts.sum())
         trial = self.point
         for halvings in range(_MAX_HALVINGS + 1):
-            trial = self.look(self.scale.moved(self.point.theta, proposal))
+            moved = self.scale.moved(self.point.theta, proposal)
+            trial = self.look_first(moved, variance, merit)
             if trial.status.ok and self.merit(trial, variance) >= merit:
                 return trial, halvings, proposal
             if np.linalg.norm(equations.jacobian @ proposal) < resolution:

@@ -63,6 +63,15 @@ class Misfit:
     status: Int[Integers, " vectors"]
 
 
+def residuals_first(
+    problem: EstimationProblem, theta: Float[Array, " unknowns"]
+) -> Evaluation | None:
+    """Residuals at one vector without sensitivities, where a problem gives them for far less; a
+    step that does not improve them needs no more."""
+    first = getattr(problem, "residuals_first", None)
+    return None if first is None else cast("Evaluation | None", first(theta))
+
+
 def jumps_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
     """Number of solutions that left their branch, by run, shape (N,); zeros where not counted."""
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
@@ -252,6 +261,10 @@ class Held(SameData):
         """Residuals and sensitivities at one vector of the free unknowns."""
         found = self.problem.evaluate(self.full(np.asarray(theta, dtype=float)))
         return replace(found, sensitivity=tuple(s[:, self.free] for s in found.sensitivity))
+
+    def residuals_first(self, theta: Array) -> Evaluation | None:
+        """Residuals without sensitivities, see :func:`residuals_first`."""
+        return residuals_first(self.problem, self.full(np.asarray(theta, dtype=float)))
 
     @property
     def branch_jumps(self) -> Integers:

@@ -337,14 +337,28 @@ class RunPredictor:
         if not self.kernels.derived.dofs:
             return self._at_samples(p[None], None, None, status, derivatives=True)
         if self.anchor is None or status[0] != Status.CONVERGED.value:
-            shape = (1, len(self.kernels.derived.outputs), len(self.active), self.record.time.size)
-            return PredictedSamples(
-                np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan), status
-            )
+            return self._failed(Status(int(status[0])))
         x_p = np.moveaxis(self.anchor.x_p, 0, 2)[None]
         samples = self._at_samples(p[None], self.anchor.x[None], x_p, status, derivatives=True)
         monodromy = None if self.anchor.monodromy is None else self.anchor.monodromy[None]
         return replace(samples, jumped=np.array([self.anchor.jumped]), monodromy=monodromy)
+
+    def _failed(self, status: Status) -> PredictedSamples:
+        """One vector's samples where there is no solution."""
+        shape = (1, len(self.kernels.derived.outputs), len(self.active), self.record.time.size)
+        nothing = np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan)
+        return PredictedSamples(*nothing, np.array([status.value], dtype=np.int64))
+
+    def known_at(self, p: Array) -> PredictedSamples | None:
+        """Outputs with derivatives at constants ``p (np,)`` where they are known; of periodic runs
+        :meth:`predict` also tells whether a solution left its branch."""
+        return None
+
+    @property
+    def shows_outputs_first(self) -> bool:
+        """Whether outputs cost far less without derivatives, and do not depend on the anchor but
+        for round-off: the branch of a periodic solution does."""
+        return not self.kernels.derived.dofs
 
     def evaluate_on(self, other: RunPredictor, p: Array) -> PredictedSamples | None:
         """Outputs with derivatives where constants leave the motion of another model unchanged.
@@ -403,18 +417,23 @@ class RunPredictor:
             y[status != Status.CONVERGED.value] = np.nan
             return PredictedSamples(y, None, status)
         z = self._rows_at_samples(None if x is None else x[..., None], p)[:, :, 0]
-        z_p = self._rows_at_samples(x_p, p) if derivatives and x_p is not None else None
-        return self._outputs(p, z, z_p, status, derivatives)
+        if not derivatives or x_p is None:
+            return self._outputs(p, z, None, status, derivatives)
+        # Most parameters of a force law act on its outputs alone, and move no state.
+        moves = x_p.any(axis=(0, 1, 2))
+        few = x_p if moves.all() else np.ascontiguousarray(x_p[..., moves])
+        return self._outputs(p, z, (self._rows_at_samples(few, p), moves), status, derivatives)
 
     def _outputs(
         self,
         p: Array,
         z: Array,
-        z_p: Array | None,
+        moved: tuple[Array, Flags] | None,
         status: Integers,
         derivatives: bool,
     ) -> PredictedSamples:
-        """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives of ``z_p``."""
+        """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives, with those of the rows
+        by the parameters that move them, and which these are."""
         derived, count = self.kernels.derived, p.shape[0]
         samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
         lanes = np.flatnonzero(status == Status.CONVERGED.value)
@@ -427,8 +446,13 @@ class RunPredictor:
         yz, yp = np.zeros((count, ny, z.shape[1], samples)), np.zeros((count, ny, na, samples))
         with np.errstate(all="ignore"):
             self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
-        if z_p is not None:
-            yp += np.einsum("lyzn,lzan->lyan", yz, z_p)
+        if moved is not None:
+            z_p, moves = moved
+            through = np.einsum("lyzn,lzan->lyan", yz, z_p)
+            if moves.all():
+                yp += through
+            else:
+                yp[:, :, moves] += through
         return PredictedSamples(y, yp, status)
 
     def squares(self, p: Array) -> tuple[Array, Integers]:

@@ -539,7 +539,8 @@ class SolvedRun(RunPredictor):
             z[lane] = found[lane].rows(phase)
             if z_p is not None:
                 z_p[lane] = found[lane].rows_by_parameter(phase)
-        samples = self._outputs(p, z, z_p, status, derivatives)
+        moved = None if z_p is None else (z_p, np.ones(na, dtype=np.bool_))
+        samples = self._outputs(p, z, moved, status, derivatives)
         return replace(samples, monodromy=np.stack([one.orbit.monodromy for one in found]))
 
 

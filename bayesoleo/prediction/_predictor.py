@@ -5,7 +5,7 @@ It assigns each unknown to its place in the model: shared ones once, by-run ones
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -231,7 +231,8 @@ class Predictor:
         everything = range(len(self.runs))
         if any(run.anchor is None for run in self.runs):
             return thread_map(lambda r: self._evaluate_run(theta, r), everything, self.jobs)
-        before, found = [run.anchor for run in self.runs], self._until_one_fails(theta)
+        before = [run.anchor for run in self.runs]
+        found = self._until_one_fails(lambda r: self._evaluate_run(theta, r))
         self._failed = next((r for r, run in found.items() if not run.status.ok), None)
         if self._failed is None:
             return [found[r] for r in everything]
@@ -239,7 +240,28 @@ class Predictor:
             run.anchor = anchor
         return [self._unsolved(r, found[self._failed].status) for r in everything]
 
-    def _until_one_fails(self, theta: Array) -> dict[int, RunPrediction]:
+    def outputs_first(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction] | None:
+        """Outputs of every run at ``theta (l,)`` without sensitivities; no anchor moves.
+
+        None where that is no cheaper than :meth:`evaluate`, or the outputs may be others than
+        there. Asked for the same vector next, that goes on from here. Where one run cannot be
+        solved, all predictions have its status and are not finite.
+        """
+        if not all(run.shows_outputs_first for run in self.runs):
+            return None
+        found = self._until_one_fails(lambda r: self._outputs_of(theta, r))
+        failed = next((r for r, run in found.items() if not run.status.ok), None)
+        if failed is None:
+            return [found[r] for r in range(len(self.runs))]
+        self._failed = failed
+        return [self._unsolved(r, found[failed].status) for r in range(len(self.runs))]
+
+    def _outputs_of(self, theta: Array, r: int) -> RunPrediction:
+        samples = self.runs[r].predict(self.constants(theta[None], r))
+        nothing = np.empty((len(self.outputs), 0, samples.y.shape[2]))
+        return RunPrediction(samples.y[0], nothing, Status(int(samples.status[0])))
+
+    def _until_one_fails(self, predict: Callable[[int], RunPrediction]) -> dict[int, RunPrediction]:
         """Predictions by run, that which failed last time first, and none after one that fails; in
         several threads the others go together, whatever comes of each."""
         runs = list(range(len(self.runs)))
@@ -249,10 +271,10 @@ class Predictor:
         found: dict[int, RunPrediction] = {}
         alone = len(runs) if self.jobs == 1 else int(self._failed is not None)
         for r in runs[:alone]:
-            found[r] = self._evaluate_run(theta, r)
+            found[r] = predict(r)
             if not found[r].status.ok:
                 return found
-        rest = thread_map(lambda r: self._evaluate_run(theta, r), runs[alone:], self.jobs)
+        rest = thread_map(predict, runs[alone:], self.jobs)
         return found | dict(zip(runs[alone:], rest, strict=True))
 
     def _evaluate_run(self, theta: Array, r: int) -> RunPrediction:
@@ -264,8 +286,9 @@ class Predictor:
         return RunPrediction(np.full(shape, np.nan), nothing, status)
 
     def _predict_run(self, theta: Array, r: int) -> RunPrediction:
-        constants = self.constants(theta[None], r)
-        return self._by_unknown(r, self.runs[r].predict(constants, derivatives=True))
+        run, constants = self.runs[r], self.constants(theta[None], r)
+        known = run.known_at(constants[0])
+        return self._by_unknown(r, known or run.predict(constants, derivatives=True))
 
     def _by_unknown(self, r: int, samples: PredictedSamples) -> RunPrediction:
         """Derivatives of one run's samples with respect to all unknowns."""

@@ -81,6 +81,9 @@ class TransientRun(RunPredictor):
         The same run under another model, whose mesh and input rows are taken over.
     """
 
+    #: The last single solution, with the anchor that it began at and its constants.
+    _last: tuple[Anchor | None, Array, Solution] | None = None
+
     def __init__(
         self,
         model: Model,
@@ -212,12 +215,20 @@ class TransientRun(RunPredictor):
         """
         if not self.kernels.derived.dofs:
             return Status.CONVERGED
+        return self._anchored(p)[0]
+
+    def _anchored(self, p: Array) -> tuple[Status, Array | None]:
+        """Status of the anchor at constants ``p (np,)``, and derivatives (1, n, w, na)."""
+        if self._stands_at(p):
+            assert self.anchor is not None
+            return Status.CONVERGED, np.moveaxis(self.anchor.x_p, 0, 2)[None]
         start = self.initial(p[None])
         if start.status[0] != Status.CONVERGED.value:
-            return Status(int(start.status[0]))
-        solution = self._first(p, start.state[0]) if self.anchor is None else self.solve(p[None])
+            return Status(int(start.status[0])), None
+        solution = self._first(p, start.state[0]) if self.anchor is None else self._alone(p)
         if isinstance(solution, Status):
-            return solution
+            return solution, None
+        x_p = None
         if solution.status[0] == Status.CONVERGED.value:
             solution, x_p, _ = transient_sensitivities(
                 self.boundary, p[None], solution, start.by_parameter
@@ -225,7 +236,37 @@ class TransientRun(RunPredictor):
             if solution.status[0] == Status.CONVERGED.value:
                 moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
                 self.anchor = Anchor(p.copy(), solution.x[0], moved)
-        return Status(int(solution.status[0]))
+        return Status(int(solution.status[0])), x_p
+
+    def _stands_at(self, p: Array) -> bool:
+        """Whether the anchor is the solution at constants ``p (np,)``."""
+        return self.anchor is not None and np.array_equal(self.anchor.p, p)
+
+    def _alone(self, p: Array) -> Solution:
+        """The solution at constants ``p (np,)``, from the anchor; asked again, from memory."""
+        anchor, last = self.anchor, self._last
+        if last is None or last[0] is not anchor or not np.array_equal(last[1], p):
+            last = self._last = anchor, p.copy(), self._solved(p[None])
+        return last[2]
+
+    def known_at(self, p: Array) -> PredictedSamples | None:
+        """Outputs with derivatives of the anchor, if it is the solution at constants ``p``."""
+        return self.evaluate(p) if self._stands_at(p) else None
+
+    @property
+    def shows_outputs_first(self) -> bool:
+        """As of a periodic run; the start decides which solution a transient is."""
+        return not self.kernels.derived.dofs or self.anchor is not None
+
+    def evaluate(self, p: Array) -> PredictedSamples:
+        """Set the anchor at constants ``p (np,)``, and take outputs with derivatives from it."""
+        if not self.kernels.derived.dofs:
+            return super().evaluate(p)
+        status, x_p = self._anchored(p)
+        if status is not Status.CONVERGED or self.anchor is None:
+            return self._failed(status)
+        found = np.array([status.value], dtype=np.int64)
+        return self._at_samples(p[None], self.anchor.x[None], x_p, found, derivatives=True)
 
     def _first(self, p: Array, state: Array) -> Solution | Status:
         """The first solution, on a mesh of its own unless one was taken over."""
@@ -314,9 +355,12 @@ class TransientRun(RunPredictor):
 
     def solve(self, p: Array) -> Solution:
         """Solutions for constants ``p (L, np)``, each started from the anchor alone."""
+        return self._alone(p[0]) if len(p) == 1 and self.anchor is not None else self._solved(p)
+
+    def _solved(self, p: Array) -> Solution:
         most = self._together(derivatives=False)
         if p.shape[0] > most:
-            parts = [self.solve(p[k : k + most]) for k in range(0, p.shape[0], most)]
+            parts = [self._solved(p[k : k + most]) for k in range(0, p.shape[0], most)]
             rows = zip(*((part.x, part.status, part.iterations) for part in parts), strict=True)
             return Solution(*map(np.concatenate, rows))
         if self.anchor is None:

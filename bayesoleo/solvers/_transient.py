@@ -34,7 +34,6 @@ from bayesoleo.solvers._periodic import (
     Boundary,
     Solution,
     Trial,
-    linear_by_column,
     solve_from_state,
 )
 from bayesoleo.solvers._radau_step import (
@@ -474,46 +473,47 @@ def moved_from_start(
         Derivatives of the last state by the first.
     ok : ndarray of bool, shape (L,)
     """
+    scheme, step = problem.scheme, problem.step(n)
+    moves = right.any(axis=(0, 1, 3)) | start_p.any(axis=(0, 1))
+    moves[:1] |= not moves.any()  # the transition and the status are asked for in any case
+    every = bool(moves.all())
+    few = right if every else np.compress(moves, right, axis=2)
+    moved = start_p[:, :, moves]
     # A motion that carries the initial derivative on without a force is known; what is left to
-    # solve for starts at zero. Columns that do not move the start have no such motion.
-    moves_start = start_p.any(axis=(0, 1))
-    moved = start_p[:, :, moves_start]
-    if moved.size:
-        rows, part = _free_rows(problem, n, moved), right[:, :, moves_start]
-        for k in range(gz.shape[2]):
-            part += gz[:, :, k, None, :] * rows[:, None, k]
-        right[:, :, moves_start] = part
-    step = problem.step(n)
-    x, transition, ok = linear_by_column(problem.scheme, gz, right, lanes, step, initial=True)
-    if moved.size:
-        x[..., moves_start] += _free_motion(problem, n, moved)
-    return x, transition, ok
+    # solve for starts at zero.
+    if moved.any():
+        few += moved.mT[:, None] @ _pull_of_states(problem, n, gz)
+    x, transition, ok = scheme.linear(gz, few, None, lanes, step, initial=True)
+    if moved.any():
+        _carry_on(problem, n, moved, x)
+    if every:
+        return x, transition, ok
+    whole = np.zeros((*x.shape[:3], right.shape[2]))
+    whole[..., moves] = x
+    return whole, transition, ok
 
 
-def _free_motion(problem: Boundary, n: int, start_p: Array) -> Array:
-    """Unknowns ``(L, n, w, na)`` of a motion whose highest derivatives are zero."""
+def _pull_of_states(problem: Boundary, n: int, gz: Array) -> Array:
+    """Change of the equations by each state at time zero, shape (L, d, D, N), where the motion goes
+    on with its initial derivative and no force."""
+    orders, rows = problem.scheme.orders, state_rows(problem.scheme.orders)
+    found: Array = np.take(gz, rows, axis=2)
+    time, state = problem.period * problem.scheme.phases(n), 0
+    for order in orders:
+        if order == 2:
+            found[:, :, state + 1] += time * found[:, :, state]
+        state += order
+    return found
+
+
+def _carry_on(problem: Boundary, n: int, start_p: Array, x: Array) -> None:
+    """Add that motion by changes ``(L, D, k)`` of the first state to ``x (L, n, w, k)``."""
     scheme = problem.scheme
     assert isinstance(scheme, Collocation)
-    rows = _carried(scheme.orders, problem.period * scheme.nodes(n), start_p)
-    x = np.zeros((start_p.shape[0], n, scheme.width, start_p.shape[2]))
-    x[:, :, : scheme.state_size] = np.moveaxis(rows[:, state_rows(scheme.orders)], 3, 1)
-    return x
-
-
-def _free_rows(problem: Boundary, n: int, start_p: Array) -> Array:
-    """Values and derivatives ``(L, nz, na, N)`` of that motion at the points."""
-    return _carried(problem.scheme.orders, problem.period * problem.scheme.phases(n), start_p)
-
-
-def _carried(orders: tuple[int, ...], time: Array, start_p: Array) -> Array:
-    rows, state = [], 0
-    for order in orders:
-        value = np.repeat(start_p[:, state, :, None], time.size, axis=2)
+    time, state = problem.period * scheme.nodes(n), 0
+    for order in scheme.orders:
+        for k in range(state, state + order):
+            x[:, :, k] += start_p[:, None, k]
         if order == 2:
-            rate = np.repeat(start_p[:, state + 1, :, None], time.size, axis=2)
-            rows += [value + rate * time, rate]
-        else:
-            rows.append(value)
-        rows.append(np.zeros_like(value))
+            x[:, :, state] += time[:, None] * start_p[:, None, state + 1]
         state += order
-    return np.stack(rows, axis=1)

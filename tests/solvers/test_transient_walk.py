@@ -12,7 +12,7 @@ from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._mesh import equidistant, tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary
-from bayesoleo.solvers._transient import _carried, newton, solve_transient
+from bayesoleo.solvers._transient import moved_from_start, newton, solve_transient
 
 STEPS, TIME = 1024, 40.0
 
@@ -78,13 +78,49 @@ def test_a_step_that_leaves_the_region_of_the_equations_is_told():
     assert solved(4.0).status[0] == Status.INADMISSIBLE.value
 
 
+def test_changes_of_the_start_move_the_motion_as_differences_do(problem):
+    """Also beside a column that changes nothing, which stays zero."""
+    boundary, p = problem
+    size, step, lanes = 1e-6, boundary.step(STEPS), np.zeros(1, dtype=np.int64)
+    first = np.array([0.2, 0.5])
+
+    def solved(state):
+        start = np.zeros((1, STEPS, boundary.scheme.width))
+        start[0, :, :2] = state
+        found = solve_transient(boundary, p, start)
+        assert found.status[0] == Status.CONVERGED.value
+        return found.x
+
+    x, points = solved(first), boundary.inputs.shape[1]
+    z, g = np.zeros((1, 3, points)), np.zeros((1, 1, points))
+    gz, right = np.zeros((1, 1, 3, points)), np.zeros((1, 1, 3, points))
+    boundary.scheme.rows(x, lanes, step, z)
+    boundary.equations.jacobian(z, boundary.inputs, p, lanes, g, gz)
+    start_p = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    moved, _, ok = moved_from_start(boundary, STEPS, gz, right, start_p, lanes)
+    assert ok.all()
+    assert not moved[..., 1].any()
+    for column, state in ((0, 0), (2, 1)):
+        change = size * np.eye(2)[state]
+        expected = (solved(first + change) - solved(first - change)) / (2 * size)
+        # Differences of a motion with friction this steep, over their largest.
+        error = np.abs(moved[..., column] - expected).max(axis=(0, 1))
+        assert (error < 1e-4 * np.abs(expected).max(axis=(0, 1))).all()
+
+
 def test_without_a_force_a_velocity_moves_on_and_a_state_of_first_order_stays():
-    """Rows of a motion whose highest derivatives are zero: each is the next one's integral."""
+    """States of a motion whose highest derivatives are zero: each is the next one's integral."""
+    scheme = Collocation(tableau("radau3"), (2, 1), equidistant(4))
+    boundary = Boundary(None, scheme, 3.0, np.zeros((0, scheme.phases(4).size)), 0, 2)
+    gz = np.zeros((1, 2, 5, scheme.phases(4).size))
+    gz[0, 0, 2] = gz[0, 1, 4] = 1.0  # highest derivatives
     start = np.array([[[0.3, -1.0], [2.0, 0.5], [7.0, 4.0]]])  # position, velocity, temperature
-    time = np.array([0.0, 0.5, 3.0])
-    position, velocity, force, heat, rate = np.moveaxis(_carried((2, 1), time, start)[0], 0, 0)
-    np.testing.assert_allclose(position, start[0, 0, :, None] + start[0, 1, :, None] * time)
-    np.testing.assert_allclose(velocity, np.repeat(start[0, 1, :, None], 3, axis=1))
-    np.testing.assert_allclose(heat, np.repeat(start[0, 2, :, None], 3, axis=1))
-    assert not force.any()
-    assert not rate.any()
+    x, transition, _ = moved_from_start(
+        boundary, 4, gz, np.zeros((1, 2, 2, gz.shape[3])), start, np.zeros(1, dtype=np.int64)
+    )
+    time = 3.0 * np.arange(4)[:, None] / 4
+    np.testing.assert_allclose(x[0, :, 0], start[0, 0] + start[0, 1] * time)
+    np.testing.assert_allclose(x[0, :, 1], np.repeat(start[0, 1][None], 4, axis=0))
+    np.testing.assert_allclose(x[0, :, 2], np.repeat(start[0, 2][None], 4, axis=0))
+    assert not x[0, :, 3:].any()
+    np.testing.assert_allclose(transition[0], [[1, 3, 0], [0, 1, 0], [0, 0, 1]], atol=1e-12)
