@@ -374,19 +374,20 @@ def fit_model(
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         mesh = _error_of_mesh(problem, point, predictions, numerics, check_mesh)
         shift, error, change, seen = mesh
+        lost = _lost(mbe, point)
         # The mode begins with the estimate, and that on a finer mesh with the last: what is told
         # is where all began.
         begun = mbe.start if begun is None else begun
         steps = problem.predictor.steps
         moved = shift > numerics.policy.mesh_shift
-        if not _wants_finer(problem, point, predictions, numerics, moved, seen, check_mesh):
+        if not _wants_finer(problem, point, predictions, numerics, moved, seen, check_mesh, lost):
             mbe, point = replace(mbe, start=begun), replace(point, start=begun)
             return ModelFit(
                 model, problem, mbe, point, predictions, steps, numerics, shift, error, change
             )
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
-        start = point.theta if point.status.ok else start
+        start = start if lost else point.theta
         share = problem.predictor if _can_be_coarser(problem) else share
         problem = _problem(model, records, numerics, 2 * steps, share)
 
@@ -419,6 +420,15 @@ def _estimated(
     return mbe, point
 
 
+def _lost(mbe: PointEstimate, point: PointEstimate) -> bool:
+    """Whether an estimate ended, or lost its way, where a solution was not found.
+
+    One that its limit of iterations ended has no need of other steps, and what it reached is nearer
+    than where it began.
+    """
+    return not point.status.ok and bool(mbe.failures or point.failures)
+
+
 def _can_be_coarser(problem: CampaignProblem) -> bool:
     """Whether any run is so long that its steps may be joined."""
     return any(run.can_be_coarser for run in problem.predictor.runs)
@@ -445,6 +455,7 @@ def _wants_finer(
     moved: bool,
     seen: float,
     check: bool,
+    lost: bool,
 ) -> bool:
     """Whether an estimate is to be repeated on half the steps.
 
@@ -453,10 +464,12 @@ def _wants_finer(
     others this is all that is asked.
     """
     steps, long = problem.predictor.steps, _can_be_coarser(problem)
-    if long and steps < WHOLE and not point.status.ok:
+    if long and steps < WHOLE and lost:
         return True  # steps may be so long that no solution is found, or lost on the way
     if not check:
-        return long and steps < MOST_COMPARED and _shows(problem, point, predictions, numerics)
+        # Where iterations ended the estimate, finer steps than an integrator's give it only more.
+        most = MOST_COMPARED if point.status.ok else WHOLE
+        return long and steps < most and _shows(problem, point, predictions, numerics)
     if long and not np.isfinite(seen):
         moved = steps < WHOLE
     elif long and steps < MOST_COMPARED:
@@ -522,7 +535,7 @@ def _shows(
     numerics: Numerics,
 ) -> bool:
     """Whether half the steps would visibly change what a model leaves."""
-    if not point.status.ok:
+    if not all(run.status.ok for run in predictions):
         return False
     halved = _halved(problem, point)
     if halved is None:  # where a force sets in, the solution is lost on one mesh and not on another

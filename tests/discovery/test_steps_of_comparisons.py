@@ -340,3 +340,24 @@ def test_masked_samples_change_nothing():
     assert expected[0] > 0
     assert changed_squares(measured, here, other, variance, weight) == expected
     assert changed_squares(measured, here, other, variance, np.zeros(500)) == (0.0, 0.0)
+
+
+def test_iterations_that_run_out_are_not_repeated_from_the_start_on_finer_steps(monkeypatch):
+    """More iterations were what such an estimate lacked, and the steps still do."""
+    model, truth = KINDS["oscillator"]
+    data, begin = record(model, truth), np.array([60.0, 280.0])
+    starts, real = [], _fit.estimate
+
+    def counted(problem, method, *, start=None, **options):
+        starts.append((problem.predictor.steps, None if start is None else start.copy()))
+        return real(problem, method, start=start, **options)
+
+    monkeypatch.setattr(_fit, "estimate", counted)
+    found = fit_model(
+        model, [data], replace(NUMERICS, steps=COARSEST), start=begin,
+        max_iterations=1, check_mesh=False,
+    )  # fmt: skip
+    assert not found.point.status.ok
+    assert [steps for steps, _ in starts[:1]] == [COARSEST]
+    # On finer steps, if any, the estimate goes on from where it was.
+    assert not any(np.array_equal(start, begin) for _, start in starts[1:])
