@@ -228,7 +228,7 @@ def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Ref
 def refit_all(base: Base, scores: Sequence[Score], numerics: Numerics) -> list[Refit]:
     """Estimates of the model extended by each of some candidates; see :func:`refit`."""
     shared = base, numerics
-    found = process_map(_apart, shared, scores, numerics.jobs, known=_records_of)
+    found = process_map(_apart, shared, scores, numerics.jobs, known=records_of)
     return [replace(one, score=score) for one, score in zip(found, scores, strict=True)]
 
 
@@ -237,7 +237,8 @@ def _apart(shared: tuple[Base, Numerics], score: Score) -> Refit:
     return replace(refit(shared[0], score, shared[1]), score=cast(Any, None))
 
 
-def _records_of(shared: tuple[Base, Numerics]) -> Sequence[Record]:
+def records_of(shared: tuple[Base, *tuple[Any, ...]]) -> Sequence[Record]:
+    """Records of what calls of a worker share, a base first; results refer to them."""
     return shared[0].fit.records
 
 

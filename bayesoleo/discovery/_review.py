@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
 from bayesoleo._types import ProgressCallback
+from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import Numerics
@@ -26,7 +28,7 @@ from bayesoleo.discovery._ranking import (
     rank,
     score_candidates,
 )
-from bayesoleo.discovery._refit import Refit, fall_from, refit, refit_all, refit_at
+from bayesoleo.discovery._refit import Refit, fall_from, records_of, refit, refit_all, refit_at
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
@@ -291,20 +293,33 @@ def _from_other_shapes(
     best score at the null may lie near the wrong one. Two effects would then seem distinguishable
     that differ in their shape only.
     """
-    best, policy = max(result.fall for result in refits.values()), base.policy
-    better: dict[int, Refit] = {}
-    for score in chosen:
-        found, grids = refits[id(score)], score.option.candidate.shapes
-        if not score.shapes or not found.fall > policy.restart_share * best:
-            continue
-        for part in policy.shape_starts:
-            if best - found.fall < policy.restart_gap * found.inflation:
-                break
-            shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
-            again = refit(base, replace(score, shapes=shapes), numerics)
-            if np.isfinite(again.share) and again.fall > found.fall:
-                found = better[id(score)] = replace(again, score=score)
-    return better
+    best = max(result.fall for result in refits.values())
+    behind = [
+        score
+        for score in chosen
+        if score.shapes and refits[id(score)].fall > base.policy.restart_share * best
+    ]
+    items = [(score, refits[id(score)].fall, refits[id(score)].inflation) for score in behind]
+    found = process_map(_restarted, (base, numerics, best), items, numerics.jobs, known=records_of)
+    pairs = zip(behind, found, strict=True)
+    return {id(score): replace(one, score=score) for score, one in pairs if one is not None}
+
+
+def _restarted(
+    shared: tuple[Base, Numerics, float], item: tuple[Score, float, float]
+) -> Refit | None:
+    """A better estimate of one effect from other shapes, without its score; None where there is
+    none. Its best known fall and inflation are given with it."""
+    (base, numerics, best), (score, fall, inflation) = shared, item
+    better, grids = None, score.option.candidate.shapes
+    for part in base.policy.shape_starts:
+        if best - fall < base.policy.restart_gap * inflation:
+            break
+        shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
+        again = refit(base, replace(score, shapes=shapes), numerics)
+        if np.isfinite(again.share) and again.fall > fall:
+            better, fall, inflation = again, again.fall, again.inflation
+    return None if better is None else replace(better, score=cast(Any, None))
 
 
 def _worth_estimating(
