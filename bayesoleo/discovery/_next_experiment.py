@@ -291,7 +291,8 @@ class _Judge:
         new = isinstance(run, Planned) or (isinstance(run, Variation) and bool(run.change))
         if new and not _inside(self.limits, outputs, [y for _, y in solved]):
             return BEYOND_LIMITS
-        return self._described(run, self._told([item for item, _ in solved], known))
+        told = self._told([item for item, _ in solved], known)
+        return self._described(run, record.frequency, told)
 
     def _begin(self, rival: int, label: str) -> TransientRun | None:
         """Where a rival's solutions of a transient's variations begin: found once."""
@@ -337,7 +338,7 @@ class _Judge:
                 found.append(Component(k, 1.0, item))
         return found
 
-    def _described(self, run: Run, told: Separation | Precision) -> ProposedRun:
+    def _described(self, run: Run, frequency: float, told: Separation | Precision) -> ProposedRun:
         """The run with what it tells."""
         own = {
             "separation": told if isinstance(told, Separation) else None,
@@ -351,7 +352,6 @@ class _Judge:
                 run.frequency, move.mean, move.amplitude, label=run.label, **own  # type: ignore[arg-type]
             )  # fmt: skip
         label = "" if run.change else run.like
-        frequency = run.record.frequency
         return ProposedRun(
             frequency, np.nan, np.nan, label=label, like=run.like, change=run.change, **own  # type: ignore[arg-type]
         )  # fmt: skip

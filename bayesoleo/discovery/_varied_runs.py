@@ -9,8 +9,9 @@ starts. No amplitude, duration or start leaves the range of those measured by mo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -43,8 +44,9 @@ class Variation:
 
     Parameters
     ----------
-    record : Record
-        With inputs, without outputs.
+    make : callable
+        Makes its record, with inputs and without outputs: those of some dozen long records would
+        fill the memory.
     like : str
         Label of the run that it varies.
     change : str
@@ -53,10 +55,15 @@ class Variation:
         Factor of the estimated start of a transient.
     """
 
-    record: Record
+    make: Callable[[], Record]
     like: str
     change: str = ""
     start: float = 1.0
+
+    @property
+    def record(self) -> Record:
+        """Its record, made anew."""
+        return self.make()
 
 
 def varied_runs(records: Sequence[Record], model: Model, outputs: Sequence[str]) -> list[Variation]:
@@ -91,8 +98,9 @@ def varied_runs(records: Sequence[Record], model: Model, outputs: Sequence[str])
 def repeated(record: Record, outputs: Sequence[str]) -> Variation:
     """A measured run once more."""
     if record.periodic:
-        return Variation(_blank_period(record, record.frequency, {}, outputs), record.label)
-    return Variation(_blank_transient(record, {}, 1.0, 1.0, outputs), record.label)
+        blank = partial(_blank_period, record, record.frequency, {}, outputs)
+        return Variation(blank, record.label)
+    return Variation(partial(_blank_transient, record, {}, 1.0, 1.0, outputs), record.label)
 
 
 def moving_inputs(
@@ -151,7 +159,7 @@ def _periodic(records: Sequence[Record], model: Model, outputs: Sequence[str]) -
                     name: _scaled(record.harmonics[name], factors[name], turned[name])
                     for name in inputs
                 }
-                blank = _blank_period(record, record.frequency, moved, outputs)
+                blank = partial(_blank_period, record, record.frequency, moved, outputs)
                 found.append(Variation(blank, record.label, change))
     return found
 
@@ -210,7 +218,9 @@ def _transient(records: Sequence[Record], model: Model, outputs: Sequence[str]) 
             words += [_times("duration", last), _times("start", begin)]
             change = ", ".join(word for word in words if word)
             if change:
-                blank = _blank_transient(record, scale, float(last), float(begin), outputs, model)
+                blank = partial(
+                    _blank_transient, record, scale, float(last), float(begin), outputs, model
+                )
                 found.append(Variation(blank, record.label, change, float(begin)))
     return found
 

@@ -11,9 +11,11 @@ discretisation error is estimated once, at the point estimate.
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
-from typing import cast
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -47,6 +49,8 @@ MOST_LINES = 256
 TOLERANCE = 1e-6
 #: Points of a run at which its equations are looked at: every run of every fit is.
 LOOKS = 16_384
+#: Bytes of draws that are kept for the next model of a run.
+MOST_KEPT = 3e8
 #: Coefficients of an input for which states are solved together.
 TOGETHER = 32
 
@@ -71,7 +75,6 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     """
     derived = run.kernels.derived
     ny, samples = run.measured.shape
-    at_samples = _input_changes(run, run.record.position)
     lanes, one = np.zeros(1, dtype=np.int64), p[None]
     z, x = np.empty((1, 0, samples)), np.empty((1, 0, 0))
     if derived.dofs:
@@ -85,12 +88,13 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     with np.errstate(all="ignore"):
         run.kernels.output_jacobian(z, run.sample_inputs, one, lanes, yz, yp)
         run.kernels.output_inputs(z, run.sample_inputs, one, lanes, yu)
-    columns = np.einsum("yuN,ukN->ykN", yu[0], at_samples)
+    changes, by_start = _InputChanges(run, run.record.position), _moved_by_start(run, p, x)
+    columns = np.empty((ny, changes.count + by_start.shape[1], samples))
+    for part in changes.parts:
+        columns[:, part] = np.einsum("yuN,ukN->ykN", yu[0], changes.of(part))
     for part, moved in _moved(run, one, x) if derived.dofs else ():
         columns[:, part] += np.einsum("yzN,zkN->ykN", yz[0], moved)
-    by_start = _moved_by_start(run, p, x)
-    if by_start.shape[1]:  # hundreds of other columns are not copied for nothing
-        columns = np.concatenate([columns, np.einsum("yzN,zkN->ykN", yz[0], by_start)], axis=1)
+    columns[:, changes.count :] = np.einsum("yzN,zkN->ykN", yz[0], by_start)
     return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 
@@ -109,10 +113,9 @@ def _moved(run: RunPredictor, p: Array, x: Array) -> Iterator[tuple[slice, Array
     run.scheme.rows(x, lanes, step, z)
     run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
     run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
-    changes = _input_changes(run, run.points)
-    for first in range(0, changes.shape[1], TOGETHER):
-        part = slice(first, first + TOGETHER)
-        right = np.einsum("lduN,ukN->ldkN", gu, changes[:, part])
+    changes = _InputChanges(run, run.points)
+    for part in changes.parts:
+        right = np.einsum("lduN,ukN->ldkN", gu, changes.of(part))
         states = run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
         yield part, run.scheme.sample(states, run.plan, step)[0]
 
@@ -165,29 +168,128 @@ def _start_errors(run: TransientRun) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _input_changes(run: RunPredictor, phase: Array) -> Array:
-    """Change of every input row by one standard deviation of each coefficient, shape (nu, k, N)."""
-    rows, record = run.kernels.derived.inputs, run.record
-    if not record.periodic:
-        return _transient_changes(run, phase)
-    highest = highest_derivatives(rows)
-    channels = [name for name in run.model.inputs if any(row[0] == name for row in rows)]
-    blocks = []
-    for channel in channels:
-        item = harmonics_of(record, channel).for_derivative(highest[channel])
-        own = [(k, derivative) for k, (name, derivative) in enumerate(rows) if name == channel]
-        count, kept = item.orders.size, counted_parts(item, [derivative for _, derivative in own])
-        place = np.cumsum(kept) - 1
-        block = np.zeros((len(rows), int(kept.sum()), phase.size))
-        factors = zip(item.orders, np.sqrt(item.variances), _turns(item.orders, phase), strict=True)
-        for j, (order, sd, turn) in enumerate(factors):
-            for k, derivative in own:
-                changed = (2j * np.pi * record.frequency * order) ** derivative * sd * turn
-                for at, part in ((j, changed.real), (count + j, -changed.imag)):
-                    if kept[at]:
-                        block[k, place[at]] = part
-        blocks.append(block)
-    return np.concatenate(blocks, axis=1) if blocks else np.zeros((len(rows), 0, phase.size))
+class _InputChanges:
+    """Change of every input row by one standard deviation of each coefficient, some at a time.
+
+    Parameters
+    ----------
+    run : RunPredictor
+    phase : ndarray, shape (N,)
+        Where.
+    """
+
+    def __init__(self, run: RunPredictor, phase: Array):
+        rows, record = run.kernels.derived.inputs, run.record
+        self.shape, self.blocks = (len(rows), phase.size), list[tuple[list[int], _Block]]()
+        highest = highest_derivatives(rows)
+        for channel in run.model.inputs:
+            orders = {k: order for k, (name, order) in enumerate(rows) if name == channel}
+            if not orders:
+                continue
+            derivatives = tuple(orders.values())
+            block: _Block
+            if record.periodic:
+                item = harmonics_of(record, channel).for_derivative(highest[channel])
+                block = _Known(_harmonic_changes(item, record.frequency, derivatives, phase))
+            else:
+                curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
+                size, rate = record.time.size, record.rate
+                lines = _noise_lines(curve, 1.0 / rate, size)
+                block = (
+                    _Known(_known_changes(curve, rate, size, derivatives, phase.tobytes()))
+                    if lines is None
+                    else _Lines(*lines, derivatives, phase)
+                )
+            self.blocks.append((list(orders), block))
+        self.ends = np.cumsum([0, *(block.count for _, block in self.blocks)])
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return int(self.ends[-1])
+
+    @property
+    def parts(self) -> list[slice]:
+        """All coefficients, a few at a time."""
+        firsts = range(0, self.count, TOGETHER)
+        return [slice(first, min(first + TOGETHER, self.count)) for first in firsts]
+
+    def of(self, part: slice) -> Array:
+        """Of some coefficients, shape (nu, k, N)."""
+        found = np.zeros((self.shape[0], part.stop - part.start, self.shape[1]))
+        for (rows, block), begin, end in zip(self.blocks, self.ends, self.ends[1:], strict=False):
+            low, high = max(part.start, begin), min(part.stop, end)
+            if low < high:
+                own = block.of(int(low - begin), int(high - begin))
+                found[rows, low - part.start : high - part.start] = own
+        return found
+
+
+class _Block(Protocol):
+    """Changes of some derivatives of one channel."""
+
+    count: int
+
+    def of(self, first: int, last: int) -> Array:
+        """Of the coefficients from a first one up to a last one, shape (derivatives, k, N)."""
+
+
+class _Known:
+    """Those that were computed, shape (derivatives, k, N)."""
+
+    def __init__(self, changes: Array):
+        self.changes, self.count = changes, changes.shape[1]
+
+    def of(self, first: int, last: int) -> Array:
+        return self.changes[:, first:last]
+
+
+class _Lines:
+    """Those by lines of noise whose angles are whole multiples of half a turn in all the time.
+
+    Of a long record all of them together take hundreds of megabytes. They are made from two tables,
+    and thus faster than they would be kept.
+
+    Parameters
+    ----------
+    omega, sd : ndarray, shape (k,)
+        From :func:`_noise_lines`.
+    derivatives : tuple of int
+    position : ndarray, shape (N,)
+    """
+
+    def __init__(self, omega: Array, sd: Array, derivatives: tuple[int, ...], position: Array):
+        self.omega, self.sd, self.derivatives = omega, sd, derivatives
+        self.half, self.count = 0.5 * position, omega.size
+        self.turns = np.exp(2j * np.pi * np.outer(np.arange(TABLE), self.half % 1.0))
+
+    def of(self, first: int, last: int) -> Array:
+        found = np.empty((len(self.derivatives), last - first, self.half.size))
+        turns = _turns(np.arange(first, last), self.half, self.turns)
+        for j, turn in enumerate(turns):
+            for k, order in enumerate(self.derivatives):
+                size = self.sd[first + j] * self.omega[first + j] ** order
+                # A quarter of a turn for each derivative.
+                part = turn.imag if order % 2 else turn.real
+                np.multiply(part, -size if order % 4 in (1, 2) else size, out=found[k, j])
+        return found
+
+
+def _harmonic_changes(
+    item: Harmonics, frequency: float, derivatives: Sequence[int], phase: Array
+) -> Array:
+    """The same by the counted parts of harmonics, shape (derivatives, k, N)."""
+    count, kept = item.orders.size, counted_parts(item, derivatives)
+    place = np.cumsum(kept) - 1
+    found = np.zeros((len(derivatives), int(kept.sum()), phase.size))
+    factors = zip(item.orders, np.sqrt(item.variances), _turns(item.orders, phase), strict=True)
+    for j, (order, sd, turn) in enumerate(factors):
+        for k, derivative in enumerate(derivatives):
+            changed = (2j * np.pi * frequency * order) ** derivative * sd * turn
+            for at, part in ((j, changed.real), (count + j, -changed.imag)):
+                if kept[at]:
+                    found[k, place[at]] = part
+    return found
 
 
 def counted_parts(item: Harmonics, derivatives: Sequence[int]) -> Flags:
@@ -197,14 +299,17 @@ def counted_parts(item: Harmonics, derivatives: Sequence[int]) -> Flags:
     return np.concatenate([known & (moves | (0 in derivatives)), known & moves])
 
 
-def _turns(orders: Integers, phase: Array) -> Iterator[ComplexArray]:
+def _turns(
+    orders: Integers, phase: Array, fine: ComplexArray | None = None
+) -> Iterator[ComplexArray]:
     """``exp(2 pi i k phase)`` for one order ``k`` after the other, each of shape (N,).
 
     Products of two tables, since hundreds of orders at thousands of phases would take an
     exponential each.
     """
     whole = phase % 1.0
-    fine = np.exp(2j * np.pi * np.outer(np.arange(TABLE), whole))
+    if fine is None:
+        fine = np.exp(2j * np.pi * np.outer(np.arange(TABLE), whole))
     coarse: dict[int, ComplexArray] = {}
     for order in orders:
         high, low = divmod(int(order), TABLE)
@@ -213,36 +318,41 @@ def _turns(orders: Integers, phase: Array) -> Iterator[ComplexArray]:
         yield coarse[high] * fine[low]
 
 
-@lru_cache(maxsize=64)
-def _errors(signal: Smoothed) -> tuple[Smoothed, ...]:
-    return tuple(signal.errors(DRAWS))
+class _Draws:
+    """Draws of the errors of curves, those asked for last: of a long record they fill the memory,
+    and each new run that is predicted has curves of its own."""
+
+    def __init__(self, most: float):
+        self.most, self.lock = most, threading.Lock()
+        self.kept: OrderedDict[Smoothed, tuple[Smoothed, ...]] = OrderedDict()
+
+    def of(self, curve: Smoothed) -> tuple[Smoothed, ...]:
+        """Draws of one curve."""
+        with self.lock:
+            if curve in self.kept:
+                self.kept.move_to_end(curve)
+                return self.kept[curve]
+        found = tuple(curve.errors(DRAWS))
+        with self.lock:
+            self.kept[curve] = found
+            while len(self.kept) > 1 and self._size() > self.most:
+                self.kept.popitem(last=False)
+        return found
+
+    def _size(self) -> int:
+        """Bytes of what is kept, with the pieces that a curve is evaluated by."""
+        return sum(3 * one.states.nbytes for draws in self.kept.values() for one in draws)
 
 
-def _transient_changes(run: RunPredictor, position: Array) -> Array:
-    """The same of a transient: every line of the noise that a curve holds, or draws of its error
-    where there are too many."""
-    rows, record = run.kernels.derived.inputs, run.record
-    highest, blocks = highest_derivatives(rows), [np.zeros((len(rows), 0, position.size))]
-    for channel in run.model.inputs:
-        orders = {k: order for k, (name, order) in enumerate(rows) if name == channel}
-        if not orders:
-            continue
-        curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
-        changes = _known_changes(
-            curve, record.rate, record.time.size, tuple(orders.values()), position.tobytes()
-        )
-        block = np.zeros((len(rows), changes.shape[1], position.size))
-        block[list(orders)] = changes
-        blocks.append(block)
-    return np.concatenate(blocks, axis=1)
+_errors = _Draws(MOST_KEPT)
 
 
 @lru_cache(maxsize=4)
 def _known_changes(
     curve: Smoothed, rate: float, samples: int, orders: tuple[int, ...], position: bytes
 ) -> Array:
-    """The same as :func:`_curve_changes`, kept: each model of a run asks for it again, and of a
-    long record it takes longer than to solve the model."""
+    """The same as :func:`_curve_changes`, kept: each model of a run asks for it again, and draws of
+    a long record take longer than to solve the model."""
     found = _curve_changes(curve, rate, samples, orders, np.frombuffer(position))
     found.flags.writeable = False
     return found
@@ -254,7 +364,7 @@ def _curve_changes(
     """Change of some derivatives of a curve by one standard deviation of each of its errors, of a
     record of so many samples, and of a length with that reciprocal."""
     lines, found = _noise_lines(curve, 1.0 / rate, samples), []
-    draws = () if lines is not None else _errors(curve)
+    draws = () if lines is not None else _errors.of(curve)
     for order in orders:
         if lines is not None:
             omega, sd = lines
