@@ -687,9 +687,10 @@ def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | Non
         jobs=coarse.jobs,
         share=coarse,
     )
-    if any(status is not Status.CONVERGED for status in fine.set_anchor(theta)):
+    found = fine.solved_anew(theta)
+    if any(samples.status[0] != Status.CONVERGED.value for samples in found):
         return None
-    return [fine.simulate(theta[None], r).y[0] for r in range(len(fine.runs))]
+    return [samples.y[0] for samples in found]
 
 
 def _shift(

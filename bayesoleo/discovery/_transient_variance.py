@@ -63,7 +63,7 @@ class RunNoise:
     @property
     def samples(self) -> int:
         """Number of samples."""
-        return self.residual.shape[1]
+        return int(self.residual.shape[1])
 
     @cached_property
     def lines(self) -> _Lines:

@@ -349,6 +349,11 @@ class RunPredictor:
         nothing = np.full((1, shape[1], shape[3]), np.nan), np.full(shape, np.nan)
         return PredictedSamples(*nothing, np.array([status.value], dtype=np.int64))
 
+    def solved_anew(self, p: Array) -> PredictedSamples:
+        """Outputs at constants ``p (np,)``, which the anchor is set at first."""
+        status = self.set_anchor(p)
+        return self.predict(p[None]) if status is Status.CONVERGED else self._failed(status)
+
     def known_at(self, p: Array) -> PredictedSamples | None:
         """Outputs with derivatives at constants ``p (np,)`` where they are known; of periodic runs
         :meth:`predict` also tells whether a solution left its branch."""

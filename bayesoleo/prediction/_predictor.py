@@ -217,6 +217,14 @@ class Predictor:
             lambda r: self.runs[r].set_anchor(self.constants(theta[None], r)[0]), work, self.jobs
         )
 
+    def solved_anew(self, theta: Float[Array, " unknowns"]) -> list[PredictedSamples]:
+        """Outputs of every run at ``theta (l,)`` without sensitivities, whether or not it has an
+        anchor."""
+        work = range(len(self.runs))
+        return thread_map(
+            lambda r: self.runs[r].solved_anew(self.constants(theta[None], r)[0]), work, self.jobs
+        )
+
     def predict(self, theta: Float[Array, " unknowns"]) -> list[RunPrediction]:
         """Outputs and sensitivities of every run at ``theta (l,)``."""
         return thread_map(lambda r: self._predict_run(theta, r), range(len(self.runs)), self.jobs)

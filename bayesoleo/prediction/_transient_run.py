@@ -249,6 +249,18 @@ class TransientRun(RunPredictor):
             last = self._last = anchor, p.copy(), self._solved(p[None])
         return last[2]
 
+    def solved_anew(self, p: Array) -> PredictedSamples:
+        """Outputs at constants ``p (np,)``; without an anchor from the start, and none is set."""
+        if not self.kernels.derived.dofs or self.anchor is not None:
+            return self.predict(p[None])
+        start = self.initial(p[None])
+        if start.status[0] != Status.CONVERGED.value:
+            return self._failed(Status(int(start.status[0])))
+        solution = self._first(p, start.state[0])
+        if isinstance(solution, Status):
+            return self._failed(solution)
+        return self._at_samples(p[None], solution.x, None, solution.status, derivatives=False)
+
     def known_at(self, p: Array) -> PredictedSamples | None:
         """Outputs with derivatives of the anchor, if it is the solution at constants ``p``."""
         return self.evaluate(p) if self._stands_at(p) else None

@@ -122,3 +122,14 @@ def test_refused_steps_take_no_sensitivities_and_the_estimate_is_the_same(monkey
     assert few < len(calls) - few
     # Both are converged to a thousandth of a standard deviation.
     np.testing.assert_allclose(found.theta, expected.theta, rtol=0, atol=2e-3 * expected.sd.max())
+
+
+def test_a_run_without_an_anchor_is_solved_without_sensitivities(monkeypatch):
+    known, fresh = swinging().predictor, swinging().predictor
+    known.set_anchor(TRUTH)
+    expected = known.simulate(TRUTH[None], 0).y
+    monkeypatch.setattr(transient, "transient_sensitivities", lambda *_: pytest.fail("computed"))
+    (found,) = fresh.solved_anew(TRUTH)
+    assert fresh.runs[0].anchor is None
+    # Newton's method leaves round-off, from either start.
+    np.testing.assert_allclose(found.y, expected, rtol=0, atol=1e-10)
