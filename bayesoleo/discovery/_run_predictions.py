@@ -179,7 +179,8 @@ def predict_fitted(fit: ModelFit) -> list[Prediction]:
             if name in fit.model.parameters or name.endswith(f"[{record.label}]")
         }
         predictor = _single(fit, record)
-        if record.periodic:  # stay on the branch of the fit
+        # Stay on the branch of the fit; a transient on its mesh is not solved again.
+        if record.periodic or predictor.runs[0].steps == solved.steps:
             predictor.runs[0].anchor = solved.anchor
         prediction = Prediction(record, run.y, mine, 0, run.status, predictor)
         predictor.set_anchor(prediction.vector)
@@ -218,8 +219,9 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
             return found
         finer = _single(fit, record, 2 * steps, predictor)
         if found.status.ok:
-            solved = finer.set_anchor(found.vector)[0] is Status.CONVERGED
-            halved = finer.simulate(found.vector[None], 0).y[0] if solved else np.array(np.nan)
+            (fine,) = finer.solved_anew(found.vector)
+            solved = fine.status[0] == Status.CONVERGED.value
+            halved = fine.y[0] if solved else np.array(np.nan)
             counts = weights(record) > 0
             left = np.mean((run.measured - found.y)[:, counts] ** 2, axis=1)
             if np.isfinite(halved).all():

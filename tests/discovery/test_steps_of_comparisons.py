@@ -252,16 +252,18 @@ def test_a_hold_out_run_has_steps_of_its_own(fitted):
 
 def failing(monkeypatch, fails):
     """Let the motion not be found where a function of the steps and the number of the call says."""
-    solve = Predictor.set_anchor
+    solve = Predictor.solved_anew
     seen = []
 
-    def set_anchor(self, theta, *args, **more):
+    def solved_anew(self, theta):
         seen.append(self.steps)
+        found = solve(self, theta)
         if fails(self.steps, seen.count(self.steps)):
-            return [Status.NO_CONVERGENCE] * len(self.runs)
-        return solve(self, theta, *args, **more)
+            lost = np.array([Status.NO_CONVERGENCE.value])
+            return [replace(one, status=lost) for one in found]
+        return found
 
-    monkeypatch.setattr(Predictor, "set_anchor", set_anchor)
+    monkeypatch.setattr(Predictor, "solved_anew", solved_anew)
 
 
 @pytest.mark.parametrize(
