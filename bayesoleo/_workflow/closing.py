@@ -32,11 +32,13 @@ from bayesoleo._workflow.output import (
 )
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
+from bayesoleo.discovery._inference import CATALOGUE
 from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of
 from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
+from bayesoleo.error_models._registry import AUTO
 from bayesoleo.errors import ResultsError
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._diagnostics import Samples
@@ -149,7 +151,13 @@ def draw_final(
         name for item in loop.rounds if item.accepted is not None for name in item.accepted.same
     ]
     inference = inference_for(
-        task, final.fit, final.assembly, callback, held_out=final.held_out, undecided=rivals
+        task,
+        final.fit,
+        final.assembly,
+        callback,
+        held_out=final.held_out,
+        undecided=rivals,
+        scanned=loop.scanned,
     )
     return draw(task, final.fit, checkpoints, callback, progress, inference)
 
@@ -261,6 +269,7 @@ def run_loop(
             known=known,
             prior=settings.structure_prior,
             keep=keep,
+            keep_columns=max_effects > 0 and settings.inference.error_model in (AUTO, CATALOGUE),
             callback=callback,
         )
     except Exception as error:

@@ -40,6 +40,7 @@ from bayesoleo.discovery._inference import (
 )
 from bayesoleo.discovery._result_tree import point_group, posterior_groups, predictive_groups
 from bayesoleo.discovery._run_predictions import Prediction, predict_held_out
+from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.error_models._registry import AUTO
 from bayesoleo.estimation._per_run import by_run_dataset
 from bayesoleo.model._model import Model
@@ -131,6 +132,7 @@ def inference_for(
     *,
     held_out: Sequence[Prediction] | None = None,
     undecided: Sequence[str] = (),
+    scanned: Scanned | None = None,
 ) -> Inference:
     """Error model and scatter of a fit: the user's choice, or by what the data show.
 
@@ -155,6 +157,7 @@ def inference_for(
         effects=settings.searched,
         held_out=held_out,
         undecided=undecided,
+        scanned=scanned,
         jobs=settings.jobs,
     )
 

@@ -14,12 +14,13 @@ from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._run_predictions import Prediction
+from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._signatures import (
     COLOUR_FALSE_ALARM,
+    FittedSignatures,
     Noise,
     more_than_noise_p,
     noise_of,
-    signatures_of,
 )
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._base import Frame
@@ -167,6 +168,7 @@ def chosen_for(
     effects: Sequence[Effect] | None = None,
     held_out: Sequence[Prediction] = (),
     undecided: Sequence[str] = (),
+    scanned: Scanned | None = None,
     jobs: int | None = None,
 ) -> Inference:
     """The inference with an error model that is chosen by what the data show.
@@ -186,8 +188,10 @@ def chosen_for(
         Runs that were not fitted, for predictions.
     undecided : sequence of str
         Effects between which the search could not decide.
+    scanned : Scanned, optional
+        What the last scores of the search computed.
     jobs : int, optional
-        Threads.
+        Processes.
     """
     word = inference.error_model
     if word not in (AUTO, CATALOGUE):
@@ -201,10 +205,12 @@ def chosen_for(
     if word == AUTO and not undecided and more_than_noise_p(fit, noise) > LOOKED_FOR:
         word, reason = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
         return replace(inference, error_model=word, reason=reason)
-    fit.problem.signatures = signatures_of(
-        fit, assembly, noise, effects=effects, held_out=held_out, jobs=jobs
+    found = FittedSignatures.of(
+        fit, assembly, noise, effects=effects, held_out=held_out, scanned=scanned, jobs=jobs
     )
+    fit.problem.signatures = found.signatures
     if word == CATALOGUE:
+        fit.problem.signatures = found.with_curves(jobs)
         return inference
     word, reason = error_model_by(
         noise.p_value,
@@ -214,8 +220,8 @@ def chosen_for(
     )
     if word == CATALOGUE:
         word, reason = _unless_priors_decide(fit, noise, reason)
-    if word != CATALOGUE:
-        fit.problem.signatures = None
+    # Curves are for draws: what runs that were not fitted need of them is computed for these only.
+    fit.problem.signatures = found.with_curves(jobs) if word == CATALOGUE else None
     return replace(inference, error_model=word, reason=reason)
 
 

@@ -28,6 +28,7 @@ from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import Progress, Round, examine
+from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state
 from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
@@ -182,6 +183,11 @@ class ClosedLoop:
         return tuple(target for _, target in self.final.assembly.added)
 
     @property
+    def scanned(self) -> Scanned | None:
+        """What the candidates of the last round change in the outputs, where it was kept."""
+        return self.rounds[-1].scanned if self.rounds else None
+
+    @property
     def verdict(self) -> str:
         """One of the three verdicts of the summary."""
         return verdict_of(self.rounds, self.first, self.final, policy=self.policy)
@@ -235,6 +241,7 @@ def close_loop(
     known: Progress | None = None,
     prior: StructurePrior = DEFAULT_PRIOR,
     keep: Callable[[Progress], None] = lambda _: None,
+    keep_columns: bool = False,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model and add the effects that it lacks, one after the other.
@@ -261,6 +268,9 @@ def close_loop(
         Prior probabilities of what may be missing.
     keep : callable
         Receives the progress once the model is estimated, and after each round.
+    keep_columns : bool
+        Whether to keep what the candidates of the last round change in the outputs, for the choice
+        of an error model.
     callback : callable
         Receives a message at each step.
 
@@ -272,12 +282,18 @@ def close_loop(
         known = _begun(assembly, roles, numerics, callback)
         keep(known)
     search = SearchOptions(
-        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback
+        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns
     )
     known = searched(known, search)
 
     def follow(other: Progress, most: int) -> Progress:
-        quiet = replace(search, max_effects=most, nonparametric=False, keep=lambda _: None)
+        quiet = replace(
+            search,
+            max_effects=most,
+            nonparametric=False,
+            keep=lambda _: None,
+            keep_columns=False,
+        )
         return searched(other, quiet)
 
     roles = _with_noise(roles, known)
@@ -345,6 +361,7 @@ class SearchOptions:
     nonparametric: bool
     keep: Callable[[Progress], None]
     callback: ProgressCallback
+    keep_columns: bool = False
 
 
 def searched(known: Progress, search: SearchOptions) -> Progress:
@@ -376,6 +393,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             effects=search.effects,
             seed=search.seed,
             limit=limit,
+            keep_columns=search.keep_columns,
             callback=callback,
         )
         if outcome.after is None and search.nonparametric and max_effects > 0:

@@ -23,8 +23,16 @@ from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._scanned_columns import MOST_KEPT, Scanned, size_of
 from bayesoleo.discovery._score_basis import Base
-from bayesoleo.discovery._score_tests import Score, classes, corrected_p, score_all, without_twins
+from bayesoleo.discovery._score_tests import (
+    Score,
+    classes,
+    corrected_p,
+    score_all,
+    score_and_keep,
+    without_twins,
+)
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import BETWEEN
@@ -259,6 +267,7 @@ def score_candidates(
     jobs: int | None,
     *,
     order: Callable[[Option, int], int | bool] | None = None,
+    keep: Callable[[Scanned], None] | None = None,
     callback: ProgressCallback = lambda _: None,
 ) -> tuple[list[Score], dict[str, str]]:
     """Score every effect at every place, each effect once.
@@ -276,6 +285,8 @@ def score_candidates(
     order : callable (option, place in the catalogue) -> int, optional
         Of equivalent effects the first in this order is kept; by default the first of the
         catalogue. Their shares are equal but for round-off, which differs between machines.
+    keep : callable, optional
+        Receives what the candidates change in the outputs, unless that is large.
     callback : callable, optional
         Receives a message at each step.
 
@@ -289,7 +300,11 @@ def score_candidates(
     scales = scales_of(base.fit, assembly.drive, tuple(assembly.native.dofs))
     options = assembly.options(scales, None if effects is None else tuple(effects))
     callback(f"score {len(options)} candidates")
-    scores, failed = score_all(base, options, jobs)
+    if keep is not None and size_of(base.fit, options) <= MOST_KEPT:
+        scores, failed, columns = score_and_keep(base, options, jobs)
+        keep(Scanned(base.fit, assembly, effects, options, columns))
+    else:
+        scores, failed = score_all(base, options, jobs)
     places = {option.key: k for k, option in enumerate(options)}
     chosen = order or (lambda _, place: place)
     scores.sort(key=lambda score: chosen(score.option, places[score.option.key]))

@@ -7,7 +7,7 @@ progress holds everything that the search needs to continue after its last finis
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from bayesoleo.discovery._nonparametric_search import CurveSearch
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, rank, score_candidates
 from bayesoleo.discovery._refit import Refit, refit_all
+from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import corrected_p, effective_tests
 from bayesoleo.discovery._state import State
@@ -51,6 +52,8 @@ class Round:
         Effective number of independent tests of the search.
     nonparametric : CurveSearch or None
         The smooth functions that were tried where no named effect explains the residual.
+    scanned : Scanned or None
+        What the candidates change in the outputs, where it was kept.
     """
 
     before: State
@@ -61,6 +64,7 @@ class Round:
     reason: str
     tests: float
     nonparametric: CurveSearch | None = None
+    scanned: Scanned | None = field(default=None, compare=False, repr=False)
 
 
 def examine(
@@ -71,6 +75,7 @@ def examine(
     effects: Sequence[Effect] | None,
     seed: int,
     limit: str = "",
+    keep_columns: bool = False,
     callback: ProgressCallback,
 ) -> Round:
     """Look for the effect that a fitted model lacks.
@@ -89,30 +94,39 @@ def examine(
         For the correction for the search.
     limit : str
         Why effects are only ranked and none is accepted; empty where one may be.
+    keep_columns : bool
+        Whether a round that accepts no effect keeps what the candidates change in the outputs.
     callback : callable
         Receives a message at each step.
     """
     if limit and any(step.effect.family == FAMILY for step in state.assembly.steps):
         # A curve absorbs the share of named effects, so that a ranking of them is meaningless.
         return Round(state, (), {}, None, None, limit, 1.0)
-    base, policy = state.base(), numerics.policy
+    base, policy, kept = state.base(), numerics.policy, list[Scanned]()
     scores, failed = score_candidates(
-        base, state.assembly, effects, numerics.jobs, callback=callback
+        base,
+        state.assembly,
+        effects,
+        numerics.jobs,
+        keep=kept.append if keep_columns else None,
+        callback=callback,
     )
+    scanned = kept[0] if kept else None
     tests = effective_tests(scores, seed, policy=policy)
     # They have served, and are half of what a round takes in memory and where it is kept.
     scores = [replace(one, columns=np.empty((0, one.columns.shape[1]))) for one in scores]
     ranking = rank(scores, tests, {}, policy=policy)
     stop = _stopping_reason(state, ranking, tests, policy)
     if stop is not None or limit:
-        return Round(state, ranking, failed, None, None, stop or limit, tests)
+        return Round(state, ranking, failed, None, None, stop or limit, tests, scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
     if accepted is not None and after is not None and np.isnan(after.worst_ratio):
         reason = f"with {accepted.effect} a run has no solution at the estimate"
         accepted, after = None, None
-    return Round(state, ranking, failed, accepted, after, reason, tests)
+    scanned = scanned if after is None else None  # of a model that is final
+    return Round(state, ranking, failed, accepted, after, reason, tests, scanned=scanned)
 
 
 def _stopping_reason(
@@ -329,7 +343,8 @@ class Progress:
 
     def after(self, outcome: Round, state: State, notes: list[str]) -> Progress:
         """The search with one more round."""
-        return Progress(self.first, state, (*self.rounds, outcome), tuple(notes))
+        before = (replace(one, scanned=None) if one.scanned else one for one in self.rounds)
+        return Progress(self.first, state, (*before, outcome), tuple(notes))
 
     def ended(self, reason: str) -> Progress:
         """The search, stopped early. An empty last round is added unless the search has a last

@@ -41,6 +41,7 @@ from bayesoleo.effects._terms import FAMILY as TERMS
 from bayesoleo.solvers._orbit import Status
 
 if TYPE_CHECKING:
+    from bayesoleo.discovery._fit import ModelFit
     from bayesoleo.discovery._score_basis import RunBase
 
 
@@ -229,7 +230,22 @@ def score_all(
     failed : dict of str to str
         Reason by effect where the extended model could not be solved.
     """
-    found = process_map(_apart, base, options, jobs)
+    return _of_results(process_map(_apart, base, options, jobs), options)
+
+
+def score_and_keep(
+    base: Base, options: Sequence[Option], jobs: int | None = None
+) -> tuple[list[Score], dict[str, str], list[list[Block] | Status]]:
+    """The same with the columns of each option, by set of shapes, or why there are none."""
+    found = process_map(_apart_with_columns, base, options, jobs)
+    scores, failed = _of_results([result for _, result in found], options)
+    return scores, failed, [columns for columns, _ in found]
+
+
+def _of_results(
+    found: Sequence[Score | Status | str], options: Sequence[Option]
+) -> tuple[list[Score], dict[str, str]]:
+    """Scores by falling share, and the reasons of options without one."""
     results = [
         replace(one, option=option) if isinstance(one, Score) else one
         for one, option in zip(found, options, strict=True)
@@ -257,20 +273,35 @@ def _directions_of(columns: Array) -> Array:
 
 def _apart(base: Base, option: Option) -> Score | Status | str:
     """The score without its candidate, which whoever asked has."""
-    found = _attempt(base, option)
-    return replace(found, option=cast(Any, None)) if isinstance(found, Score) else found
+    return _apart_with_columns(base, option)[1]
 
 
-def _attempt(base: Base, option: Option) -> Score | Status | str:
+def _apart_with_columns(
+    base: Base, option: Option
+) -> tuple[list[Block] | Status, Score | Status | str]:
+    """The same after the columns that were scored."""
+    columns = columns_of(base.fit, option)
+    found = columns if isinstance(columns, Status) else _attempt(base, option, columns)
+    apart = replace(found, option=cast(Any, None)) if isinstance(found, Score) else found
+    return columns, apart
+
+
+def columns_of(fit: ModelFit, option: Option) -> list[Block] | Status:
+    """Derivatives of the outputs with respect to an option's new unknowns, for each set of shapes
+    in the order of :func:`shapes_of`."""
+    fixed = [name for name in option.model.estimated() if name not in option.candidate.parameters]
+    return sensitivities_of(fit, option.model.fixing(*fixed), shapes_of(option))
+
+
+def shapes_of(option: Option) -> list[dict[str, float]]:
+    """All sets of values of shape parameters that are scanned."""
+    shapes = option.candidate.shapes
+    return [dict(zip(shapes, values, strict=True)) for values in product(*shapes.values())]
+
+
+def _attempt(base: Base, option: Option, columns: Sequence[Block]) -> Score | str:
     """The score, or why there is none."""
-    candidate = option.candidate
-    shapes = [
-        dict(zip(candidate.shapes, values, strict=True))
-        for values in product(*candidate.shapes.values())
-    ]
-    columns = _columns(base, option, shapes)
-    if isinstance(columns, Status):
-        return columns
+    shapes = shapes_of(option)
     best, used, thinned, signatures = None, columns[0], [], []
     for values, block in zip(shapes, columns, strict=True):
         score = _evaluate(base, option, values, block)
@@ -292,14 +323,6 @@ def _attempt(base: Base, option: Option) -> Score | Status | str:
         freedom=freedom,
         signature=np.concatenate(signatures) if signatures else best.signature,
     )
-
-
-def _columns(
-    base: Base, option: Option, shapes: Sequence[Mapping[str, float]]
-) -> list[Block] | Status:
-    """Derivatives of the outputs with respect to the new unknowns, for each set of shapes."""
-    fixed = [name for name in option.model.estimated() if name not in option.candidate.parameters]
-    return sensitivities_of(base.fit, option.model.fixing(*fixed), shapes)
 
 
 def _evaluate(

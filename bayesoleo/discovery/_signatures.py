@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import scipy.fft
@@ -23,7 +22,9 @@ from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, without_masked
 from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._run_predictions import Prediction, sample_noise
-from bayesoleo.discovery._score_basis import LEAST, Block, coefficients, sensitivities_of
+from bayesoleo.discovery._scanned_columns import Columns, Scanned
+from bayesoleo.discovery._score_basis import LEAST, coefficients
+from bayesoleo.discovery._score_tests import columns_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -255,14 +256,6 @@ def harmonic_powers(
 # -- signatures ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Scanned:
-    """Sensitivities of the new unknowns of one candidate, by set of shapes and run."""
-
-    option: Option
-    blocks: list[Block]
-
-
 def signatures_of(
     fit: ModelFit,
     assembly: Assembly,
@@ -272,85 +265,170 @@ def signatures_of(
     held_out: Sequence[Prediction] = (),
     jobs: int | None = None,
 ) -> Signatures:
-    """Signatures of every effect at every place where it applies.
+    """Signatures of every effect at every place where it applies, those of draws included.
 
-    Each is normalised over all fitted runs and outputs, in units of the noise: what it leaves
-    beside the model's parameters has a root mean square of one. An effect that the parameters can
-    largely imitate may therefore be larger than one that they cannot, as it is among effects that
-    have not been noticed. The effects of a family share one variance. What the parameters do as
-    well is left out.
+    Parameters are those of :meth:`FittedSignatures.of`.
+    """
+    found = FittedSignatures.of(fit, assembly, noise, effects=effects, held_out=held_out, jobs=jobs)
+    return found.with_curves(jobs)
+
+
+@dataclass(frozen=True)
+class FittedSignatures:
+    """Signatures of all effects in the fitted runs, from which those of other runs follow.
 
     Parameters
     ----------
     fit : ModelFit
-    assembly : Assembly
-        What was fitted.
-    noise : Noise
-        Of the outputs.
-    effects : sequence of Effect, optional
-        By default the catalogue.
-    held_out : sequence of Prediction
-        Runs that were not fitted, for predictions.
-    jobs : int, optional
-        Threads.
+    others : tuple of ModelFit
+        Runs that were not fitted, each by itself.
+    options : sequence of Option
+        The effects.
+    groups : tuple of _Group
+        Signatures that the model's parameters do not have.
+    signatures : Signatures
+        Without the curves that draws need.
     """
-    scales = scales_of(fit, assembly.drive, tuple(assembly.native.dofs))
-    options = assembly.options(scales, None if effects is None else tuple(effects))
-    labels = {record.label for record in fit.records}
-    others = [_as_fit(fit, one) for one in held_out if one.record.label not in labels]
-    groups: list[_Group] = []
-    sensitivity = _sensitivity(fit, noise)
-    gram = sensitivity @ sensitivity.T
-    for found in process_map(_groups_of, (fit, others), options, jobs):
-        scaled = (_scaled(fit, noise, group, sensitivity, gram) for group in found)
-        groups += [group for group in scaled if group is not None]
-    return _assembled(fit, others, noise, groups)
+
+    fit: ModelFit
+    others: tuple[ModelFit, ...]
+    options: Sequence[Option]
+    groups: tuple[_Group, ...]
+    signatures: Signatures
+
+    @classmethod
+    def of(
+        cls,
+        fit: ModelFit,
+        assembly: Assembly,
+        noise: Noise,
+        *,
+        effects: Sequence[Effect] | None = None,
+        held_out: Sequence[Prediction] = (),
+        scanned: Scanned | None = None,
+        jobs: int | None = None,
+    ) -> FittedSignatures:
+        """Of every effect at every place where it applies.
+
+        Each signature is normalised over all fitted runs and outputs, in units of the noise: what
+        it leaves beside the model's parameters has a root mean square of one. An effect that the
+        parameters can largely imitate may therefore be larger than one that they cannot, as it is
+        among effects that have not been noticed. The effects of a family share one variance. What
+        the parameters do as well is left out.
+
+        Parameters
+        ----------
+        fit : ModelFit
+        assembly : Assembly
+            What was fitted.
+        noise : Noise
+            Of the outputs.
+        effects : sequence of Effect, optional
+            By default the catalogue.
+        held_out : sequence of Prediction
+            Runs that were not fitted, for predictions.
+        scanned : Scanned, optional
+            What a score computed of the effects; it is taken where it is of the same fit.
+        jobs : int, optional
+            Processes.
+        """
+        labels = {record.label for record in fit.records}
+        others = tuple(_as_fit(fit, one) for one in held_out if one.record.label not in labels)
+        known = scanned.take(fit, assembly, effects) if scanned else None
+        if known is None:
+            scales = scales_of(fit, assembly.drive, tuple(assembly.native.dofs))
+            options = assembly.options(scales, None if effects is None else tuple(effects))
+            known = options, process_map(columns_of, fit, options, jobs)
+        sensitivity = _sensitivity(fit, noise)
+        gram, groups = sensitivity @ sensitivity.T, list[_Group]()
+        for place, (option, columns) in enumerate(zip(*known, strict=True)):
+            found = _groups(fit, others, place, option, columns)
+            scaled = (_scaled(fit, noise, group, sensitivity, gram) for group in found)
+            groups += [group for group in scaled if group is not None]
+        signatures = _assembled(fit, others, noise, groups)
+        return cls(fit, others, known[0], tuple(groups), signatures)
+
+    def with_curves(self, jobs: int | None = None) -> Signatures:
+        """The signatures with the curves of all runs, those that were not fitted included."""
+        curves = {
+            record.label: curves_of(table, _position(self.fit, r, record), record.periodic)
+            for r, (record, table) in enumerate(
+                zip(self.fit.records, self.signatures.columns, strict=True)
+            )
+        }
+        used = sorted({group.place for group in self.groups}) if self.others else []
+        tasks = [(k, self.options[place]) for k in range(len(self.others)) for place in used]
+        columns = iter(process_map(_columns_of_other, self.others, tasks, jobs))
+        for one in self.others:
+            known = {place: next(columns) for place in used}
+            for r, record in enumerate(one.records):
+                table = self._table(one, r, record, known)
+                curves[record.label] = curves_of(table, _position(one, r, record), record.periodic)
+        return replace(self.signatures, curves=curves)
+
+    def _table(self, one: ModelFit, r: int, record: Record, known: Mapping[int, Columns]) -> Array:
+        """Signatures of a run that was not fitted, shape (s, k, n); zero where there are none."""
+        rows = [(group, name) for group in self.groups for name in group.columns]
+        samples = int(one.problem.counts[r, 0])
+        table = np.zeros((len(one.predictor.outputs), len(rows), samples))
+        scale = np.sqrt(self.signatures.share)
+        for k, (group, name) in enumerate(rows):
+            columns = known[group.place]
+            if isinstance(columns, Status) or name not in columns[group.shape].names:
+                continue
+            block = columns[group.shape]
+            values = one.problem.kept(r, block.by_run[r][:, block.names.index(name)])
+            np.multiply(values, scale[k] / group.size, out=table[:, k])
+        return table
 
 
 @dataclass(frozen=True)
 class _Group:
     """Signatures of one parameter of one effect at one set of shapes; one a run if it has several.
 
-    ``columns`` holds, by unknown, arrays (ny, N) by run label. Where it is one unknown,
-    ``direction`` is what it does beside the model's parameters, over all fitted samples in units of
-    the noise, of unit length, (n,): single precision is good to some 1e-6 of a cosine.
+    ``place`` and ``shape`` say of which option and set of its shapes. ``columns`` holds, by
+    unknown, arrays (ny, N) by run label, which ``size`` divides; of unknowns of runs that were not
+    fitted it holds none. Where it is one unknown, ``direction`` is what it does beside the model's
+    parameters, over all fitted samples in units of the noise, of unit length, (n,): single
+    precision is good to some 1e-6 of a cosine.
     """
 
     family: str
     member: str
+    place: int
+    shape: int
     columns: Mapping[str, Mapping[str, Array]]
+    size: float = 1.0
     direction: NDArray[np.float32] | None = None
 
 
-def _groups_of(shared: tuple[ModelFit, Sequence[ModelFit]], option: Option) -> list[_Group]:
-    """See :func:`_groups`; also of another process."""
-    return _groups(*shared, option)
+def _columns_of_other(others: Sequence[ModelFit], task: tuple[int, Option]) -> Columns:
+    """Columns of an option in one of several runs that were not fitted."""
+    number, option = task
+    return columns_of(others[number], option)
 
 
-def _groups(fit: ModelFit, others: Sequence[ModelFit], option: Option) -> list[_Group]:
+def _groups(
+    fit: ModelFit, others: Sequence[ModelFit], place: int, option: Option, columns: Columns
+) -> list[_Group]:
     """Signatures of one candidate, in the outputs' units."""
-    candidate, found = option.candidate, list[_Group]()
-    values = list(product(*candidate.shapes.values()))
-    shapes = [dict(zip(candidate.shapes, item, strict=True)) for item in values]
-    fixed = [name for name in option.model.estimated() if name not in candidate.parameters]
-    model = option.model.fixing(*fixed)
-    solved = [(one, sensitivities_of(one, model, shapes)) for one in (fit, *others)]
-    if isinstance(solved[0][1], Status):
+    if isinstance(columns, Status):
         return []
-    for k in range(len(shapes)):
-        columns: dict[str, dict[str, dict[str, Array]]] = {}
-        for one, blocks in solved:
-            if isinstance(blocks, Status):
-                continue
-            for r, record in enumerate(one.records):
-                by_run = blocks[k].by_run[r]
-                for j, name in enumerate(blocks[k].names):
-                    group = columns.setdefault(name.split("[")[0], {})
-                    group.setdefault(name, {})[record.label] = one.problem.kept(r, by_run[:, j])
-        member = f"{candidate.effect} at {candidate.target}"
-        found += [
-            _Group(candidate.family, f"{member}: {name}", item) for name, item in columns.items()
-        ]
+    candidate, found = option.candidate, list[_Group]()
+    member = f"{candidate.effect} at {candidate.target}"
+    for k, block in enumerate(columns):
+        groups: dict[str, dict[str, dict[str, Array]]] = {}
+        for r, record in enumerate(fit.records):
+            for j, name in enumerate(block.names):
+                group = groups.setdefault(name.split("[")[0], {})
+                values = fit.problem.kept(r, block.by_run[r][:, j])
+                group.setdefault(name, {})[record.label] = values
+        for name, group in groups.items():
+            if option.model.parameters[name].by_run:
+                # A run that was not fitted has an unknown of its own, of which data say nothing.
+                labels = [record.label for one in others for record in one.records]
+                group.update({f"{name}[{label}]": {} for label in labels})
+            found.append(_Group(candidate.family, f"{member}: {name}", place, k, group))
     return found
 
 
@@ -391,53 +469,49 @@ def _scaled(
     if not (np.isfinite(whole) and whole > 0) or left <= LEAST * whole:
         return None
     size = max(float(np.sqrt(left)), LEAST_BESIDE * float(np.sqrt(whole))) / rows.shape[1] ** 0.5
-    columns = {
-        name: {label: values / size for label, values in column.items()}
-        for name, column in group.columns.items()
-    }
     direction = None
     if len(beside) == 1:
         direction = (beside[0] / np.sqrt(left)).astype(np.float32)
-    return replace(group, columns=columns, direction=direction)
+    return replace(group, size=size, direction=direction)
 
 
 def _assembled(
     fit: ModelFit, others: Sequence[ModelFit], noise: Noise, groups: Sequence[_Group]
 ) -> Signatures:
-    """All signatures in the order of their groups."""
+    """All signatures in the order of their groups, without curves."""
     share = equal_shares([g.family for g in groups], [g.member for g in groups])
     columns = [
-        (f"{group.member} {name}", float(np.sqrt(part)), values)
+        (f"{group.member} {name}", float(np.sqrt(part)), group.size, values)
         for group, part in zip(groups, share, strict=True)
         for name, values in group.columns.items()
     ]
-    shares = np.array([root**2 for _, root, _ in columns])
+    shares = np.array([root**2 for _, root, _, _ in columns])
     usable = np.flatnonzero([len(g.columns) == 1 for g in groups for _ in g.columns])
     directions = [g.direction for g in groups if g.direction is not None]
     first, odds = alike(np.array(directions), shares[usable], ALIKE)
-    outputs, curves, origins = len(noise.sigma), {}, {}
-    table = []
-    for one in (fit, *others):
-        for r, record in enumerate(one.records):
-            block = np.zeros((outputs, len(columns), int(one.problem.counts[r, 0])))
-            for k, (_, root, values) in enumerate(columns):
-                if record.label in values:
-                    np.multiply(values[record.label], root, out=block[:, k])
-            curves[record.label] = curves_of(block, _position(one, r, record), record.periodic)
-            origins[record.label] = one.problem.samples[r].origin
-            if one is fit:
-                table.append(block)
+    outputs, table = len(noise.sigma), []
+    for r, record in enumerate(fit.records):
+        block = np.zeros((outputs, len(columns), int(fit.problem.counts[r, 0])))
+        for k, (_, root, size, values) in enumerate(columns):
+            if record.label in values:
+                np.multiply(values[record.label], root / size, out=block[:, k])
+        table.append(block)
+    origins = {
+        record.label: one.problem.samples[r].origin
+        for one in (fit, *others)
+        for r, record in enumerate(one.records)
+    }
     swing = [
         np.concatenate([run.measured[b] for run in fit.predictor.runs]).std()
         for b in range(outputs)
     ]
     return Signatures(
-        tuple(name for name, _, _ in columns),
+        tuple(name for name, *_ in columns),
         tuple(fit.problem.runs),
         tuple(table),
         noise.sigma,
         noise.colour,
-        curves,
+        {},
         shares,
         usable[first],
         odds,

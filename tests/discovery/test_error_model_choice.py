@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,16 @@ import pytest
 from fitted_states import NUMERICS
 from small_campaigns import damper, damper_campaign, spring_damper_force, with_friction
 
-from bayesoleo.discovery import _inference as inference
-from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery import _inference as inference, _signatures as signatures
+from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import LOOKED_FOR, Inference, chosen_for
-from bayesoleo.discovery._signatures import more_than_noise_p, noise_of
+from bayesoleo.discovery._ranking import score_candidates
+from bayesoleo.discovery._run_predictions import predict_held_out
+from bayesoleo.discovery._scanned_columns import Scanned
+from bayesoleo.discovery._signatures import more_than_noise_p, noise_of, signatures_of
+from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.effects import find_effect
 from bayesoleo.error_models._catalogue_discrepancy import Linearised
 
 SEEDS = 12
@@ -71,3 +77,85 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     assert found.error_model == "independent"
     assert "100% of the signal of force" in found.reason
     assert fit.problem.signatures is None
+
+
+EFFECTS = tuple(
+    find_effect(name) for name in ("coulomb_friction", "end_stop_upper", "sensor_offset")
+)
+
+
+def scanned_by(state: State, effects=EFFECTS) -> Scanned:
+    """What a score of some effects keeps."""
+    kept: list[Scanned] = []
+    score_candidates(state.base(), state.assembly, effects, 1, keep=kept.append)
+    return kept[0]
+
+
+@pytest.fixture(scope="module")
+def left(tmp_path_factory):
+    """A model that lacks friction, fitted."""
+    campaign = damper_campaign(tmp_path_factory.mktemp("left"), with_friction)
+    return fit_state(Assembly(damper(), None), assign(campaign.records), NUMERICS)
+
+
+def not_again(*_, **__):
+    raise AssertionError("computed again")
+
+
+def test_what_a_score_computed_is_not_computed_again(left, monkeypatch):
+    """The same choice and signatures as without scores, to the last bit: nothing is lost on the
+    way."""
+    fit, assembly = replace(left.fit), left.assembly
+    apart = chosen_for(Inference("auto"), fit, assembly, effects=EFFECTS, jobs=1)
+    alone = fit.problem.signatures
+    scanned = scanned_by(left)
+    monkeypatch.setattr(signatures, "columns_of", not_again)
+    found = chosen_for(
+        Inference("auto"), left.fit, assembly, effects=EFFECTS, scanned=scanned, jobs=1
+    )
+    assert found == apart
+    assert found.error_model == "catalogue"
+    together = left.fit.problem.signatures
+    assert together.names == alone.names
+    for one, other in zip(together.columns, alone.columns, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_columns_of_another_fit_are_not_taken(left):
+    """Nor those of other effects; and they are handed on once, and never pickled."""
+    fit, assembly = left.fit, left.assembly
+    assert scanned_by(left).take(replace(fit), assembly, EFFECTS) is None
+    assert scanned_by(left).take(fit, replace(assembly), EFFECTS) is None
+    assert scanned_by(left).take(fit, assembly, EFFECTS[:1]) is None
+    scanned = scanned_by(left)
+    assert scanned.take(fit, assembly, list(EFFECTS)) is not None
+    assert scanned.take(fit, assembly, EFFECTS) is None
+    assert pickle.loads(pickle.dumps(scanned_by(left))) is None
+
+
+def test_large_columns_are_not_kept(left, monkeypatch):
+    kept: list[Scanned] = []
+    monkeypatch.setattr("bayesoleo.discovery._ranking.MOST_KEPT", 1000)
+    score_candidates(left.base(), left.assembly, EFFECTS, 1, keep=kept.append)
+    assert not kept
+
+
+def test_a_run_that_was_not_fitted_has_the_curves_of_its_twin(left):
+    """A fitted run under another label, held out: its motion, and so its curves, are the same."""
+    fit = left.fit
+    twin = replace(fit.records[0], label="twin", role="hold-out")
+    held = predict_held_out(fit, Roles((), (twin,), "declared", "").held_out)
+    effects = (*EFFECTS, find_effect("varies_by_run"))
+    found = signatures_of(fit, left.assembly, noise_of(fit), effects=effects, held_out=held, jobs=1)
+    # An unknown that each run has of its own acts in that run alone.
+    own = np.array(["[" in name for name in found.names])
+    assert own.any()
+    first, second = found.curves[fit.records[0].label], found.curves["twin"]
+    # Both motions are solved to some 1e-10 of their size, each by itself.
+    scale = np.abs(first[:, ~own]).max()
+    np.testing.assert_allclose(second[:, ~own], first[:, ~own], atol=1e-7 * scale)
+    mine = np.array([name.endswith(f"[{fit.records[0].label}]") for name in found.names])
+    its = np.array([name.endswith("[twin]") for name in found.names])
+    np.testing.assert_allclose(second[:, its], first[:, mine], atol=1e-7 * scale)
+    assert not np.any(first[:, its])
+    assert all(not block[:, its].any() for block in found.columns)
