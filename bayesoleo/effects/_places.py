@@ -20,6 +20,7 @@ from bayesoleo._units import base_unit, dimensions
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
+from bayesoleo.model._kernels import Structured
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
 
@@ -463,14 +464,22 @@ def damping_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
     Friction saturates and so is none: the test is whether doubling a large velocity raises the term
     by half or more.
     """
-    found = {}
+    return dict(_damping_terms(Structured(model), place, tuple(model.nominal().items())))
+
+
+@lru_cache(maxsize=256)  # most effects of a search ask the same of one model
+def _damping_terms(
+    like: Structured, place: Coordinate, _: tuple[tuple[sp.Symbol, float], ...]
+) -> tuple[tuple[str, sp.Expr], ...]:
+    """The same of any model with these equations and nominal values."""
+    model, found = like.model, []
     for name, term in balance_terms(model, place).items():
         whole = model.expand(term)
         if place.velocity is not None and whole.has(place.velocity):
             at_rest = whole.subs(place.velocity, 0)
             if at_rest == 0 and _grows(whole, place.velocity, model):
-                found[name] = term
-    return found
+                found.append((name, term))
+    return tuple(found)
 
 
 def resistance_sense(model: Model, place: Coordinate) -> int:
