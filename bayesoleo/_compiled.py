@@ -135,6 +135,10 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
 
 #: Compiles a function for other compiled code and for Python, without the interpreter lock.
 jit = cached(error_model="numpy")
+#: The same for a function that others call in one place or two: its instructions become theirs. The
+#: compiler makes machine code of each function and then once more of all that calls it, so that a
+#: chain of calls costs a multiple.
+inlined = cached(error_model="numpy", inline="always")
 
 #: Points in a block, and the distance between rows.
 BLOCK = 64

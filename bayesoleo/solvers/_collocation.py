@@ -208,7 +208,7 @@ def linear(
             if newton:
                 _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
             if jumps.shape[3] == n:
-                transfer[:, D:] += jumps[lane]
+                _add_columns(jumps[lane], transfer, D)
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:
@@ -315,6 +315,15 @@ def _add_jumps(
                     x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
                 )
         state += orders[j]
+
+
+@jit
+def _add_columns(source: Array, target: Array, first: int) -> None:
+    """Add to columns from the first on, without slices: see ``_elimination._copy_columns``."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            for m in range(source.shape[2]):
+                target[i, first + j, m] += source[i, j, m]
 
 
 @jit

@@ -219,6 +219,15 @@ def close_balanced(
 
 
 @jit
+def _copy_columns(source: Array, first: int, target: Array) -> None:
+    """Copy columns from the first on: an assignment of slices compiles the text of its error too,
+    which takes as long as all else in this file."""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, first + j]
+
+
+@jit
 def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: bool) -> bool:
     """Close the period and run through it once more.
 
@@ -246,9 +255,9 @@ def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: b
             monodromy[i, j] = product[i, j]
     if not initial:
         closure, scale = np.empty((D, D)), np.empty(D)
-        state[:] = product[:, D:]
+        _copy_columns(product, D, state)
         if not close(product, state, closure)[0]:
-            state[:] = product[:, D:]
+            _copy_columns(product, D, state)
             if not close_balanced(product, state, closure, scale)[0]:
                 return False
     for i in range(D):

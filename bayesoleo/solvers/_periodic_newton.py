@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK, after, call_kernel, caller, jit, pointer
+from bayesoleo._compiled import BLOCK, after, call_kernel, caller, inlined, jit, pointer
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
 from bayesoleo.solvers._orbit import Status
@@ -146,7 +146,7 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
     return NEEDS_EXCHANGE if bad > 0 else CONVERGED
 
 
-@jit
+@inlined
 def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
     """Equations alone at the present unknowns, solved with the last derivatives; whether the
     unknowns are admissible."""
@@ -203,7 +203,7 @@ def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out:
                     z[k, stage * steps + i] = 0.0
 
 
-@jit
+@inlined
 def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
     """Invert the closure of the period, from the recursion's matrices alone."""
     inverse, closure, products = work.inverse, work.closure, work.products
@@ -227,7 +227,7 @@ def _set_identity(matrix: Array) -> None:
             matrix[i, k] = 1.0 if i == k else 0.0
 
 
-@jit
+@inlined
 def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) -> None:
     """First state of every chunk: that of the period from its closure, or zero."""
     history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
@@ -310,7 +310,7 @@ def _extrapolate(line: LinearStart, lane: int, now: Array) -> None:
             to[i] += first * a[i]
 
 
-@jit
+@inlined
 def _iterate(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options
 ) -> tuple[int, int]:
@@ -353,7 +353,7 @@ def _iterate(
     return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
 
 
-@jit
+@inlined
 def _chords(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
 ) -> tuple[int, float]:
@@ -384,7 +384,7 @@ def _chords(
     return most, last
 
 
-@jit
+@inlined
 def _chord_suffices(size: float, last: float) -> bool:
     """Whether one more step with these derivatives leaves round-off, if Newton's error is squared:
     ``k size**2`` with ``k = size / last**2``, which old derivatives contract by ``2 k size``.
@@ -393,7 +393,7 @@ def _chord_suffices(size: float, last: float) -> bool:
     return 2.0 * size * ratio**4 < CHORD_LEFT
 
 
-@jit
+@inlined
 def _advance(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
 ) -> tuple[int, float, float]:
@@ -418,7 +418,7 @@ def _advance(
     return (INADMISSIBLE if outcome == INADMISSIBLE else NO_CONVERGENCE), fraction, np.inf
 
 
-@jit
+@inlined
 def _step(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
     """The Newton step at all positions, from the recursion of the last evaluation."""
     outcome = CONVERGED if initial else close(pieces, sizes, work)
@@ -467,7 +467,7 @@ def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
     return float(scratch[0])
 
 
-@jit
+@inlined
 def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
     """Whether the residual fell, in units of the equations' terms, or is round-off, and its size in
     its own.
