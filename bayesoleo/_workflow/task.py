@@ -361,7 +361,7 @@ def prepare(
 def _compile_ahead(jobs: int | None) -> None:
     """Begin in another process with what has to be compiled, where nothing is yet."""
     if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
-        begin_elsewhere("bayesoleo.solvers._collocation", "compile_elimination")
+        begin_elsewhere("bayesoleo.discovery._compile_ahead", "compile_ahead")
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:

@@ -220,3 +220,17 @@ def pair_evidence(
         found,
     )
     return found
+
+
+def compile_evidence() -> None:
+    """Compile what a comparison of structures needs, which takes ten seconds, or load it.
+
+    An anchor and two effects, one of two amplitudes, in a small problem without unknowns.
+    """
+    part = Reduced.of(np.eye(6)[None], np.zeros(1), 0, np.zeros(0))
+    likelihood, sizes = Likelihood(9, 9.0), np.ones(1)
+    effect_evidence(part, likelihood, [Group((0,))], sizes)
+    pair_evidence(part, likelihood, Group((0,)), [Group((1,))], sizes)
+    anchored = part.with_effects([Group((0,))], [1.0])
+    effect_evidence(anchored, likelihood, [Group((0,)), Group((1, 2))], sizes)
+    anchored.log_moment(likelihood)

@@ -68,7 +68,8 @@ def log_moments(
         np.asarray(counts, dtype=np.int64),
         np.ascontiguousarray(sides.reshape(len(sides), -1)),
         np.ascontiguousarray(mean.reshape(len(mean), -1)),
-        np.ascontiguousarray(spread.reshape(*covariance.shape[:2], -1)),
+        # Copied in any case: an array that may not be written to is another type to compile for.
+        np.array(spread.reshape(*covariance.shape[:2], -1), order="C"),
         found,
     )
     return found.reshape(shape)
