@@ -208,7 +208,7 @@ def linear(
             if newton:
                 _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
             if jumps.shape[3] == n:
-                _add_columns(jumps[lane], transfer, D)
+                _add_to_last(jumps[lane], transfer)
             good = close_and_sweep(transfer, monodromy[lane], states, initial)
         ok[lane] = good
         if good:
@@ -318,8 +318,9 @@ def _add_jumps(
 
 
 @jit
-def _add_columns(source: Array, target: Array, first: int) -> None:
-    """Add to columns from the first on, without slices: see ``_elimination._copy_columns``."""
+def _add_to_last(source: Array, target: Array) -> None:
+    """Add to the last columns, without slices: see ``_elimination._copy_columns``."""
+    first = target.shape[1] - source.shape[1]
     for i in range(source.shape[0]):
         for j in range(source.shape[1]):
             for m in range(source.shape[2]):
