@@ -171,6 +171,8 @@ LOCAL = "local"
 ROUNDS = 3
 #: Seconds to wait for a scheduler.
 PATIENCE = 10
+#: Seconds to wait for a worker where a cluster has none: those that were killed begin again.
+WAIT = 300
 
 #: State of one worker pool on a worker: its token and its function.
 _kept: dict[str, Callable[[Any], Any]] = {}
@@ -310,7 +312,9 @@ class WorkerPool:
     @property
     def size(self) -> int:
         """Threads of all workers together, at least one."""
-        return int(max(sum(self.client.nthreads().values()), 1))
+        with suppress(OSError):  # the scheduler is being lost, as the next task will tell
+            return int(max(sum(self.client.nthreads().values()), 1))
+        return 1
 
     def each(self, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Results of the function for items, as :func:`each_done`.
@@ -318,7 +322,8 @@ class WorkerPool:
         Raises
         ------
         ResultsError
-            If workers are lost again and again before any finishes a task.
+            If workers are lost again and again before any finishes a task, if none comes, or if the
+            scheduler is lost.
         """
         from distributed import as_completed as completed
 
@@ -332,6 +337,7 @@ class WorkerPool:
                     result = future.result()
                 except Exception as error:
                     if _is_loss(error):
+                        self._check_scheduler()
                         continue
                     self.client.cancel(list(futures))
                     raise
@@ -348,12 +354,39 @@ class WorkerPool:
                 )
 
     def _submit(self, missing: dict[int, Any]) -> dict[Any, int]:
-        if self._shared is None:
-            self._shared = self.client.scatter([self._payload], broadcast=True, hash=False)[0]
+        self._check_scheduler()
+        self._share()
         return {
             self.client.submit(_call, self._token, self._shared, item, pure=False): index
             for index, item in missing.items()
         }
+
+    def _share(self) -> None:
+        """Send the function to all workers, as soon as there is one."""
+        deadline = time.monotonic() + WAIT
+        while self._shared is None:
+            try:
+                self._shared = self.client.scatter([self._payload], broadcast=True, hash=False)[0]
+            # There is no worker, or the last one is lost while it is sent to: Dask then finds an
+            # unknown address or nothing to copy to. A client that is closed has no scheduler.
+            except (OSError, KeyError, ValueError, AttributeError) as error:
+                self._check_scheduler()
+                if time.monotonic() > deadline:
+                    raise ResultsError(
+                        f"the scheduler has had no workers for {WAIT} seconds",
+                        hint="start some with 'dask worker <its address>', or see in their logs why"
+                        " they ended",
+                    ) from error
+                time.sleep(LOOK)
+
+    def _check_scheduler(self) -> None:
+        """Say so where it is the scheduler that is lost."""
+        if self.client.status not in ("running", "connecting"):
+            raise ResultsError(
+                "the scheduler was lost",
+                hint="start it and its workers, and then the same command, which goes on where its"
+                " results are stored",
+            )
 
 
 def _is_loss(error: BaseException) -> bool:

@@ -101,6 +101,40 @@ def test_two_writers_of_pieces_are_refused(tmp_path):
         Slots(tmp_path, "a").fill(second, 1, jobs=1)
 
 
+class Cluster:
+    """As a client is seen by a pool: without workers at first, or with its scheduler lost."""
+
+    def __init__(self, *problems, status="running"):
+        self.problems, self.status = list(problems), status
+
+    def scatter(self, payloads, **_):
+        if self.problems:
+            raise self.problems.pop(0)
+        return payloads
+
+    def submit(self, *_, **__):
+        return "sent"
+
+
+def test_a_cluster_without_workers_is_waited_for():
+    # What Dask raises where there is no worker, and where one ends while it is sent to.
+    cluster = Cluster(TimeoutError("No valid workers found"), KeyError("tcp://"), OSError())
+    assert WorkerPool(cluster, failing)._submit({5: 1}) == {"sent": 5}
+    assert cluster.problems == []
+
+
+def test_workers_that_never_come_are_an_error(monkeypatch):
+    monkeypatch.setattr(parallel, "WAIT", 0.0)
+    cluster = Cluster(*(TimeoutError("No valid workers found") for _ in range(3)))
+    with pytest.raises(ResultsError, match="no workers"):
+        WorkerPool(cluster, failing)._submit({5: 1})
+
+
+def test_a_lost_scheduler_is_not_waited_for():
+    with pytest.raises(ResultsError, match="scheduler was lost"):
+        WorkerPool(Cluster(OSError(), status="closed"), failing)._submit({5: 1})
+
+
 @pytest.mark.slow
 def test_every_task_begins_with_a_fresh_copy(client):
     found = dict(each_done(Counting(), range(12), client=client))
@@ -247,6 +281,8 @@ def test_a_scheduler_that_is_killed_is_noticed(monkeypatch, tmp_path):
                 assert time.monotonic() < deadline
                 time.sleep(0.1)
             pool.close()
+            with pytest.raises(ResultsError, match="scheduler was lost"):
+                dict(each_done(failing, range(2), client=client))
 
 
 def _await_scheduler(address):

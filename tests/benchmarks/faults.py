@@ -4,10 +4,12 @@ Each command that writes is killed at moments spread over all its changes of the
 run once more: the result must be the one of a run that nobody disturbed. Then the disk fills up at
 each of these moments, bytes of stored files are flipped, the clock and the locale are odd, and the
 input is hostile. A fault is answered by the right result, or by one line that says what is wrong.
-Last, the package itself is made faulty: see ``mutants.py``.
+Workers of a cluster are killed: see ``lost_workers.py``. Last, the package itself is made faulty:
+see ``mutants.py``.
 
 Run ``python tests/benchmarks/faults.py --json``; ``--few`` tries a sample. What is tried,
-and what was not answered, is told on standard error.
+and what was not answered, is told on standard error. It takes hours: with ``--store FILE`` a run
+that was stopped goes on after its last whole step.
 """
 
 from __future__ import annotations
@@ -26,18 +28,21 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hostile import INPUTS
 
 from bayesoleo._cli import main
 from bayesoleo._machine_code import cache_folder
-from bayesoleo._storage.files import SUMS, current
+from bayesoleo._storage.files import SUMS, current, write_text_atomic
 from bayesoleo._storage.result_files import read_tree
+from bayesoleo._storage.resume import package_digest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "cli"))
 from small_rig import CAMPAIGN, MODEL, rows, write_rows
@@ -52,7 +57,8 @@ MODULES = (
 
 #: What changes a disk, beside opening a file to write to it.
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
-#: Seconds that a command may take.
+#: CPU seconds that a command may take, and seconds in which it must take some. A limit of time that
+#: passes would call a command slow because the machine is busy with others.
 PATIENCE = 600
 FAST = ["--jobs", "1", "--quiet"]
 #: Commands by name; what they write is in ``out``.
@@ -109,6 +115,8 @@ class Count:
     segfaults: int = 0
     mutants: int = 0
     mutants_killed: int = 0
+    workers_killed: int = 0
+    tasks_lost: int = 0
     remarks: list[str] = field(default_factory=list)
 
     def fault(self, name: str, outcome: Outcome, right: bool) -> None:
@@ -141,15 +149,15 @@ def command(
     child = os.fork()
     if child == 0:
         _be_command(arguments, folder, told, counted, before)
-    limit = time.monotonic() + PATIENCE
+    watch = Watch(child)
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             break
-        if time.monotonic() > limit:
-            os.kill(child, signal.SIGKILL)
+        if watch.over():
+            os.killpg(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            return Outcome(-signal.SIGALRM, "took too long")
+            return Outcome(-signal.SIGALRM, watch.said)
         time.sleep(0.01)
     text = told.read_text("utf-8", "replace")
     changes = int(counted.read_text() or 0) if counted.exists() else 0
@@ -158,12 +166,56 @@ def command(
     return Outcome(os.waitstatus_to_exitcode(status), text, changes)
 
 
+class Watch:
+    """Whether a command has taken too long, or does nothing any more.
+
+    Parameters
+    ----------
+    group : int
+        Process group of the command: it and the processes that it began.
+    """
+
+    def __init__(self, group: int) -> None:
+        self.group, self.used, self.said = group, 0.0, ""
+        self.looked = self.moved = time.monotonic()
+
+    def over(self) -> bool:
+        """Whether it must be ended; ``said`` tells why."""
+        now = time.monotonic()
+        if now < self.looked + 1.0:
+            return False
+        self.looked = now
+        used = cpu_of(self.group)
+        if used is None or used > self.used:  # where CPU times cannot be read, only a limit counts
+            self.moved = now if used is not None else self.moved
+            self.used = used or 0.0
+        if self.used > PATIENCE:
+            self.said = f"took too long: {self.used:.0f} s of CPU"
+        elif now > self.moved + PATIENCE:
+            self.said = f"hangs: no CPU used for {PATIENCE} s"
+        return bool(self.said)
+
+
+def cpu_of(group: int) -> float | None:
+    """CPU seconds of the processes of a group and of those that they waited for."""
+    if sys.platform != "linux":
+        return None
+    ticks = 0
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):  # it has ended
+            words = file.read_text("utf-8", "replace").rpartition(")")[2].split()
+            if int(words[2]) == group:
+                ticks += sum(map(int, words[11:15]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
 def _be_command(
     arguments: list[str], folder: Path, told: Path, counted: Path, before: Callable[[], None]
 ) -> None:
     """The child of :func:`command`; it never returns."""
     status = 1
     try:
+        os.setpgid(0, 0)  # with what it begins, so that all of it can be watched and ended
         os.chdir(folder)
         for number, file in ((1, os.devnull), (2, told)):
             os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
@@ -475,14 +527,26 @@ class Bench:
             self.count.fault(name, done, done.status == 0 and kept and right(folder))
             shutil.rmtree(folder)
 
+    def workers(self) -> None:
+        """Kill workers and schedulers of a cluster; see ``lost_workers.py``."""
+        self._other("lost_workers.py", *(["--only", "replicate"] if self.few else []))
+
     def mutants(self) -> None:
         """Change what numbers mean, which the tests must notice; see ``mutants.py``."""
-        script = Path(__file__).with_name("mutants.py")
-        arguments = [sys.executable, str(script), "--json", *(["--few"] if self.few else [])]
-        # Of its own: mutants are tried in processes that have not imported the package.
+        self._other("mutants.py", *(["--few"] if self.few else []))
+
+    def _other(self, name: str, *options: str) -> None:
+        """Count what another benchmark counts, in a process of its own.
+
+        It must not be forked from here: mutants are tried in processes that have not imported the
+        package, and clusters begin threads.
+        """
+        script = Path(__file__).with_name(name)
+        arguments = [sys.executable, str(script), "--json", *options]
         done = subprocess.run(arguments, stdout=subprocess.PIPE, text=True, check=True)
         for key, value in json.loads(done.stdout).items():
-            setattr(self.count, key, value)
+            if hasattr(self.count, key):
+                setattr(self.count, key, value)
 
 
 def make_rig(folder: Path) -> None:
@@ -511,21 +575,44 @@ def measure(
     only: str = "",
     share: float = 1.0,
     report: Callable[[str], None] = lambda _: None,
+    store: Path | None = None,
 ) -> Count:
     """Try all faults, a sample of them, or those whose name begins with one of some words.
 
-    ``share`` is that of the moments at which a command is killed, and of the bits.
+    ``share`` is that of the moments at which a command is killed, and of the bits. Steps that
+    ``store`` has counted are not taken again.
     """
+    options = {"code": package_digest(), "few": few, "share": share}
+    counted = counted_before(store, options)
     with tempfile.TemporaryDirectory(prefix="faults-") as root:
         bench = Bench(Path(root), few)
         for name, step in steps(bench, share):
-            if name.startswith(tuple(only.split(","))):
-                seen = len(bench.count.remarks)
-                report(name)
+            if not name.startswith(tuple(only.split(","))):
+                continue
+            report(name)
+            if name not in counted:
+                bench.count = Count()
                 step()
-                for remark in bench.count.remarks[seen:]:
-                    report(f"  {remark}")
-    return bench.count
+                counted[name] = vars(bench.count)
+                if store is not None:
+                    write_text_atomic(store, json.dumps(options | {"counted": counted}, indent=1))
+            for remark in counted[name]["remarks"]:
+                report(f"  {remark}")
+    total = Count()
+    for one in counted.values():
+        for key, value in one.items():
+            setattr(total, key, getattr(total, key) + value)
+    return total
+
+
+def counted_before(store: Path | None, options: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What a run of the same code with the same options counted, by step."""
+    if store is None or not store.exists():
+        return {}
+    found = json.loads(store.read_text(encoding="utf-8"))
+    if any(found[key] != value for key, value in options.items()):
+        raise SystemExit(f"error: {store} is of other code or other options; choose another file")
+    return dict(found["counted"])
 
 
 def steps(bench: Bench, share: float) -> Iterator[tuple[str, Callable[[], None]]]:
@@ -535,7 +622,6 @@ def steps(bench: Bench, share: float) -> Iterator[tuple[str, Callable[[], None]]
         yield f"kill {verb}", partial(bench.kills, verb, most)
         yield f"fill the disk of {verb}", partial(bench.full_disk, verb, most)
     yield "hostile input", bench.inputs
-    yield "mutants", bench.mutants
     if not bench.few:
         yield "a small disk", bench.real_disk
         yield "flipped bits", partial(bench.flips, max(3, round(share * 51)))
@@ -543,6 +629,8 @@ def steps(bench: Bench, share: float) -> Iterator[tuple[str, Callable[[], None]]
         yield "locales", bench.locales
         for spare in (1, 30, 100):
             yield f"{spare} MB", partial(bench.memory, "estimate", spare)
+    yield "workers", bench.workers
+    yield "mutants", bench.mutants
 
 
 def cli() -> None:
@@ -551,10 +639,11 @@ def cli() -> None:
     parser.add_argument("--few", action="store_true", help="a sample of the faults")
     parser.add_argument("--only", default="", help="steps, by their first words: kill,clocks")
     parser.add_argument("--share", type=float, default=1.0, help="of moments and bits tried")
+    parser.add_argument("--store", type=Path, help="file of steps that are counted, to go on from")
     wanted = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*multi-threaded.*")  # the child starts no thread
     told = partial(print, file=sys.stderr, flush=True)
-    count = measure(wanted.few, wanted.only, wanted.share, told)
+    count = measure(wanted.few, wanted.only, wanted.share, told, wanted.store)
     figures = {key: int(value) for key, value in vars(count).items() if key != "remarks"}
     if wanted.json:
         print(json.dumps(figures))

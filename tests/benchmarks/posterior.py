@@ -1,9 +1,10 @@
 """Speed, correctness and safety of the sampler, against other samplers of the same densities.
 
-Run as ``python tests/benchmarks/posterior.py [--json] [--only speed,truth,peers,safety,machines]``.
-Needs ``BAYESOLEO_DATA``; peers that are not installed are left out. Ratios are taken in one run. On
-a busy machine wall time measures the others' work: figures by CPU time, of all threads, stand
-beside it under names that end in ``_cpu``. What is found is told on the error stream as it comes.
+Run as ``python tests/benchmarks/posterior.py [--json] [--only speed,truth]``; the parts are speed,
+truth, peers, curved, safety and machines. Needs ``BAYESOLEO_DATA``; peers that are not installed
+are left out. Ratios are taken in one run. On a busy machine wall time measures the others' work:
+figures by CPU time, of all threads, stand beside it under names that end in ``_cpu``. What is found
+is told on the error stream as it comes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "posterior"))
 #: Modules ``posterior_<part>`` with a function ``<part>_figures``. Imported when they are needed:
 #: processes that are started by one begin with importing this file.
-PARTS = ("speed", "truth", "peers", "safety", "machines")
+PARTS = ("speed", "truth", "peers", "curved", "safety", "machines")
 
 
 def figures(part: str) -> dict[str, float]:

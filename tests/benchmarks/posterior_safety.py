@@ -29,7 +29,9 @@ class Slow(LogDensity):
         return super().__call__(phi)
 
 
-def run(folder: Path | None, kind: type[LogDensity] = LogDensity) -> Samples:
+def run(
+    folder: Path | None, kind: type[LogDensity] = LogDensity, scheduler: str | None = None
+) -> Samples:
     """The bimodal gas spring, in many small segments."""
     case = gas_spring_case(0.01)
     return sample(
@@ -41,6 +43,7 @@ def run(folder: Path | None, kind: type[LogDensity] = LogDensity) -> Samples:
         segment=4,
         fingerprint="kills",
         progress=False,
+        scheduler=scheduler,
     )
 
 

@@ -96,3 +96,40 @@ def linear_runs(errors, *, levels, slope=1.5, times=None, by_run=True, **options
     wave = [slope * np.cos(2 * np.pi * time) for time in times]
     y = tuple(a + b + e for a, b, e in zip(levels, wave, errors, strict=True))
     return LinearRuns(y, tuple(times), by_run, **options)
+
+
+def hierarchical_quadrature(problem: LinearRuns, log_v: float = -1.4):
+    """Mean and sd of levels, slope, mean and spread, by integrating over spread and variance.
+
+    The levels scatter about the mean by the spread. Given spread and variance, whose logarithm lies
+    within one of ``log_v``, all is linear and normal; the slope is integrated out with the levels.
+    """
+    prior_sd, runs = 2.0, len(problem.y)
+    table = np.concatenate([problem.columns(k) for k in range(runs)])
+    y = np.concatenate([part[0] for part in problem.y])
+    logs, firsts, seconds = [], [], []
+    for spread in np.geomspace(1e-3, 8.0, 241):
+        # Unknowns: levels, slope, mean; prior precision of the levels about the mean.
+        precision = np.zeros((runs + 2, runs + 2))
+        each = spread**-2.0
+        precision[:runs, :runs] = each * np.eye(runs)
+        precision[:runs, -1] = precision[-1, :runs] = -each
+        precision[-1, -1] = runs * each + prior_sd**-2.0
+        precision[runs, runs] = 0.01
+        for log_variance in np.linspace(log_v - 1, log_v + 1, 61):
+            whole = precision.copy()
+            whole[:-1, :-1] += table.T @ table * np.exp(-log_variance)
+            right = np.append(table.T @ y, 0.0) * np.exp(-log_variance)
+            covariance = np.linalg.inv(whole)
+            centre = covariance @ right
+            log = -runs * np.log(spread) - 0.5 * y.size * log_variance
+            log += 0.5 * right @ centre - 0.5 * y @ y * np.exp(-log_variance)
+            log -= 0.5 * np.linalg.slogdet(whole)[1]
+            log += -0.5 * (spread / prior_sd) ** 2 + np.log(spread)  # grid is equal in its log
+            logs.append(log)
+            firsts.append([*centre, spread])
+            seconds.append([*(np.diag(covariance) + centre**2), spread**2])
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    mean = weight @ np.array(firsts)
+    return mean, np.sqrt(weight @ np.array(seconds) - mean**2)

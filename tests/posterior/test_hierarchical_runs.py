@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear_runs import linear_runs
+from linear_runs import hierarchical_quadrature, linear_runs
 from scipy import stats
 
 from bayesoleo.errors import InputError
@@ -71,42 +71,6 @@ def test_the_stretch_is_the_determinant_of_the_map():
     )
 
 
-def quadrature(problem):
-    """Mean and sd of mean, spread and each level, by integrating over spread and variance.
-
-    Given these two all is linear and normal; the slope is integrated out with the levels.
-    """
-    prior_sd, n = 2.0, RUNS * COUNT
-    table = np.concatenate([problem.columns(k) for k in range(RUNS)])
-    y = np.concatenate([part[0] for part in problem.y])
-    logs, firsts, seconds = [], [], []
-    spreads, log_vs = np.geomspace(1e-3, 8.0, 241), np.linspace(-2.4, -0.4, 61)
-    for spread in spreads:
-        # Unknowns: levels, slope, mean; prior precision of the levels about the mean.
-        precision = np.zeros((RUNS + 2, RUNS + 2))
-        each = spread**-2.0
-        precision[:RUNS, :RUNS] = each * np.eye(RUNS)
-        precision[:RUNS, -1] = precision[-1, :RUNS] = -each
-        precision[-1, -1] = RUNS * each + prior_sd**-2.0
-        precision[RUNS, RUNS] = 0.01
-        for log_v in log_vs:
-            whole = precision.copy()
-            whole[:-1, :-1] += table.T @ table * np.exp(-log_v)
-            right = np.append(table.T @ y, 0.0) * np.exp(-log_v)
-            covariance = np.linalg.inv(whole)
-            centre = covariance @ right
-            log = -RUNS * np.log(spread) - 0.5 * n * log_v - 0.5 * y @ y * np.exp(-log_v)
-            log += 0.5 * right @ centre - 0.5 * np.linalg.slogdet(whole)[1]
-            log += -0.5 * (spread / prior_sd) ** 2 + np.log(spread)  # grid is equal in its log
-            logs.append(log)
-            firsts.append([*centre, spread])
-            seconds.append([*(np.diag(covariance) + centre**2), spread**2])
-    weight = np.exp(np.array(logs) - max(logs))
-    weight /= weight.sum()
-    mean = weight @ np.array(firsts)
-    return mean, np.sqrt(weight @ np.array(seconds) - mean**2)
-
-
 def test_a_spread_of_any_size_is_kept():
     population = density_of(problem_of(0.4)).unknowns.populations[0]
     spread = population.typical * 10.0 ** np.arange(-12, 13)
@@ -122,7 +86,7 @@ def test_the_posterior_is_the_exact_one(spread):
     mixture = laplace_mixture(density, told(problem)[None])
     samples = sample(density, mixture, seed=2, effective_size=1500, progress=False)
     assert samples.reached, samples.warning
-    mean, sd = quadrature(problem)
+    mean, sd = hierarchical_quadrature(problem)
     flat = samples.draws.reshape(-1, samples.draws.shape[2])[:, : RUNS + 3]
     error = 4 / np.sqrt(samples.effective_size[: RUNS + 3])
     np.testing.assert_array_less(np.abs(flat.mean(axis=0) - mean) / sd, error)

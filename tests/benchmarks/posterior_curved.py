@@ -1,0 +1,153 @@
+"""Curved posteriors and one of 25 dimensions: effective draws a CPU second against NUTS.
+
+Our draws count from the Laplace mixture to the last kept one, theirs from the same modes with the
+adaptation of step size and masses; compiling is left out, and of each peer the best of its
+settings is taken. ``z`` is the largest difference of a mean from its exact value, in standard
+errors, and of a standard deviation likewise.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from posterior_curved_cases import CASES, Case
+
+from bayesoleo.posterior import sample
+from bayesoleo.posterior._diagnostics import effective_size
+
+Array = NDArray[np.float64]
+WANTED, TUNE, DRAWS, CHAINS = 4000, 500, 2000, 2
+
+
+def z_of(case: Case, draws: Array, size: Array) -> float:
+    """Largest error of means and standard deviations in standard errors of so many draws."""
+    flat = draws.reshape(-1, draws.shape[-1])[:, : case.mean.size]
+    size = size[: case.mean.size]
+    mean = np.abs(flat.mean(axis=0) - case.mean) / case.sd * np.sqrt(size)
+    fourth = np.mean(((flat - case.mean) / case.sd) ** 4, axis=0)
+    # An effective size of the squares is not known; a spread's error is that of independent draws.
+    sd = np.abs(flat.std(axis=0) / case.sd - 1) / np.sqrt((fourth - 1) / 4 / size)
+    return float(max(mean.max(), sd.max()))
+
+
+def described(case: Case, draws: Array, used: float) -> dict[str, float]:
+    """Effective draws a CPU second, and errors."""
+    size = effective_size(draws)
+    return {
+        "ess": float(size.min()),
+        "ess_per_cpu_s": float(size.min()) / used,
+        "z": z_of(case, draws, size),
+    }
+
+
+def ours(case: Case) -> dict[str, float]:
+    """The package's sampler."""
+    sample(case.density, case.mixture, seed=2, progress=False, quick=True)  # modules are imported
+    used = time.process_time()
+    found = sample(case.density, case.mixture, effective_size=WANTED, seed=1, progress=False)
+    used = time.process_time() - used
+    return described(case, found.draws, used) | {
+        "evaluations": found.evaluations,
+        "reached": int(found.reached),
+        "cpu_s": used,
+    }
+
+
+def starts(case: Case, back: Callable[[Array], Array]) -> Array:
+    """Draws of the Laplace mixture, one for each chain, in a peer's coordinates."""
+    phi = case.mixture.sample(np.random.default_rng(0), CHAINS)
+    return np.asarray(back(case.density.natural(phi)))
+
+
+def with_numpyro(case: Case, form: str, dense: bool) -> tuple[Array, float]:
+    """Natural draws (chains, draws, d), and CPU time."""
+    import jax
+    from numpyro.infer import MCMC, NUTS
+
+    jax.config.update("jax_enable_x64", True)
+    height, natural, back = case.forms[form]
+    kernel = NUTS(potential_fn=lambda x: -height(x), dense_mass=dense)
+    chains = MCMC(
+        kernel, num_warmup=TUNE, num_samples=DRAWS, num_chains=CHAINS, chain_method="sequential",
+        progress_bar=False,
+    )  # fmt: skip
+    first = jax.numpy.asarray(starts(case, back))
+    for seed in (0, 1):  # the first one compiles
+        used = time.process_time()
+        chains.run(jax.random.PRNGKey(seed), init_params=first)
+        draws = np.asarray(chains.get_samples(group_by_chain=True))
+        used = time.process_time() - used
+    return np.stack([natural(one) for one in draws]), used
+
+
+def with_blackjax(case: Case, form: str, dense: bool) -> tuple[Array, float]:
+    """Natural draws (chains, draws, d), and CPU time."""
+    import blackjax
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    height, natural, back = case.forms[form]
+
+    @jax.jit
+    def chain(key, first):
+        tuning, drawing = jax.random.split(key)
+        adaptation = blackjax.window_adaptation(
+            blackjax.nuts, height, is_mass_matrix_diagonal=not dense
+        )
+        (state, tuned), _ = adaptation.run(tuning, first, TUNE)
+        step = blackjax.nuts(height, **tuned).step
+
+        def one(state, key):
+            state, _ = step(key, state)
+            return state, state.position
+
+        return jax.lax.scan(one, state, jax.random.split(drawing, DRAWS))[1]
+
+    first = jax.numpy.asarray(starts(case, back))
+    chain(jax.random.PRNGKey(9), first[0]).block_until_ready()  # compiles
+    used = time.process_time()
+    draws = [np.asarray(chain(jax.random.PRNGKey(k), x)) for k, x in enumerate(first)]
+    used = time.process_time() - used
+    return np.stack([natural(one) for one in draws]), used
+
+
+PEERS = {"numpyro": with_numpyro, "blackjax": with_blackjax}
+
+
+def peers(case: Case) -> Iterator[tuple[str, dict[str, float]]]:
+    """Each peer that is installed, in each form; with dense masses where these are few."""
+    for name, run in PEERS.items():
+        if importlib.util.find_spec(name) is None:
+            continue
+        for form in case.forms:
+            draws, used = run(case, form, len(case.density.names) < 10)
+            yield f"{name}_{form}", described(case, draws, used)
+
+
+def figures(name: str) -> dict[str, float]:
+    """One case; ``nuts_ratio_<case>`` is ours over the best of the peers."""
+    case = CASES[name]()
+    mine = ours(case)
+    table = {f"{name}_{key}": value for key, value in mine.items()}
+    best = 0.0
+    for peer, found in peers(case):
+        table |= {f"{name}_{peer}_{key}": value for key, value in found.items()}
+        best = max(best, found["ess_per_cpu_s"])
+    if best:
+        table[f"nuts_ratio_{name}"] = mine["ess_per_cpu_s"] / best
+    return table
+
+
+def curved_figures() -> dict[str, float]:
+    """All cases."""
+    table: dict[str, float] = {}
+    for name in CASES:
+        found = figures(name)
+        print(f"  {name}: {found}", file=sys.stderr, flush=True)
+        table |= found
+    return table
