@@ -70,7 +70,7 @@ def drawn(scheduler: str | None, out: Path | None) -> dict[str, object]:
 
 
 def closed(scheduler: str | None, out: Path | None, *, rigs: Path) -> dict[str, object]:
-    """Summaries of two loops, each with two seeds."""
+    """Summaries of two loops."""
     assert out is not None
     campaigns = []
     for name, force in (("rubbing", with_friction), ("free", spring_damper_force)):
@@ -78,7 +78,7 @@ def closed(scheduler: str | None, out: Path | None, *, rigs: Path) -> dict[str, 
             damper_campaign(rigs / name, force)
         campaigns.append(rigs / name)
     done = close_each(
-        campaigns, damper(), out=out, seeds=2, jobs=None if scheduler else 2, scheduler=scheduler,
+        campaigns, damper(), out=out, jobs=None if scheduler else 2, scheduler=scheduler,
         settings=QUICK, retries=5,
     )  # fmt: skip
     return {

@@ -85,7 +85,7 @@ class Rise:
 def bent() -> Case:
     """Rise of amplitude 3 and rate 0.8, measured until 0.6."""
     time = np.linspace(0.0, 0.6, 40)
-    noise = 0.02 * np.random.default_rng(5).standard_normal(time.size)
+    noise = 0.1 * np.random.default_rng(5).standard_normal(time.size)
     problem = Rise(time, 3.0 * (1 - np.exp(-0.8 * time)) + noise)
     density = LogDensity(problem)
     mean, sd = _rise_moments(problem)

@@ -2,7 +2,8 @@
 
 Each command runs in a process and a folder of its own. ``close_cold_extra_s`` is what an empty
 cache of compiled code adds, ``first_word_s`` the time to the first line or bar that a user sees.
-Times are those of this machine now; solves are CPU times of one thread. Run as
+Times are those of this machine now; solves are CPU times of one thread. ``transient_ratio`` needs
+CasADi: see ``transients.py``. Run as
 ``python tests/benchmarks/waiting.py --json``, with the data found through ``BAYESOLEO_DATA``.
 """
 
