@@ -8,7 +8,7 @@ Workers of a cluster are killed: see ``lost_workers.py``. Last, the package itse
 see ``mutants.py``.
 
 Run ``python tests/benchmarks/faults.py --json``; ``--few`` tries a sample. What is tried,
-and what was not answered, is told on standard error. It takes hours: with ``--store FILE`` a run
+and what was not answered, is told on standard error. It takes long: with ``--store FILE`` a run
 that was stopped goes on after its last whole step.
 """
 
