@@ -17,6 +17,8 @@ from bayesoleo.plots._style import Scale, engineering, format_number
 
 #: More probable than not.
 LIKELY = 0.5
+#: Probability of something outside from which on no effect is named without it.
+NEARLY_SURE = 0.95
 NOTHING, OUTSIDE = "nothing missing", "something outside the catalogue"
 #: Structures of the table that are shown before the others are asked for.
 LEAD = 6
@@ -140,6 +142,25 @@ def classes(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"{names[0].upper()}{names[1:]}{more}: together {p}."
 
 
+def beside_outside(summary: Mapping[str, Any]) -> str:
+    """What probabilities of effects mean where no set of them explains the data: a sentence.
+
+    An effect may then stand for a part of the unknown law that the functions by which that is
+    represented cannot make. A friction that is missing had been told as a stiffness.
+    """
+    found = known(summary)
+    if found is None or found["outside"] < NEARLY_SURE:
+        return ""
+    best = max((one["probability"] for one in found["effects"]), default=0.0)
+    if best < SHOWN:
+        return ""
+    return (
+        f"Something outside the catalogue acts ({spoken(found['outside'])}), so that probabilities"
+        " of effects hold only as far as its law is like those that were compared: take the effects"
+        " for likenesses."
+    )
+
+
 def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
     """Beginning of the headline where an error is left and nothing was added."""
     found, lead = known(summary), "Something is missing"
@@ -149,6 +170,8 @@ def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
         p = spoken(found["only_outside"])
         return f"{lead} that the catalogue does not have ({p})"
     best = next(iter(found["effects"]), None)
+    if found["outside"] >= NEARLY_SURE:
+        return f"{lead} that effects of the catalogue do not explain ({spoken(found['outside'])})"
     if best is not None and best["probability"] >= LIKELY:
         p = spoken(best["probability"])
         return f"{lead}, probably {title_of(name(best), summary)} ({p})"
@@ -247,7 +270,7 @@ def section(summary: Mapping[str, Any]) -> list[str]:
             "The search decides by estimates and by runs that were held out, the probabilities by"
             " the fitted runs and the prior."
         )
-    texts += classes(summary)
+    texts += [beside_outside(summary), *classes(summary)]
     texts.append(
         "The probabilities follow from marginal likelihoods about each estimate and from the prior"
         f" that nothing is missing ({prior['nothing']}), that effects of the catalogue are"
