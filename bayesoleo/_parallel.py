@@ -375,7 +375,7 @@ class WorkerPool:
                     raise ResultsError(
                         f"the scheduler has had no workers for {WAIT} seconds",
                         hint="start some with 'dask worker <its address>', or see in their logs why"
-                        " they ended",
+                        f" they ended ({type(error).__name__}: {error})",
                     ) from error
                 time.sleep(LOOK)
 

@@ -155,9 +155,9 @@ def beside_outside(summary: Mapping[str, Any]) -> str:
     if best < SHOWN:
         return ""
     return (
-        f"Something outside the catalogue acts ({spoken(found['outside'])}), so that probabilities"
-        " of effects hold only as far as its law is like those that were compared: take the effects"
-        " for likenesses."
+        f"Something outside the catalogue acts ({spoken(found['outside'])}). Probabilities of"
+        " effects assume that its law resembles one of those that were compared. Read the effects"
+        " as similar to what is missing, not as its causes."
     )
 
 
@@ -171,7 +171,8 @@ def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
         return f"{lead} that the catalogue does not have ({p})"
     best = next(iter(found["effects"]), None)
     if found["outside"] >= NEARLY_SURE:
-        return f"{lead} that effects of the catalogue do not explain ({spoken(found['outside'])})"
+        p = spoken(found["outside"])
+        return f"{lead} that effects of the catalogue do not explain alone ({p})"
     if best is not None and best["probability"] >= LIKELY:
         p = spoken(best["probability"])
         return f"{lead}, probably {title_of(name(best), summary)} ({p})"

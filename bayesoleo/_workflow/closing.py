@@ -159,6 +159,8 @@ def draw_final(
         undecided=rivals,
         scanned=loop.scanned,
     )
+    if loop.scanned is not None:
+        loop.scanned.drop()
     return draw(task, final.fit, checkpoints, callback, progress, inference)
 
 

@@ -426,7 +426,8 @@ def _lost(mbe: PointEstimate, point: PointEstimate) -> bool:
     One that its limit of iterations ended has no need of other steps, and what it reached is nearer
     than where it began.
     """
-    return not point.status.ok and bool(mbe.failures or point.failures)
+    ended_by_limit = point.status is Status.NO_CONVERGENCE
+    return not point.status.ok and bool(not ended_by_limit or mbe.failures or point.failures)
 
 
 def _can_be_coarser(problem: CampaignProblem) -> bool:

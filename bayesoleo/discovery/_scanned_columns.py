@@ -16,8 +16,8 @@ from bayesoleo.effects._effect import Effect
 from bayesoleo.solvers._orbit import Status
 
 #: Bytes of columns from which they are computed anew where they are needed: they are held during
-#: all that lies between, and most searches need them never.
-MOST_KEPT = 2**29
+#: all that lies between, and most searches never need them.
+MOST_KEPT = 2**28
 
 #: Of one candidate by set of shapes, or why there are none.
 Columns = list[Block] | Status
@@ -60,6 +60,10 @@ class Scanned:
         if found is None or not same or not _equal(same_effects, effects):
             return None
         return found
+
+    def drop(self) -> None:
+        """Forget the columns: nothing needs them any more."""
+        self._found = None
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
         # A search that is resumed computes them anew: they are many times its own size.

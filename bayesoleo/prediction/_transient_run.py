@@ -236,6 +236,7 @@ class TransientRun(RunPredictor):
             if solution.status[0] == Status.CONVERGED.value:
                 moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
                 self.anchor = Anchor(p.copy(), solution.x[0], moved)
+                self._last = None  # it began at the anchor of before, which would be kept with it
         return Status(int(solution.status[0])), x_p
 
     def _stands_at(self, p: Array) -> bool:

@@ -115,7 +115,7 @@ def test_nothing_missing_is_not_claimed_against_its_probability():
         ({(COULOMB,): 0.8}, "Something is missing, probably Coulomb friction (stroke) (0.80): "),
         (
             {(COULOMB, OUTSIDE): 0.65, (OUTSIDE,): 0.34},
-            "Something is missing that effects of the catalogue do not explain (0.99): ",
+            "Something is missing that effects of the catalogue do not explain alone (0.99): ",
         ),
         ({(COULOMB,): 0.4, (STRIBECK,): 0.4}, "Something is missing: "),
         (
@@ -128,10 +128,10 @@ def test_what_is_left_has_its_probability(table, text):
     assert headline(summary_of(table, verdict=schema.UNEXPLAINED, ratio=5.0)).startswith(text)
 
 
-def test_effects_beside_an_unknown_law_are_called_likenesses():
+def test_effects_beside_an_unknown_law_are_called_similar():
     text = structures.beside_outside(summary_of({(COULOMB, OUTSIDE): 0.65, (OUTSIDE,): 0.34}))
-    assert text.startswith("Something outside the catalogue acts (0.99), so that probabilities of")
-    assert text.endswith("take the effects for likenesses.")
+    assert text.startswith("Something outside the catalogue acts (0.99). Probabilities of effects")
+    assert text.endswith("not as its causes.")
     assert not structures.beside_outside(summary_of({(OUTSIDE,): 0.99, NOTHING: 0.01}))
     assert not structures.beside_outside(summary_of({(COULOMB, OUTSIDE): 0.65, (COULOMB,): 0.3}))
 
