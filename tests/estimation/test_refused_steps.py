@@ -62,6 +62,8 @@ def test_residuals_first_are_those_of_an_evaluation_and_move_no_anchor():
     assert run.anchor is anchor
     whole = problem.evaluate(away)
     assert run.anchor is not anchor
+    # A long motion is not held twice.
+    assert run._last is None or run._last[0] is run.anchor
     # The same solution at the same samples, by other code.
     np.testing.assert_allclose(first.residual[0], whole.residual[0], rtol=0, atol=1e-12)
 
