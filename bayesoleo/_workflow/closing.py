@@ -157,10 +157,10 @@ def draw_final(
         callback,
         held_out=final.held_out,
         undecided=rivals,
-        scanned=loop.scanned,
+        scanned=loop._scanned,
     )
-    if loop.scanned is not None:
-        loop.scanned.drop()
+    if loop._scanned is not None:
+        loop._scanned.drop()
     return draw(task, final.fit, checkpoints, callback, progress, inference)
 
 

@@ -183,9 +183,9 @@ class ClosedLoop:
         return tuple(target for _, target in self.final.assembly.added)
 
     @property
-    def scanned(self) -> Scanned | None:
+    def _scanned(self) -> Scanned | None:
         """What the candidates of the last round change in the outputs, where it was kept."""
-        return self.rounds[-1].scanned if self.rounds else None
+        return self.rounds[-1]._scanned if self.rounds else None
 
     @property
     def verdict(self) -> str:

@@ -52,8 +52,6 @@ class Round:
         Effective number of independent tests of the search.
     nonparametric : CurveSearch or None
         The smooth functions that were tried where no named effect explains the residual.
-    scanned : Scanned or None
-        What the candidates change in the outputs, where it was kept.
     """
 
     before: State
@@ -64,7 +62,8 @@ class Round:
     reason: str
     tests: float
     nonparametric: CurveSearch | None = None
-    scanned: Scanned | None = field(default=None, compare=False, repr=False)
+    #: What the candidates change in the outputs, where it was kept.
+    _scanned: Scanned | None = field(default=None, compare=False, repr=False)
 
 
 def examine(
@@ -118,7 +117,7 @@ def examine(
     ranking = rank(scores, tests, {}, policy=policy)
     stop = _stopping_reason(state, ranking, tests, policy)
     if stop is not None or limit:
-        return Round(state, ranking, failed, None, None, stop or limit, tests, scanned=scanned)
+        return Round(state, ranking, failed, None, None, stop or limit, tests, _scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
@@ -126,7 +125,7 @@ def examine(
         reason = f"with {accepted.effect} a run has no solution at the estimate"
         accepted, after = None, None
     scanned = scanned if after is None else None  # of a model that is final
-    return Round(state, ranking, failed, accepted, after, reason, tests, scanned=scanned)
+    return Round(state, ranking, failed, accepted, after, reason, tests, _scanned=scanned)
 
 
 def _stopping_reason(
@@ -343,7 +342,7 @@ class Progress:
 
     def after(self, outcome: Round, state: State, notes: list[str]) -> Progress:
         """The search with one more round."""
-        before = (replace(one, scanned=None) if one.scanned else one for one in self.rounds)
+        before = (replace(one, _scanned=None) if one._scanned else one for one in self.rounds)
         return Progress(self.first, state, (*before, outcome), tuple(notes))
 
     def ended(self, reason: str) -> Progress:

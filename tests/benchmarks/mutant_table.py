@@ -113,8 +113,8 @@ SOLVERS: Rows = {
          "for relative in (LOOK, LOOK):",
          "solvers/test_integrated_transients.py"),
         ("a start's velocity moves the free motion half as far",
-         "rows += [value + rate * time, rate]",
-         "rows += [value + 0.5 * rate * time, rate]",
+         "x[:, :, state] += time[:, None] * start_p",
+         "x[:, :, state] += 0.5 * time[:, None] * start_p",
          "solvers/test_transient_walk.py::test_without_a_force_a_velocity_moves_on_and_a_state_of_first_order_stays"),
     ],
     "prediction/_starts.py": [
