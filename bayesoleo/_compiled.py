@@ -66,7 +66,7 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
 #: Told once that something is compiled.
 _listeners: list[Callable[[str], object]] = []
 COMPILED_ONCE = (
-    "compile the solvers for this processor: done once, it takes up to half a minute in all"
+    "compile the solvers for this processor: done once, it takes half a minute to two minutes"
 )
 
 
