@@ -65,9 +65,7 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
 
 #: Told once that something is compiled.
 _listeners: list[Callable[[str], object]] = []
-COMPILED_ONCE = (
-    "compile the solvers for this processor: done once, it takes half a minute to two minutes"
-)
+COMPILED_ONCE = "compile the solvers for this processor: done once, it may take a minute or two"
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Candidates are compared on long steps where that decides nothing, and on short ones elsewhere."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -342,6 +343,18 @@ def test_masked_samples_change_nothing():
     assert expected[0] > 0
     assert changed_squares(measured, here, other, variance, weight) == expected
     assert changed_squares(measured, here, other, variance, np.zeros(500)) == (0.0, 0.0)
+
+
+def test_an_estimate_is_lost_where_no_solution_was_found_and_not_where_iterations_ended():
+    def ended(status, **failures):
+        return SimpleNamespace(status=status, failures=failures)
+
+    fine = ended(Status.CONVERGED)
+    assert not _fit._lost(fine, fine)
+    assert not _fit._lost(fine, ended(Status.NO_CONVERGENCE))
+    assert _fit._lost(fine, ended(Status.NO_CONVERGENCE, not_finite=1))
+    # No failure is counted where derivatives are not finite.
+    assert _fit._lost(fine, ended(Status.NOT_FINITE))
 
 
 def test_iterations_that_run_out_are_not_repeated_from_the_start_on_finer_steps(monkeypatch):
