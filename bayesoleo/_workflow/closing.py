@@ -85,8 +85,9 @@ def close(
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
     and after.
 
-    What is known is written as soon as it is known: the estimate, and the result of each round. The
-    same call, with the same campaign, model and settings, goes on after the last finished round.
+    What is known is kept as soon as it is known, the estimate and each round: the same call, with
+    the same campaign, model and settings, goes on after the last finished round. While the search
+    goes on, its result so far is written as well, three times a minute at most.
 
     Parameters
     ----------
@@ -176,8 +177,11 @@ def _write_found(
     stages: Stages,
     questions: Sequence[Question],
 ) -> None:
-    """Write what was found, with its report, before what may take hours."""
-    so_far = Stages(failed=[*stages.failed, {"stage": POSTERIOR_STAGE, "reason": NOT_SAMPLED}])
+    """Write what was found without draws: before they are made, which may take hours, or where
+    nothing else can be written."""
+    so_far = Stages(failed=list(stages.failed))
+    if all(one["stage"] != POSTERIOR_STAGE for one in stages.failed):
+        so_far.failed.append({"stage": POSTERIOR_STAGE, "reason": NOT_SAMPLED})
     try:
         write_result(task, loop, None, output, so_far, questions)
     except Exception as error:
@@ -199,6 +203,8 @@ def written(
         raise
     except Exception as error:
         stages.fail(REPORT_STAGE, reason_of(error), error)
+        if not output.begun:
+            _write_found(task, loop, output, stages, questions)
         found = report_what_is_there(output, stages)
         if found is None:
             raise
@@ -290,7 +296,8 @@ def write_so_far(
     *,
     resume: bool,
 ) -> None:
-    """Write what is known; failing at that must not end what goes on."""
+    """Keep what is known, and write it where the last result is old; failing at that must not end
+    what goes on."""
     if output.folder is None:
         return
     stages = Stages()
@@ -298,6 +305,8 @@ def write_so_far(
     try:
         if resume:
             output.keep(task, progress)
+            if not output.due:
+                return
         loop = loop_of(progress.ended(NOT_YET), task.roles)
         output.write(*result_tree(task, loop, None, output, stages))
     except Exception as error:

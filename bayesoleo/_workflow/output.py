@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -61,6 +62,9 @@ FILES = (RESULTS, REPORT, SUMMARY)
 #: Files and folders of which a process that was killed may have left a draft.
 SWEPT = (*FILES, "each.nc", "replications.nc", "campaign")
 CHECKPOINTS, SEARCH, OLDER = "checkpoints", "search.pickle", "older"
+#: Seconds between results of a search that goes on. One takes two or three to write, and the search
+#: goes on from what is kept besides.
+OFTEN = 20.0
 #: By this file a folder of an older result is known as one that was made here, and may go.
 PUT_ASIDE = ".put-aside"
 
@@ -73,10 +77,13 @@ class ResultFolder:
     ----------
     folder : Path or None
         None writes nothing.
+    begun : bool
+        Whether a result of this calculation has been written, as far as it was known.
     """
 
     folder: Path | None
-    _begun: bool = False
+    begun: bool = field(default=False, init=False)
+    _written: float = field(default_factory=time.monotonic, init=False)
 
     @classmethod
     def checked(cls, out: str | os.PathLike[str] | None) -> ResultFolder:
@@ -138,14 +145,19 @@ class ResultFolder:
         """
         assert self.folder is not None
         aside = None
-        if not self._begun and is_finished(self.folder / RESULTS):
+        if not self.begun and is_finished(self.folder / RESULTS):
             aside = OLDER
             _drop(self.folder / OLDER)
             (self.folder / OLDER).mkdir(parents=True, exist_ok=True)
             (self.folder / OLDER / PUT_ASIDE).touch()
         with together(self.folder, FILES, aside=aside) as draft:
             yield draft
-        self._begun = True
+        self.begun, self._written = True, time.monotonic()
+
+    @property
+    def due(self) -> bool:
+        """Whether what goes on has been written so long ago that it is worth writing again."""
+        return time.monotonic() - self._written > OFTEN
 
     def finish(self) -> None:
         """Drop the older result, and what the search would go on from: the new one is complete."""

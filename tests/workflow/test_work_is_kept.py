@@ -216,6 +216,37 @@ def test_a_folder_that_fails_on_the_way_does_not_end_the_work(campaign, tmp_path
     assert json.loads(tree.attrs[schema.SUMMARY])["unfinished"] == []
 
 
+def test_a_search_of_seconds_writes_once_and_is_kept_all_the_same(campaign, tmp_path, monkeypatch):
+    without_draws(monkeypatch)
+    without_page(monkeypatch)
+    rightly, there = search.examine, []
+
+    def examine(*arguments, **more):
+        there.append(((tmp_path / "results.nc").exists(), kept.exists()))
+        return rightly(*arguments, **more)
+
+    kept = tmp_path / "checkpoints" / "search.pickle"
+    monkeypatch.setattr(search, "examine", examine)
+    workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+    assert there == [(False, True)] * 2
+    assert (tmp_path / "results.nc").exists()
+
+
+def test_a_result_whose_draws_cannot_be_written_leaves_the_effect(campaign, tmp_path, monkeypatch):
+    rightly = output.result_tree
+
+    def with_draws(task, loop, drawn, *more):
+        return broken() if drawn is not None else rightly(task, loop, drawn, *more)
+
+    monkeypatch.setattr(output, "result_tree", with_draws)
+    monkeypatch.setattr(closing, "draw", lambda *_: ())
+    with pytest.raises(UnfinishedError) as caught:
+        workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+    summary = check_unfinished(tmp_path, caught.value, "report")
+    assert summary["effects"] == ["coulomb_friction"]
+    assert [one["stage"] for one in summary["unfinished"]] == ["report", "posterior"]
+
+
 @pytest.fixture(scope="module")
 def broken_off(campaign, tmp_path_factory) -> Path:
     """Folder of a search that broke off in its second round."""
@@ -290,7 +321,9 @@ sys.path.insert(0, {tests!r})
 from small_campaigns import damper
 from bayesoleo import _workflow as workflow
 from bayesoleo.effects import find_effect
-from bayesoleo._workflow import Settings
+from bayesoleo._workflow import Settings, output
+
+output.OFTEN = 0.0
 
 def say(text):
     if text.startswith({stage!r}):
