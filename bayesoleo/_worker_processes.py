@@ -58,6 +58,7 @@ def process_map[S, T, R](
     jobs: int | None = None,
     *,
     known: Callable[[S], Sequence[Any]] = lambda _: (),
+    before: Callable[[], object] = lambda: None,
 ) -> list[R]:
     """Apply ``function(shared, item)`` to every item, in this process and others; keep the order.
 
@@ -76,6 +77,8 @@ def process_map[S, T, R](
         Processes, this one included; by default the cores that it may use.
     known : callable
         Objects within ``shared`` that results refer to rather than copy.
+    before : callable
+        What this process does before its first item, while others do theirs.
 
     Returns
     -------
@@ -86,9 +89,10 @@ def process_map[S, T, R](
     jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
     alone = jobs <= 1 or len(work) <= 1 or not _usable()
     if alone or not _in_use.acquire(blocking=False):
+        before()
         return [function(shared, item) for item in work]
     try:
-        return _shared(function, shared, work, jobs, known)
+        return _shared(function, shared, work, jobs, known, before)
     finally:
         _in_use.release()
 
@@ -103,6 +107,7 @@ def _shared[S, T, R](
     work: list[T],
     jobs: int,
     known: Callable[[S], Sequence[Any]],
+    before: Callable[[], object],
 ) -> list[R]:
     """Results of :func:`process_map` by this process and others."""
     call = _Call(function, shared, work, known)
@@ -113,6 +118,7 @@ def _shared[S, T, R](
     for helper in helpers:
         helper.start()
     try:
+        before()
         call.work()
     except BaseException:
         kill_processes()  # nobody waits for what they are doing

@@ -89,6 +89,41 @@ def test_everything_is_done_here(eager, monkeypatch, reason):
     assert found == [(os.getpid(), float(k**2)) for k in range(4)]
 
 
+def leaves_a_mark(folder, item):
+    (folder / str(os.getpid())).touch()
+    return item
+
+
+def test_other_work_comes_first_here_while_another_process_does_items(eager, tmp_path):
+    seen = set()
+
+    def first():
+        for _ in range(1200):  # a busy machine takes its time
+            seen.update(path.name for path in tmp_path.iterdir())
+            if seen:
+                return
+            time.sleep(0.05)
+
+    assert process_map(leaves_a_mark, tmp_path, range(4), 2, before=first) == [0, 1, 2, 3]
+    assert seen
+    assert str(os.getpid()) not in seen
+
+
+def test_other_work_comes_first_where_everything_is_done_here(tmp_path):
+    done = []
+    found = process_map(leaves_a_mark, tmp_path, range(4), 1, before=lambda: done.append(1))
+    assert (found, done) == ([0, 1, 2, 3], [1])
+
+
+def test_what_comes_first_here_may_fail(eager):
+    def first():
+        raise ValueError("no place")
+
+    with pytest.raises(ValueError, match="no place"):
+        process_map(slow_square, {"unit": 1.0}, range(4), 2, before=first)
+    assert len(process_map(slow_square, {"unit": 1.0}, range(4), 2)) == 4
+
+
 def fails_late(shared, item):
     time.sleep(0.1)
     if item == shared:

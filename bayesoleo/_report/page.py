@@ -298,7 +298,11 @@ def _untried(summary: Mapping[str, Any]) -> str:
     return f"{len(failed)} candidates have no score: {', '.join(texts)}."
 
 
-def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> list[str]:
+def write_report(
+    tree: xr.DataTree,
+    path: str | os.PathLike[str],
+    before: Callable[[], object] = lambda: None,
+) -> list[str]:
     """Write the report of a result as a self-contained HTML page.
 
     Parameters
@@ -307,6 +311,8 @@ def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> list[str]:
         As read by ``read_tree``. Any of its groups may be absent.
     path : path-like
         Replaced as a whole or not at all.
+    before : callable
+        What this process does before it draws, while another one draws.
 
     Returns
     -------
@@ -318,17 +324,17 @@ def write_report(tree: xr.DataTree, path: str | os.PathLike[str]) -> list[str]:
     ResultsError
         The tree holds no summary, or the place cannot be written to.
     """
-    text, failed = _render(tree)
+    text, failed = _render(tree, before)
     write_text_atomic(path, text)
     return failed
 
 
 def render_report(tree: xr.DataTree) -> str:
     """The page of :func:`write_report` as text."""
-    return _render(tree)[0]
+    return _render(tree, lambda: None)[0]
 
 
-def _render(tree: xr.DataTree) -> tuple[str, list[str]]:
+def _render(tree: xr.DataTree, before: Callable[[], object]) -> tuple[str, list[str]]:
     """The page, and the figures that it lacks."""
     import jinja2
 
@@ -341,17 +347,19 @@ def _render(tree: xr.DataTree) -> tuple[str, list[str]]:
     )
     environment.filters["first_of"] = next
     drawing = sections.Drawing()
-    content = _content(tree, drawing)
+    content = _content(tree, drawing, before)
     page = environment.get_template("report.html.jinja").render(content)
     return page, drawing.failed
 
 
-def _content(tree: xr.DataTree, drawing: sections.Drawing) -> dict[str, Any]:
+def _content(
+    tree: xr.DataTree, drawing: sections.Drawing, before: Callable[[], object]
+) -> dict[str, Any]:
     """What the template fills in."""
     summary = _summary(tree)
     units = tables.output_units(tree, summary)
     averaged = reading.averaged_word(tree)
-    figures = _figures(tree, summary, drawing)
+    figures = _figures(tree, summary, drawing, before)
     rounds = list(_rounds(summary, figures))
     proposals = list(_proposals(summary, figures))
     return {
@@ -446,11 +454,15 @@ Maker = Callable[[xr.DataTree], list[Any]]
 
 
 def _figures(
-    tree: xr.DataTree, summary: dict[str, Any], drawing: sections.Drawing
+    tree: xr.DataTree,
+    summary: dict[str, Any],
+    drawing: sections.Drawing,
+    before: Callable[[], object],
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
     makers = _makers(summary)
-    found = process_map(_draw, (tree, _drawing_settings()), list(makers.values()))
+    shared = tree, _drawing_settings()
+    found = process_map(_draw, shared, list(makers.values()), before=before)
     drawing.failed += [text for _, failed in found for text in failed]
     return {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
 

@@ -327,9 +327,10 @@ def write_result(
     stages.callback("write results and report")
     with output.draft() as draft:
         failed = len(stages.failed)
+        first = _Files(tree, summary, draft)
         for figure in stages.attempt(
             REPORT_STAGE,
-            lambda: write_report(tree, draft / REPORT),
+            lambda: write_report(tree, draft / REPORT, first.write),
             lambda: write_plain_report(
                 {**summary, schema.UNFINISHED: stages.failed}, draft / REPORT
             ),
@@ -338,8 +339,27 @@ def write_result(
         if len(stages.failed) > failed:
             summary[schema.UNFINISHED] = list(stages.failed)
             _mark(tree, summary)
-        write_files(tree, summary, draft)
+        if len(stages.failed) > failed or not first.written:
+            write_files(tree, summary, draft)
     return tree
+
+
+@dataclass
+class _Files:
+    """The files of a tree and its summary, written while another process draws figures.
+
+    What fails here is tried again when the figures have been drawn, and fails then.
+    """
+
+    tree: xr.DataTree
+    summary: dict[str, Any]
+    folder: Path
+    written: bool = False
+
+    def write(self) -> None:
+        with suppress(Exception):
+            write_files(self.tree, self.summary, self.folder)
+            self.written = True
 
 
 def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | None:

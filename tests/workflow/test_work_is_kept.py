@@ -247,6 +247,27 @@ def test_a_result_whose_draws_cannot_be_written_leaves_the_effect(campaign, tmp_
     assert [one["stage"] for one in summary["unfinished"]] == ["report", "posterior"]
 
 
+def test_files_that_fail_beside_the_figures_are_tried_again(campaign, tmp_path, monkeypatch):
+    rightly, tried = output.write_files, []
+
+    def write_files(*arguments):
+        tried.append(len(tried))
+        return broken() if tried == [0] else rightly(*arguments)
+
+    monkeypatch.setattr(output, "write_files", write_files)
+    without_draws(monkeypatch)
+    monkeypatch.setattr(output, "write_report", _page_of_nothing)
+    tree = workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+    assert tried == [0, 1]
+    assert read_back(tmp_path)[0] == json.loads(tree.attrs[schema.SUMMARY])
+
+
+def _page_of_nothing(_, path, before):
+    before()
+    path.write_text("no figure", encoding="utf-8")
+    return []
+
+
 @pytest.fixture(scope="module")
 def broken_off(campaign, tmp_path_factory) -> Path:
     """Folder of a search that broke off in its second round."""
