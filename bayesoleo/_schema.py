@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -338,8 +338,6 @@ def validate_summary(summary: dict[str, Any]) -> None:
     ResultsError
         Names the path of the first thing wrong, such as ``rounds[0].error.force.a.rms``.
     """
-    import jsonschema
-
     for path, value in _numbers(summary, ()):
         if not math.isfinite(value):
             raise ResultsError(
@@ -348,6 +346,23 @@ def validate_summary(summary: dict[str, Any]) -> None:
                 value=value,
                 hint="write null (None) where there is no value",
             )
+    try:
+        text = json.dumps(summary, ensure_ascii=False)
+    except TypeError:  # what has no place in a file breaks the schema too, which says where
+        _check_schema(summary)
+    else:
+        _check_text(text)
+
+
+@lru_cache(maxsize=1)
+def _check_text(text: str) -> None:
+    """Check what stands in a file; one summary is checked where it is made, written and shown."""
+    _check_schema(json.loads(text))
+
+
+def _check_schema(summary: dict[str, Any]) -> None:
+    import jsonschema
+
     validator = jsonschema.Draft202012Validator(summary_schema())
     error = jsonschema.exceptions.best_match(validator.iter_errors(summary))
     if error is not None:

@@ -95,3 +95,13 @@ def test_a_missing_part_is_named():
 def test_names_are_built_in_one_place():
     assert schema.mean(schema.before("force")) == "force_before_mean"
     assert schema.variable_name(schema.by_run("offset", "a/b")) == "offset[a∕b]"
+
+
+def test_a_summary_that_was_valid_is_checked_again_once_it_has_changed():
+    schema.validate_summary(SUMMARY)
+    for _ in range(2):  # what is wrong is not remembered as checked
+        with pytest.raises(ResultsError, match="verdict"):
+            schema.validate_summary(broken(["verdict"], "no such verdict"))
+    schema.validate_summary(SUMMARY)
+    with pytest.raises(ResultsError, match="verdict"):
+        schema.validate_summary(broken(["verdict"], object()))
