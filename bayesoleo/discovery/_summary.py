@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
+from scipy import stats
 
 from bayesoleo import _schema as schema
 from bayesoleo.discovery._curves import CurveFacts
@@ -14,6 +15,7 @@ from bayesoleo.discovery._fit_and_hold_out_error import limit, lowest
 from bayesoleo.discovery._loop import ON_LIMIT, ClosedLoop
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round
+from bayesoleo.discovery._score_basis import squared_distance
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structures import Structure, StructurePosterior
@@ -78,7 +80,10 @@ def summarise(
             "posterior": None if samples is None else samples.branch_jumps,
         },
         "notes": [
-            *(in_words(note, titles) for note in (*loop.notes, *_may_be_absent(final, parameters))),
+            *(
+                in_words(note, titles)
+                for note in (*loop.notes, *_may_be_absent(final, parameters, samples))
+            ),
             *facts.notes,
             *([] if stability is None else stability.notes()),
             *final.fit.point.doubts,
@@ -311,21 +316,47 @@ def _parameters(
     return table
 
 
-def _may_be_absent(state: State, parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _may_be_absent(
+    state: State, parameters: Mapping[str, Mapping[str, Any]], samples: Samples | None = None
+) -> list[str]:
     """Say which added effects have amplitudes that zero is as likely for, beside the others.
 
-    What a round says of an effect is said of its estimate at that time.
+    What a round says of an effect is said of its estimate at that time. Amplitudes of one effect
+    are judged together: what varies from run to run may be known to a thousandth of what all runs
+    have in common, which a parameter of the model can take up.
     """
     notes = []
     for step in state.assembly.steps:
-        own = [one for name, one in parameters.items() if name.split("[")[0] in step.amplitudes]
-        if own and step.effect.family != FAMILY and all(map(_includes_zero, own)):
-            notes.append(
-                f"{step.effect.id} at {step.target} may be absent: beside the other effects the"
-                f" 95 % interval of its amplitude includes zero; the share that its round states is"
-                f" that of the estimate then"
-            )
+        own = [name for name in parameters if name.split("[")[0] in step.amplitudes]
+        if not own or step.effect.family == FAMILY:
+            continue
+        if not all(_includes_zero(parameters[name]) for name in own):
+            continue
+        if len(own) == 1:
+            what = "interval of its amplitude"
+        elif _are_zero_together(state, own, samples):
+            what = "region of its amplitudes"
+        else:
+            continue
+        notes.append(
+            f"{step.effect.id} at {step.target} may be absent: beside the other effects the"
+            f" 95 % {what} includes zero; the share that its round states is that of the"
+            f" estimate then"
+        )
     return notes
+
+
+def _are_zero_together(state: State, names: Sequence[str], samples: Samples | None) -> bool:
+    """Whether the 95 % region of several parameters, as of a normal density, includes zero."""
+    if samples is None:
+        place = [state.fit.problem.names.index(name) for name in names]
+        mean = state.fit.point.theta[place]
+        covariance = state.fit.point.covariance[np.ix_(place, place)]
+    else:
+        draws = samples.draws[:, :, [samples.names.index(name) for name in names]]
+        rows = draws.reshape(-1, len(names))
+        mean, covariance = rows.mean(axis=0), np.cov(rows, rowvar=False)
+    return bool(squared_distance(mean, covariance) <= stats.chi2.isf(0.05, len(names)))
 
 
 def _includes_zero(parameter: Mapping[str, Any]) -> bool:

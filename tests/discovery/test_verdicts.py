@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace as Stub
 
+import numpy as np
 import pytest
 
 from bayesoleo import _schema as schema
@@ -109,3 +110,28 @@ def test_an_effect_whose_amplitude_may_be_zero_is_said_to_be_doubtful(interval, 
     notes = _may_be_absent(state, {"cubic_stiffness_upper": own, "gain": other})
     assert len(notes) == said
     assert all("cubic_stiffness at upper may be absent" in note for note in notes)
+
+
+@pytest.mark.parametrize("drawn", [False, True])
+@pytest.mark.parametrize("difference", [0.3, 30.0])
+def test_amplitudes_of_which_only_differences_are_known_are_judged_together(drawn, difference):
+    """What a run has more than others is known; what all have, the model's own parameter takes."""
+    names = [f"varies[{run}]" for run in "abc"]
+    mean = difference * np.array([-1.0, 0.0, 1.0])
+    covariance = np.eye(3) + 1e6 * np.ones((3, 3))
+    point = Stub(theta=mean, covariance=covariance)
+    effect = Stub(id="varies_by_run", family="run-to-run")
+    step = Stub(effect=effect, target="k", amplitudes=("varies",))
+    fit = Stub(point=point, problem=Stub(names=names))
+    state = Stub(assembly=Stub(steps=(step,)), fit=fit)
+    samples = None
+    if drawn:
+        random = np.random.default_rng(1)
+        draws = random.multivariate_normal(mean, covariance, size=(4, 500))
+        samples = Stub(names=names, draws=draws)
+    wide = {"estimate": 0.0, "interval": None, "sd": 1000.0}
+    notes = _may_be_absent(state, dict.fromkeys(names, wide), samples)
+    # Of three standard deviations of one difference the region holds nothing, of a third it does.
+    assert [("95 % region of its amplitudes" in note) for note in notes] == [True] * (
+        difference == 0.3
+    )
