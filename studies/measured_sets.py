@@ -1,8 +1,8 @@
 """Close the loop on the measured sets: the errors of each, and what was found.
 
 Campaigns and models are those of ``studies/measured``; the data are found through
-``BAYESOLEO_DATA``. What a set gives is kept in a folder, as ``<set>.nc`` and ``<set>.json``, and
-used again while neither the package nor the set's campaign and model have changed:
+``BAYESOLEO_DATA``. What a set gives is kept in a folder, as ``<set>.json`` and the folder
+``<set>``, and used again while neither the package nor the set's campaign and model have changed:
 
     python studies/measured_sets.py --only emps
 
@@ -21,6 +21,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,6 +34,7 @@ import numpy as np
 import xarray as xr
 
 import bayesoleo as bo
+from bayesoleo._workflow import Settings, close
 from bayesoleo._workflow.simulating import model_of
 from bayesoleo.effects import Scales, find_effect
 from bayesoleo.gallery import print_added
@@ -174,22 +176,18 @@ SHORT = {
 }
 
 
-def closed(name: str, jobs: int = 2) -> bo.Explanation:
-    """What ``close --quick`` computes."""
-    model = STUDIES / name / "model.py"
-    problem = bo.Problem(STUDIES / name, model, seed=0, quick=True, jobs=jobs, progress=False)
-    found = problem.fit(progress=False).explain(progress=False)
-    found.sample(progress=False)
-    return found
+def closed(name: str, out: Path, jobs: int = 2) -> xr.DataTree:
+    """What ``close --quick`` computes and writes."""
+    model = bo.load_model(STUDIES / name / "model.py")
+    return close(STUDIES / name, model, Settings(seed=0, quick=True, jobs=jobs), out=out)
 
 
 def measure(name: str, out: Path = OUT, jobs: int = 2) -> Figures:
-    """Close the loop on one set; its result is stored as netCDF."""
+    """Close the loop on one set; its result is kept in a folder, as the command leaves it."""
+    shutil.rmtree(out / name, ignore_errors=True)  # what goes on from a search takes less time
     begin, worked = time.perf_counter(), time.process_time()
-    explained = closed(name, jobs)
+    tree = closed(name, out / name, jobs)
     seconds, cpu = time.perf_counter() - begin, time.process_time() - worked
-    explained.save(out / f"{name}.nc")
-    tree = explained.tree
     summary = json.loads(tree.attrs["summary"])
     short = SHORT.get(name, name)
     rounds = summary["rounds"]
@@ -250,7 +248,7 @@ def kept(name: str, out: Path = OUT, jobs: int = 2) -> Figures:
 def tree_of(name: str, out: Path = OUT) -> xr.DataTree:
     """The result of a set, which is kept."""
     kept(name, out)
-    return bo.load_result(out / f"{name}.nc").tree
+    return bo.load_result(out / name / "results.nc").tree
 
 
 def all_kept(names: Sequence[str], out: Path, jobs: int) -> Figures:

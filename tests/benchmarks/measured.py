@@ -15,7 +15,8 @@ Each set gives its errors, and
 ``<set>_certainty``
     ``certain``, ``probable``, ``likeness`` or empty;
 ``<set>_seconds``
-    time of what ``bayesoleo close --quick`` computes, compilation included;
+    time of ``bayesoleo close --quick`` without the import of the package: with its files and its
+    report, compilation included;
 ``<set>_cpu_seconds``
     CPU time of that, summed over the threads of one process: what a busy machine leaves alone.
     With ``--jobs 1`` it is all of it; with more, worker processes are not counted;
