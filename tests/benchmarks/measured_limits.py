@@ -1,4 +1,4 @@
-"""How small the errors of two measured sets can be, by fits of few lines that do not use the loop.
+"""How small errors of three measured sets can be, by fits of few lines that do not use the loop.
 
 Run with ``python tests/benchmarks/measured_limits.py --json`` for one flat object, or without
 ``--json`` for a table. The data are found through ``BAYESOLEO_DATA``. NumPy and SciPy compute
@@ -23,6 +23,12 @@ emps_position_flexible_own_mm            the flexible one fitted to the pulses t
 brfd_<run>_elastic_kip, …_backlash_kip   elastic Coulomb friction, without and with backlash in
                                          series, fitted to that run itself
 brfd_<run>_above_20_Hz_kip               force above 20 Hz, rms
+pendulum_<damping>_fit_mrad              angle of the four records that are fitted, rms: with
+                                         viscous damping, and with Coulomb friction (sharp, or over
+                                         a wide range of velocities), drag and a constant force
+                                         besides
+pendulum_<damping>_validation_mrad       angle of both validation records, each from its own start
+pendulum_<damping>_by_run_mrad           the same where the viscous part is that of the record
 ======================================== ==========================================================
 """
 
@@ -249,11 +255,140 @@ def brfd() -> Figures:
     }
 
 
+@nb.njit(cache=False)
+def swung(times, start, stiffness, velocities, force):  # type: ignore[no-untyped-def]
+    """Angle of a pendulum that swings freely, by steps of a quarter of a sample (Runge-Kutta 4).
+
+    The force of its velocity is linear between given velocities.
+    """
+    angle = np.empty(times.size)
+    place, speed = start[0], start[1]
+    slopes = np.diff(force) / np.diff(velocities)
+
+    def pull(place: float, speed: float) -> float:
+        at = min(max(np.searchsorted(velocities, speed) - 1, 0), slopes.size - 1)
+        return -stiffness * np.sin(place) - force[at] - slopes[at] * (speed - velocities[at])
+
+    for sample in range(times.size):
+        angle[sample] = place
+        if sample == times.size - 1:
+            break
+        step = (times[sample + 1] - times[sample]) / 4
+        for _ in range(4):
+            one = pull(place, speed)
+            two = pull(place + step / 2 * speed, speed + step / 2 * one)
+            three = pull(place + step / 2 * speed + step**2 / 4 * one, speed + step / 2 * two)
+            four = pull(place + step * speed + step**2 / 2 * two, speed + step * three)
+            place += step * speed + step**2 / 6 * (one + two + three)
+            speed += step / 6 * (one + 2 * two + 2 * three + four)
+    return angle
+
+
+#: Velocities, rad/s, between which the force of a pendulum is linear.
+FINE = np.sinh(np.linspace(-8.0, 8.0, 401)) / np.sinh(8.0) * 16.0
+
+
+def viscous_swing(values: np.ndarray) -> np.ndarray:
+    """Viscous damping."""
+    return values[0] * FINE
+
+
+def sharp_swing(values: np.ndarray) -> np.ndarray:
+    """Viscous damping, Coulomb friction that turns within 0.05 rad/s, drag and a constant force."""
+    viscous, coulomb, drag, constant = values
+    return wide_swing(np.array([viscous, coulomb, np.log(0.05), drag, constant]))
+
+
+def wide_swing(values: np.ndarray) -> np.ndarray:
+    """The same with friction over any width, whose logarithm is given."""
+    viscous, coulomb, width, drag, constant = values
+    friction = coulomb * 2 / np.pi * np.arctan(FINE / np.exp(width))
+    return viscous * FINE + friction + drag * FINE * np.abs(FINE) + constant
+
+
+SWINGS = {
+    "viscous": (viscous_swing, [0.056]),
+    "sharp": (sharp_swing, [-0.02, 0.2, 0.006, -0.04]),
+    "wide": (wide_swing, [-0.16, 1.3, np.log(3.7), 0.012, -0.04]),
+}
+
+
+def pendulum() -> Figures:
+    """Each law of damping fitted to four records, and what two others say of it.
+
+    All six are pieces of one decay, from 1.6 rad to 0.3: the others swing less far.
+    """
+    file = "SinglePendulumDataForParameterEstimation.mat"
+    data = loadmat(dataset_folder("single_pendulum") / file)
+    fitted, held = (
+        [
+            (time.ravel(), angles[0] - np.pi)
+            for time, angles in zip(
+                data[f"Time_{kind}"].ravel(), data[f"Y_{kind}"].ravel(), strict=True
+            )
+        ]
+        for kind in ("id", "vad")
+    )
+    found: Figures = {}
+    for name, (law, begin) in SWINGS.items():
+        values, errors = fitted_swings(law, np.array([64.05, *begin]), fitted)
+        found[f"pendulum_{name}_fit_mrad"] = 1e3 * rms(errors)
+        for word, free in (("validation", 0), ("by_run", 1)):
+            each = [one_swing(law, values, record, free) for record in held]
+            found[f"pendulum_{name}_{word}_mrad"] = 1e3 * rms(np.concatenate(each))
+    return found
+
+
+def fitted_swings(
+    law: Callable[[np.ndarray], np.ndarray],
+    begin: np.ndarray,
+    records: list[tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness and the law's values of several records with a start each, and what is left."""
+    starts = [value for record in records for value in first_start(*record)]
+    size = begin.size
+
+    def error(values: np.ndarray) -> np.ndarray:
+        force = law(values[1:size])
+        return np.concatenate([
+            swung(time, values[size + 2 * k : size + 2 * k + 2], values[0], FINE, force) - angle
+            for k, (time, angle) in enumerate(records)
+        ])  # fmt: skip
+
+    fit = least_squares(error, [*begin, *starts], x_scale="jac", max_nfev=60)
+    return fit.x[:size], fit.fun
+
+
+def one_swing(
+    law: Callable[[np.ndarray], np.ndarray],
+    known: np.ndarray,
+    record: tuple[np.ndarray, np.ndarray],
+    free: int,
+) -> np.ndarray:
+    """What is left of a record by a known law, with its own start and, if free, viscous part."""
+    time, angle = record
+
+    def error(values: np.ndarray) -> np.ndarray:
+        own = known.copy()
+        own[1 : 1 + free] += values[2 : 2 + free]
+        return np.asarray(swung(time, values[:2], own[0], FINE, law(own[1:])) - angle)
+
+    begin = [*first_start(time, angle), *[0.0] * free]
+    return np.asarray(least_squares(error, begin, x_scale="jac", max_nfev=60).fun)
+
+
+def first_start(time: np.ndarray, angle: np.ndarray) -> tuple[float, float]:
+    """Angle and velocity at the first sample, by a parabola through a tenth of a second."""
+    few = time < time[0] + 0.1
+    slope = np.polyfit(time[few] - time[0], angle[few], 2)
+    return float(slope[2]), float(slope[1])
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one flat object")
-    sets = {"emps": emps, "brfd": brfd}
+    sets = {"emps": emps, "brfd": brfd, "pendulum": pendulum}
     parser.add_argument("--only", nargs="+", default=list(sets), choices=sets, metavar="SET")
     chosen = parser.parse_args()
     found: Figures = {}
