@@ -38,6 +38,8 @@ STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
 #: declared frequency is double, but a per cent for an unsettled start and zero for the rounding of
 #: samples without noise.
 LEFT, LEAST = 0.25, 0.05
+#: Samples at the end of a record that say how far a channel moves from one to the next.
+NEAR = 50
 #: Multiples of the declared period that are tried.
 LONGER = (2, 3)
 
@@ -245,7 +247,39 @@ def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = N
     for record, doubts in zip(records, periods, strict=True):
         # Lines between the harmonics of a wrong frequency are harmonics of the true one.
         found += [] if doubts else _about_channels(record, known)
-    return found
+    return found + _about_pieces(records)
+
+
+def _about_pieces(records: Sequence[Record]) -> list[str]:
+    """Transients that are pieces of one record, one sentence for each such record."""
+    chains: list[list[Record]] = []
+    for record in sorted(records, key=lambda one: float(one.time[0])):
+        chain = next((one for one in chains if _goes_on(one[-1], record)), None)
+        if chain is None:
+            chains.append([record])
+        else:
+            chain.append(record)
+    return [
+        f"{_runs([one.label for one in chain])} are pieces of one record: each goes on where"
+        " another one ends. A parameter that differs from run to run may stand for what changes"
+        " along it, such as the amplitude"
+        for chain in chains
+        if len(chain) > 1
+    ]
+
+
+def _goes_on(before: Record, after: Record) -> bool:
+    """Whether one transient's clock and all of its channels go on in another one."""
+    step = float(before.time[-1] - before.time[-2])
+    if before.periodic or after.periodic or not abs(after.time[0] - before.time[-1] - step) < step:
+        return False
+    shared = [name for name in before.samples if name in after.samples]
+    moves = [
+        (abs(after.samples[name][0] - before.samples[name][-1]), np.abs(np.diff(ends)))
+        for name in shared
+        for ends in [before.samples[name][-NEAR:]]
+    ]
+    return bool(moves) and all(jump <= 3.0 * moved.max() for jump, moved in moves)
 
 
 def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[str]:

@@ -17,6 +17,7 @@ from bayesoleo.data._sample_quality import (
     rounding_that_repeats,
     step_of,
 )
+from bayesoleo.prediction._records import transient_record
 
 FREQUENCY, STEP, SAMPLES = 2.0, 1 / 1000.0, 5000
 
@@ -127,3 +128,35 @@ def test_rounding_of_a_signal_without_noise_has_no_line(tmp_path):
     assert foreign_lines(replace(record, samples={"force": clean + line}, signal_noise=noise)) == ()
     loud = replace(record, samples={"force": clean + 1e6 * line}, signal_noise=noise)
     assert len(foreign_lines(loud)) == 1
+
+
+def decay(rng, noise):
+    """A swing that dies away, cut in two, on one clock."""
+    t, _ = signal(rng)
+    x = np.exp(-0.2 * t) * np.cos(2 * np.pi * FREQUENCY * t) + noise * rng.standard_normal(t.size)
+    return [(t[:2500], x[:2500]), (t[2500:], x[2500:])]
+
+
+def about_pieces(*records):
+    made = [transient_record(f"{k + 1}", t, {"x": x}) for k, (t, x) in enumerate(records)]
+    return [text for text in data_warnings(made) if "pieces of one record" in text]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_pieces_of_one_record_are_said_to_be_so(noise):
+    first, second = decay(np.random.default_rng(3), noise)
+    other = first[0], 2.0 * first[1]
+    for several in ((first, second), (first, second, other)):
+        (said,) = about_pieces(*several)
+        assert said.startswith("runs 1, 2 are pieces of one record")
+    (said,) = about_pieces(second, first)
+    assert said.startswith("runs 2, 1 are pieces of one record")
+
+
+def test_records_of_their_own_are_no_pieces():
+    first, second = decay(np.random.default_rng(3), 0.001)
+    anew = second[0] - second[0][0], second[1]  # a clock of its own
+    elsewhere = second[0], second[1] + 0.5  # it was let go again
+    later = second[0] + 3 * STEP, second[1]
+    for other in (anew, elsewhere, later, first):
+        assert not about_pieces(first, other)
