@@ -9,7 +9,7 @@ starts. No amplitude, duration or start leaves the range of those measured by mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -210,9 +210,9 @@ def _transient(records: Sequence[Record], model: Model, outputs: Sequence[str]) 
     found = []
     for record in bases:
         own = [_targets(sizes[name]) / _travel(record, name) for name in inputs]
-        lasts = _targets(spans) / record.span if inputs else np.ones(1)
-        begins = _targets(list(starts.values())) / starts[record.label] if starts else np.ones(1)
-        for factors, last, begin in product(product(*own), [1.0, *lasts], [1.0, *begins]):
+        lasts = _targets(spans) / record.span if inputs else ()
+        begins = _targets(list(starts.values())) / starts[record.label] if starts else ()
+        for factors, last, begin in product(product(*own), _and_one(lasts), _and_one(begins)):
             scale = dict(zip(inputs, map(float, factors), strict=True))
             words = [_times(name, factor) for name, factor in scale.items()]
             words += [_times("duration", last), _times("start", begin)]
@@ -223,6 +223,11 @@ def _transient(records: Sequence[Record], model: Model, outputs: Sequence[str]) 
                 )
                 found.append(Variation(blank, record.label, change, float(begin)))
     return found
+
+
+def _and_one(factors: Iterable[float]) -> list[float]:
+    """One, and the factors that change anything: others would be the same run once more."""
+    return [1.0, *(float(factor) for factor in factors if abs(factor - 1.0) > SAME)]
 
 
 def _travel(record: Record, name: str) -> float:

@@ -339,6 +339,32 @@ def test_a_transient_is_varied_by_its_start():
     assert best.information > found.best_repeat.information
 
 
+@pytest.mark.parametrize("labels", [("a",), ("a", "bb")])
+def test_no_variation_of_a_transient_is_judged_twice(labels):
+    """A single run's range is its own, and without a start there is none to vary."""
+    time = np.arange(400) * 0.01
+    driven = replace(
+        decay_model(),
+        inputs={"push": "N"},
+        equations={
+            "x": {**decay_model().equations["x"], "push": "-push"},
+        },
+    )
+    records = [
+        transient_record(
+            label, time, {"displacement": np.zeros(400), "push": np.sin((3 + len(label)) * time)}
+        )
+        for label in labels
+    ]
+    for model in (driven, replace(driven, dofs={"x": Dof("m", initial="displacement")})):
+        found = varied_runs(records, model, ("displacement",))
+        told = [(item.like, item.change) for item in found]
+        assert len(set(told)) == len(told)
+        # Three amplitudes and durations of each, without the run as it was measured; where the
+        # range is that of one run, its own values are the middle ones.
+        assert len(told) == len(labels) * (3 * 3 - 1)
+
+
 def test_variations_of_a_held_out_transient_begin_with_its_motion(monkeypatch):
     """One integration for the run itself; the same figures as with one for each variation."""
     records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
