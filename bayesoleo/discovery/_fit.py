@@ -367,6 +367,10 @@ def fit_model(
     callback, begun = progress or (lambda _: None), None
     problem = _begun(model, records, numerics, share)
     while True:
+        for run in problem.predictor.runs:
+            # Nobody is told on which branch a model stands that is only compared with others, and
+            # to follow a branch takes as long as to solve.
+            run.watched = check_mesh
         mbe, point = _estimated(
             problem, start, method, damped, tolerance, max_iterations, numerics.policy, callback
         )

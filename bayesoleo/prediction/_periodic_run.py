@@ -247,8 +247,10 @@ class RunPredictor:
             if solution.status[0] == Status.CONVERGED.value:
                 moved = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
                 anchor = Anchor(p.copy(), solution.x[0], moved, monodromy[0])
-                self.anchor = anchor.after(self.anchor, self.boundary, self.active)
-                self.jumps += self.anchor.jumped
+                if self.watched:
+                    anchor = anchor.after(self.anchor, self.boundary, self.active)
+                self.anchor = anchor
+                self.jumps += anchor.jumped
         return Status(int(solution.status[0]))
 
     def solve_from_guess(self, p: Array) -> Solution:

@@ -220,9 +220,8 @@ def solve_extrapolated(
     if arranged is None:
         return solve_periodic(problem, p, extrapolation.starts(change), overwrite=True)
     x = np.empty((p.shape[0], *extrapolation.x.shape))
-    line = arrangement.LinearStart(
-        *extrapolation.swept(arranged.layout), np.ascontiguousarray(change)
-    )
+    moved = np.ascontiguousarray(change[:, extrapolation.moving])
+    line = arrangement.LinearStart(*extrapolation.swept(arranged.layout), moved)
     solution = _compiled(problem, arranged, p, x, 40, True, line)
     return _with_exchange(
         problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), 40, True

@@ -501,20 +501,27 @@ class Extrapolation:
     x: Array
     x_p: Array
 
+    @cached_property
+    def moving(self) -> Integers:
+        """Which parameters move the motion: most of a force law act on outputs alone."""
+        return np.flatnonzero(self.x_p.any(axis=(1, 2)))
+
     def starts(self, change: Array) -> Array:
         """Starts, shape (L, n, w), at changes of shape (L, na)."""
         start = np.empty((change.shape[0], *self.x.shape))
-        slopes = self.x_p.reshape(self.x_p.shape[0], -1)
-        _extrapolate_lanes(self.x.ravel(), slopes, change, start.reshape(change.shape[0], -1))
+        slopes = self.x_p.reshape(len(self.x_p), self.x.size)
+        flat = start.reshape(change.shape[0], -1)
+        _extrapolate_lanes(self.x.ravel(), slopes, change, self.moving, flat)
         return start
 
     def swept(self, layout: SweepLayout) -> tuple[Array, Array]:
-        """The same in the order of a sweep: ``(w, positions)`` and ``(na, w, positions)``."""
+        """The same in the order of a sweep: ``(w, positions)`` and, of the parameters that move it,
+        ``(moving, w, positions)``."""
         known = self._swept.get("last")
         if known is None or known[0] is not layout:
             base = np.ascontiguousarray(self.x[layout.source].T)
-            slopes = np.ascontiguousarray(np.moveaxis(self.x_p[:, layout.source], 2, 1))
-            known = self._swept["last"] = layout, base, slopes
+            slopes = np.moveaxis(self.x_p[self.moving][:, layout.source], 2, 1)
+            known = self._swept["last"] = layout, base, np.ascontiguousarray(slopes)
         return known[1:]
 
     @cached_property
@@ -523,11 +530,11 @@ class Extrapolation:
 
 
 @jit
-def _extrapolate_lanes(x: Array, x_p: Array, change: Array, start: Array) -> None:
+def _extrapolate_lanes(x: Array, x_p: Array, change: Array, moving: Integers, start: Array) -> None:
     """Lane by lane: the order of summation of a matrix product would vary with the batch."""
     for lane in range(change.shape[0]):
         for i in range(x.size):
             start[lane, i] = x[i]
-        for k in range(change.shape[1]):
+        for k in moving:
             for i in range(x.size):
                 start[lane, i] += change[lane, k] * x_p[k, i]

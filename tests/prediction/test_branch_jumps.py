@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import Held
 from bayesoleo.posterior import LogDensity
@@ -106,6 +107,27 @@ def test_nobody_looks_for_jumps_that_are_not_asked_for(monkeypatch):
     assert problem.branch_jumps.sum() == counted
     problem.misfit(vectors)
     assert problem.branch_jumps.sum() == 2 * counted
+
+
+@pytest.mark.parametrize("compared", [False, True])
+def test_an_estimate_that_is_only_compared_looks_for_no_jumps(monkeypatch, compared):
+    """Its optimum is the same; an estimate that stands for itself looks for them."""
+    made, theta = predictor(110.0)
+    measured = {**made.records[0].samples, "displacement": made.simulate(theta[None], 0).y[0, 0]}
+    record = replace(made.records[0], samples=measured)
+    looked, left_by = [], Anchor.left_by
+
+    def counted(*given):
+        looked.append(given)
+        return left_by(*given)
+
+    monkeypatch.setattr(Anchor, "left_by", counted)
+    numerics = Numerics(jobs=1, backend="numpy", steps=STEPS)
+    start = at(theta, made.layout.names, stiffness=114.0)
+    fit = fit_model(made.model, [record], numerics, start=start, check_mesh=not compared)
+    assert bool(looked) is not compared
+    # The data are exact: both end there, to the tolerance of an estimate.
+    np.testing.assert_allclose(fit.point.theta, theta, rtol=1e-4)
 
 
 def walked(made: Predictor, theta: np.ndarray, end: np.ndarray) -> np.ndarray | None:

@@ -125,6 +125,26 @@ def test_starts_made_on_the_way_are_those_of_the_extrapolation(name, n):
     assert (found.iterations > 1).all()
 
 
+def test_parameters_that_move_nothing_take_no_part_in_a_start():
+    """Those of a force law, whatever they are."""
+    boundary, p = discretised(duffing(), FORCE, 0.2, "radau3", 64, backend="numba")
+    solved = periodic.solve_periodic(boundary, p, rest(boundary, 64))
+    solved, x_p, _ = periodic.sensitivities(boundary, p, solved)
+    slopes = np.ascontiguousarray(np.moveaxis(x_p[0], 2, 0))
+    still = np.zeros((1, *slopes.shape[1:]))
+    change = 1e-2 * np.random.default_rng(1).standard_normal((3, len(slopes)))
+    many = np.repeat(p, 3, axis=0)
+    for first, own, moves in ((slopes, change, len(slopes)), (slopes[:0], change[:, :0], 0)):
+        wide = np.concatenate([first, still]), np.c_[own, np.full(3, np.inf)]
+        alone, beside = Extrapolation(solved.x[0], first), Extrapolation(solved.x[0], wide[0])
+        assert beside.moving.size == moves
+        np.testing.assert_array_equal(beside.starts(wide[1]), alone.starts(own))
+        found = periodic.solve_extrapolated(boundary, many, beside, wide[1])
+        told = periodic.solve_extrapolated(boundary, many, alone, own)
+        assert (found.status == Status.CONVERGED.value).all()
+        np.testing.assert_array_equal(found.x, told.x)
+
+
 @pytest.mark.parametrize("name", ["radau3", "thesis"])
 def test_lanes_do_not_know_each_other(name):
     boundary, p = discretised(friction_oscillator(), FORCE, 0.2, name, 50, backend="numba")
