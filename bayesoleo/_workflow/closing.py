@@ -278,6 +278,7 @@ def run_loop(
             prior=settings.structure_prior,
             keep=keep,
             keep_columns=max_effects > 0 and settings.inference.error_model in (AUTO, CATALOGUE),
+            declared=task.declared,
             callback=callback,
         )
     except Exception as error:

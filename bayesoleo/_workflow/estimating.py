@@ -101,6 +101,8 @@ def estimated(
     settings, callback = task.settings, stages.callback
     model, runs = task.assembly.model(), task.roles.fitted
     fit = fit_model(model, runs, settings.numerics, method=method, progress=callback)
+    if method == "mbe":  # what a search begins with
+        task.keep(fit)
     plain: tuple[ModelFit, dict[str, xr.Dataset]] = (fit, {})
     return stages.attempt(
         POSTERIOR_STAGE, lambda: under_error_model(task, fit, callback), lambda: plain

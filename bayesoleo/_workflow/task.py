@@ -10,7 +10,7 @@ import json
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,7 +38,7 @@ from bayesoleo.data._frequency_response import (
 )
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
-from bayesoleo.discovery._fit import first_steps
+from bayesoleo.discovery._fit import ModelFit, first_steps
 from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
@@ -285,12 +285,27 @@ class Task:
     assembly : Assembly
         The declared model with its drive.
     settings : Settings
+    known : list of (Assembly, ModelFit)
+        Estimates that were made of declared models; all tasks that follow from this one have them.
     """
 
     reduced: ReducedCampaign
     roles: Roles
     assembly: Assembly
     settings: Settings
+    known: list[tuple[Assembly, ModelFit]] = field(default_factory=list, compare=False, repr=False)
+
+    def keep(self, fit: ModelFit) -> None:
+        """Keep the estimate of the declared model, for a search that begins with it."""
+        self.known[:] = [(self.assembly, fit.apart())]
+
+    @property
+    def declared(self) -> ModelFit | None:
+        """The estimate of the declared model by these numerics, if it was made before."""
+        for assembly, fit in self.known:
+            if assembly is self.assembly and fit.numerics == self.settings.numerics:
+                return fit.apart()
+        return None
 
     @property
     def campaign(self) -> CampaignData:

@@ -11,6 +11,7 @@ priors have almost no mass. Only then is the time for other starts well spent.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -278,6 +279,12 @@ class ModelFit:
     def records(self) -> tuple[Record, ...]:
         """The fitted runs."""
         return self.predictor.records
+
+    def apart(self) -> ModelFit:
+        """The same with solvers of its own: they stay at this estimate, wherever the others go."""
+        predictor = copy(self.predictor)
+        predictor.runs = [copy(run) for run in self.predictor.runs]
+        return replace(self, problem=CampaignProblem(predictor))
 
     @property
     def stability(self) -> Stability | None:

@@ -30,7 +30,7 @@ from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._state import State, better_start, fit_state
+from bayesoleo.discovery._state import State, better_start, fit_state, state_of
 from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.effects._effect import Effect
@@ -242,6 +242,7 @@ def close_loop(
     prior: StructurePrior = DEFAULT_PRIOR,
     keep: Callable[[Progress], None] = lambda _: None,
     keep_columns: bool = False,
+    declared: ModelFit | None = None,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model and add the effects that it lacks, one after the other.
@@ -271,6 +272,9 @@ def close_loop(
     keep_columns : bool
         Whether to keep what the candidates of the last round change in the outputs, for the choice
         of an error model.
+    declared : ModelFit, optional
+        The declared model's estimate, if it was made before: by :func:`fit_model`, by these runs
+        and numerics.
     callback : callable
         Receives a message at each step.
 
@@ -279,7 +283,7 @@ def close_loop(
     ClosedLoop
     """
     if known is None:
-        known = _begun(assembly, roles, numerics, callback)
+        known = _begun(assembly, roles, numerics, declared, callback)
         keep(known)
     search = SearchOptions(
         roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns
@@ -421,11 +425,18 @@ def _with_noise(roles: Roles, known: Progress) -> Roles:
 
 
 def _begun(
-    assembly: Assembly, roles: Roles, numerics: Numerics, callback: ProgressCallback
+    assembly: Assembly,
+    roles: Roles,
+    numerics: Numerics,
+    declared: ModelFit | None,
+    callback: ProgressCallback,
 ) -> Progress:
     """The declared model, estimated."""
     notes = [] if roles.strategy == "declared" else [roles.description]
-    state = fit_state(assembly, roles, numerics, progress=callback)
+    if declared is None:
+        state = fit_state(assembly, roles, numerics, progress=callback)
+    else:
+        state = state_of(assembly, declared, roles)
     if not state.at_floor:
         callback("the residual exceeds the expected error: try other starts")
         start = better_start(state.fit, numerics)

@@ -7,6 +7,7 @@ import json
 import pickle
 from contextlib import redirect_stderr
 from pathlib import Path
+from typing import Any
 
 import arviz
 import numpy as np
@@ -16,6 +17,7 @@ import bayesoleo as bo
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._session import display as figures
 from bayesoleo._session.campaign import Campaign
+from bayesoleo.discovery import _state
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import InputError
 from bayesoleo.prediction import RunPlan, motion
@@ -80,6 +82,29 @@ def test_fit_is_that_of_the_command_line(problem: bo.Problem, fit: bo.Fit) -> No
         fit.parameters["estimate"], tree[schema.POINT][schema.ESTIMATE].values
     )
     assert fit.parameters.loc["damping", "unit"] == "N*s/m"
+
+
+def test_a_search_begins_with_the_estimate_that_was_made(
+    campaign: bo.Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it was, whatever was asked of the fit meanwhile; the result is that of a search alone."""
+    settings = bo.Settings(quick=True, jobs=1, effects=EFFECTS, max_effects=0)
+    model, fit_model, anew = damper(cubic=False), _state.fit_model, []
+
+    def counted(*given: Any, start: Any = None, **options: Any) -> Any:
+        anew.append(start is None)
+        return fit_model(*given, start=start, **options)
+
+    monkeypatch.setattr(_state, "fit_model", counted)
+    alone = workflow.trace(campaign.reduced, model, settings)
+    assert anew.pop(0)  # the declared model; what follows starts at an estimate
+    fit = bo.Problem(campaign, model, quick=True, jobs=1).fit()
+    fit.profile()
+    found = fit.explain(effects=EFFECTS, max_effects=0)
+    assert not any(anew)
+    own, other = (json.loads(tree.attrs["summary"]) for tree in (found.tree, alone))
+    for key in ("rounds", "error_before", "parameters"):
+        assert own[key] == other[key]
 
 
 def test_another_method_leads_to_the_same_mode(problem: bo.Problem, fit: bo.Fit) -> None:
