@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from bayesoleo._parallel import single_blas_thread, thread_map
+from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
+from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._expected_information import (
     Component,
     Precision,
@@ -220,9 +222,10 @@ def propose_runs(
         repeats = [repeated(record, outputs) for record in records]
     noise = expected_noise(errors, records)
     judge = _Judge(tuple(rivals), tuple(records), drive, limits, noise, aim)
+    runs = [*planned, *repeats]
     with single_blas_thread():
-        new = thread_map(judge, list[Run](planned), jobs)
-        again = thread_map(judge, list[Run](repeats), jobs)
+        found = process_map(_judged, judge, runs, jobs, known=_records_of)
+    new, again = found[: len(planned)], found[len(planned) :]
     weights = np.array([rival.weight for rival in rivals])
     return Proposals(
         tuple(rival.name for rival in rivals),
@@ -247,6 +250,17 @@ def limits_of(records: Sequence[Record], drive: str, outputs: Sequence[str]) -> 
         room = (REACH - 1.0 + BEYOND) * (max(values) - min(values))
         seen[name] = (min(values) - room, max(values) + room)
     return Limits(free, free, free, free, free, seen)
+
+
+def _judged(judge: _Judge, run: Run) -> ProposedRun | str:
+    """What one run would tell; most of it is arrays, for which threads wait for each other."""
+    return judge(run)
+
+
+def _records_of(judge: _Judge) -> Sequence[Record]:
+    """Records that a judge and its runs share."""
+    fitted = [record for rival in judge.rivals for record in rival.fit.records]
+    return list({id(record): record for record in (*judge.records, *fitted)}.values())
 
 
 @dataclass(frozen=True)
@@ -293,6 +307,10 @@ class _Judge:
             return BEYOND_LIMITS
         told = self._told([item for item, _ in solved], known)
         return self._described(run, record.frequency, told)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process finds its own: these change while they would be sent.
+        return vars(self) | {"begins": {}}
 
     def _begin(self, rival: int, label: str) -> TransientRun | None:
         """Where a rival's solutions of a transient's variations begin: found once."""

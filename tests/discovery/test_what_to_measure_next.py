@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fitted_states import NUMERICS, fitted
 from small_campaigns import damper, damper_campaign, oscillator_campaign
 
+import bayesoleo._worker_processes as processes
 from bayesoleo.discovery import _next_experiment
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import fit_model
@@ -389,6 +391,40 @@ def test_variations_of_a_held_out_transient_begin_with_its_motion(monkeypatch):
     for key, value in told[0].items():
         # Two meshes: what either leaves of the solution.
         assert value == pytest.approx(told[1][key], rel=1e-3, abs=1e-6)
+
+
+def test_another_process_judges_runs_alike(monkeypatch):
+    """Each finds where variations begin by itself."""
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
+    records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
+    state = fit_state(Assembly(decay_model()), _roles_of(records[:1]), NUMERICS)
+    ask, asked, told = processes._Worker.ask, [], []
+
+    def counted(worker, message, known=()):
+        found = ask(worker, message, known)
+        asked.append(found[0])
+        return found
+
+    def slowly(*given):
+        time.sleep(0.2)  # so that the other process gets a share
+        return predictive_distribution(*given)
+
+    predictive_distribution = _next_experiment.predictive_distribution
+    monkeypatch.setattr(_next_experiment, "predictive_distribution", slowly)
+    monkeypatch.setattr(processes._Worker, "ask", counted)
+    try:
+        worker = processes._worker(0, processes.OF_A_SEARCH)
+        worker.ask(processes._dumps((None, None, None)))  # it answers once it has begun
+        for jobs in (2, 1):
+            asked.clear()
+            rivals = [Rival("decay", state.fit)]
+            found = propose_runs(rivals, 2 * records, state.fit_errors, aim="stiffness", jobs=jobs)
+            told.append([(t.like, t.change, t.label, t.information) for t in found.trials])
+            assert ("value" in asked) is (jobs == 2)
+    finally:
+        processes.end_processes()
+    assert told[0] == told[1]
 
 
 def _start_of(trial, starts):
