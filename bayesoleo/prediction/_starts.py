@@ -208,6 +208,20 @@ class InitialState:
         status[bad & (status == Status.CONVERGED.value)] = Status.NOT_FINITE.value
         return StartStates(state, state_p, status)
 
+    def states(self, p: Array) -> tuple[Array, Integers]:
+        """States (L, D) and statuses (L,) without derivatives: of an equilibrium these take as long
+        as itself."""
+        status = np.zeros(p.shape[0], dtype=np.int64)
+        rest = np.zeros((p.shape[0], len(self.resting)))
+        if self.resting.any():
+            z, _, _, status = self._at_rest(p)
+            rest = z[:, self.first, 0]
+        owner = np.repeat(np.arange(len(self.resting)), self.kernels.derived.orders)
+        state = self._values(p, rest[:, owner])[0]
+        bad = ~np.isfinite(state).all(axis=1)
+        status[bad & (status == Status.CONVERGED.value)] = Status.NOT_FINITE.value
+        return state, status
+
     def measured(self) -> list[tuple[str, int, sp.Symbol]]:
         """Channels that a start is read from, with the order of the derivative, where the start is
         not estimated."""
@@ -244,31 +258,13 @@ class InitialState:
         return found
 
     def _equilibrium(self, p: Array) -> tuple[Array, Array, Integers]:
-        """Rest positions ``(L, d)`` of the dofs that ask for them, by damped Newton steps."""
+        """Rest positions ``(L, d)`` of the dofs that ask for them, with derivatives."""
         derived, lanes = self.kernels.derived, np.arange(p.shape[0])
-        nz, d, moving = len(derived.states), len(derived.dofs), ~self.resting
-        nothing = np.zeros((p.shape[0], d))
-        guess, guess_p, _ = self._guesses(p, nothing)
-        known, known_p, _ = self._values(p, np.zeros((p.shape[0], self.rows.size)))
-        z, z_p = np.zeros((p.shape[0], nz, 1)), np.zeros((p.shape[0], nz, len(derived.active)))
-        owner = np.repeat(np.arange(d), derived.orders)
-        given = self.rows[moving[owner]]
-        z[:, given, 0], z_p[:, given] = known[:, moving[owner]], known_p[:, moving[owner]]
-        values = self.first[self.resting]
-        z[:, values, 0], z_p[:, values] = guess[:, self.resting], guess_p[:, self.resting]
+        nz, d = len(derived.states), len(derived.dofs)
+        z, z_p, silent, status = self._at_rest(p)
+        own, values = np.flatnonzero(self.resting), self.first[self.resting]
         g, gz = np.zeros((p.shape[0], d, 1)), np.zeros((p.shape[0], d, nz, 1))
         gp = np.zeros((p.shape[0], d, len(derived.active), 1))
-        self._evaluate(z, p, lanes, g, gz)
-        # An equation that holds wherever the dofs are (a memory at rest) says nothing: its dof
-        # stays at its guess.
-        own = np.flatnonzero(self.resting)
-        silent = (np.abs(gz[:, own][:, :, values, 0]).max(axis=2, initial=0.0) == 0.0) & (
-            g[:, own, 0] == 0.0
-        )
-        status = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
-        for lane in lanes:
-            free = ~silent[lane]
-            status[lane] = self._solve(z[lane, :, 0], p[lane], own[free], values[free])
         with np.errstate(all="ignore"):
             self._evaluate(z, p, lanes, g, gz)
             self.kernels.parameters(z, self.inputs, p, lanes, gp)
@@ -281,6 +277,34 @@ class InitialState:
             matrix = gz[lane][np.ix_(rows, columns)][:, :, 0]
             z_p[lane, columns] = -np.linalg.solve(matrix, right)
         return z[:, self.first, 0], z_p[:, self.first], status
+
+    def _at_rest(self, p: Array) -> tuple[Array, Array, Flags, Integers]:
+        """Rows ``(L, nz, 1)`` at rest, by damped Newton steps; derivatives ``(L, nz, na)`` of where
+        those began, dofs that nothing moves ``(L, resting)``, and statuses."""
+        derived, lanes = self.kernels.derived, np.arange(p.shape[0])
+        nz, d, moving = len(derived.states), len(derived.dofs), ~self.resting
+        nothing = np.zeros((p.shape[0], d))
+        guess, guess_p, _ = self._guesses(p, nothing)
+        known, known_p, _ = self._values(p, np.zeros((p.shape[0], self.rows.size)))
+        z, z_p = np.zeros((p.shape[0], nz, 1)), np.zeros((p.shape[0], nz, len(derived.active)))
+        owner = np.repeat(np.arange(d), derived.orders)
+        given = self.rows[moving[owner]]
+        z[:, given, 0], z_p[:, given] = known[:, moving[owner]], known_p[:, moving[owner]]
+        values = self.first[self.resting]
+        z[:, values, 0], z_p[:, values] = guess[:, self.resting], guess_p[:, self.resting]
+        g, gz = np.zeros((p.shape[0], d, 1)), np.zeros((p.shape[0], d, nz, 1))
+        self._evaluate(z, p, lanes, g, gz)
+        # An equation that holds wherever the dofs are (a memory at rest) says nothing: its dof
+        # stays at its guess.
+        own = np.flatnonzero(self.resting)
+        silent = (np.abs(gz[:, own][:, :, values, 0]).max(axis=2, initial=0.0) == 0.0) & (
+            g[:, own, 0] == 0.0
+        )
+        status = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
+        for lane in lanes:
+            free = ~silent[lane]
+            status[lane] = self._solve(z[lane, :, 0], p[lane], own[free], values[free])
+        return z, z_p, silent, status
 
     def _evaluate(self, z: Array, p: Array, lanes: Integers, g: Array, gz: Array) -> None:
         with np.errstate(all="ignore"):

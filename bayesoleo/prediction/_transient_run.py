@@ -254,10 +254,10 @@ class TransientRun(RunPredictor):
         """Outputs at constants ``p (np,)``; without an anchor from the start, and none is set."""
         if not self.kernels.derived.dofs or self.anchor is not None:
             return self.predict(p[None])
-        start = self.initial(p[None])
-        if start.status[0] != Status.CONVERGED.value:
-            return self._failed(Status(int(start.status[0])))
-        solution = self._first(p, start.state[0])
+        state, status = self.initial.states(p[None])
+        if status[0] != Status.CONVERGED.value:
+            return self._failed(Status(int(status[0])))
+        solution = self._first(p, state[0])
         if isinstance(solution, Status):
             return self._failed(solution)
         return self._at_samples(p[None], solution.x, None, solution.status, derivatives=False)
@@ -380,11 +380,11 @@ class TransientRun(RunPredictor):
             shape = (p.shape[0], self.steps, self.scheme.width)
             failed = np.full(p.shape[0], Status.NO_CONVERGENCE.value, dtype=np.int64)
             return Solution(np.full(shape, np.nan), failed, np.zeros(p.shape[0], dtype=np.int64))
-        start = self.initial(p)
+        state, status = self.initial.states(p)
         x = self.anchor.predict(p[:, self.active] - self.anchor.p[self.active])
-        x[:, 0, : self.scheme.state_size] = start.state
-        found = Solution(x, start.status.copy(), np.zeros(p.shape[0], dtype=np.int64))
-        good = start.status == Status.CONVERGED.value
+        x[:, 0, : self.scheme.state_size] = state
+        found = Solution(x, status.copy(), np.zeros(p.shape[0], dtype=np.int64))
+        good = status == Status.CONVERGED.value
         solution = solve_transient(self.boundary, p[good], x[good])
         found.x[good], found.status[good] = solution.x, solution.status
         found.iterations[good] = solution.iterations

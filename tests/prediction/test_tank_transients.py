@@ -64,3 +64,17 @@ def test_a_run_that_begins_like_another_has_the_solution_of_its_own_start(factor
     own, other = (made.simulate(np.ones((1, 1)), 0).y[0, 0] for made in (alone, begun))
     # Two meshes: what either leaves of the solution.
     np.testing.assert_allclose(other, own, rtol=1e-5, atol=1e-5 * np.abs(own).max())
+
+
+def test_solutions_ask_for_no_slopes_of_where_they_rest(monkeypatch):
+    """States and statuses without derivatives are those with them, failures included."""
+    made = predictor(1.0)
+    made.set_anchor(np.ones(1))
+    run, p = made.runs[0], np.array([[0.9], [1.1], [np.nan], [0.0]])
+    start, (state, status) = run.initial(p), run.initial.states(p)
+    np.testing.assert_array_equal(state, start.state)
+    np.testing.assert_array_equal(status, start.status)
+    assert (status == Status.CONVERGED.value).sum() == 2
+    expected = run.predict(p[:2])
+    monkeypatch.setattr(type(run.initial), "_equilibrium", None)
+    np.testing.assert_array_equal(run.predict(p[:2]).y, expected.y)
