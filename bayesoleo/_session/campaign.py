@@ -348,7 +348,7 @@ class CampaignWork:
         return predict(tree, reduced, **given)
 
     def explain(self, out: Any, callback: Say) -> tuple[CampaignSearch, xr.DataTree]:
-        """The closed loop without its posterior; it begins with the estimate, where there is one."""
+        """The closed loop without its posterior; it begins with an estimate that was made."""
         output, stages = ResultFolder.checked(out), Stages(callback)
         with output.alone():
             loop, questions = search(
