@@ -372,6 +372,7 @@ def _content(
             "lines": structures.section(summary),
             "table": structures.table(summary),
             "parameters": structures.parameters(summary),
+            "withheld": structures.withheld(summary),
         },
         "extended": sentences.added(summary),
         "unfinished": [*sentences.unfinished(summary), *drawing.failed],

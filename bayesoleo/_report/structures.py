@@ -20,6 +20,10 @@ LIKELY = 0.5
 #: Probability of something outside from which on no effect is named without it.
 NEARLY_SURE = 0.95
 NOTHING, OUTSIDE = "nothing missing", "something outside the catalogue"
+#: Estimates beside which averages over structures stand.
+COMPARED = ("declared", "final")
+#: Instead of an interval that is withheld; standard deviations in an interval of 90 %.
+NOT_STATED, _WIDTH = "determined poorly", 3.29
 #: Structures of the table that are shown before the others are asked for.
 LEAD = 6
 
@@ -230,15 +234,20 @@ def parameters(summary: Mapping[str, Any]) -> Table | None:
     rows = []
     for parameter, one in found["parameters"].items():
         average = one["averaged"]
-        scale = engineering(one["unit"], abs(average["mean"]))
-        cells = [_with_sd(one[key], scale) for key in ("declared", "final")]
-        # A mean may lie outside the interval, where an improbable structure is far off.
+        # A mean may lie outside the interval, where an improbable structure is far off, and may be
+        # too large for a number.
         middle = average.get("median", average["mean"])
-        cells.append(format_number(scale.factor * middle, scale.factor * average["sd"]))
-        low, high = (
-            format_number(scale.factor * end, scale.factor * average["sd"])
-            for end in average["interval"]
-        )
+        numbers = [average["mean"], middle, *(one[k]["mean"] for k in COMPARED if one[k]), 0.0]
+        size = abs(next(value for value in numbers if value is not None))
+        scale = engineering(one["unit"], size)
+        cells = [_with_sd(one[key], scale) for key in COMPARED]
+        if average["interval"] is None:
+            rows.append([parameter, *cells, "–", NOT_STATED, scale.unit])
+            continue
+        low, high = (scale.factor * end for end in average["interval"])
+        sd = (high - low) / _WIDTH if average["sd"] is None else scale.factor * average["sd"]
+        cells.append(format_number(scale.factor * middle, sd))
+        low, high = (format_number(end, sd) for end in (low, high))
         rows.append([parameter, *cells, f"{low} … {high}", scale.unit])
     head = [
         "parameter",
@@ -249,6 +258,16 @@ def parameters(summary: Mapping[str, Any]) -> Table | None:
         "unit",
     ]
     return Table(head, rows)
+
+
+def withheld(summary: Mapping[str, Any]) -> str:
+    """Why the averages of some parameters are not stated, as sentences; empty where all are."""
+    found = known(summary) or {}
+    reasons: dict[str, list[str]] = {}
+    for parameter, one in (found.get("parameters") or {}).items():
+        if reason := one["averaged"].get("reason"):
+            reasons.setdefault(reason, []).append(parameter)
+    return " ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items())
 
 
 def _with_sd(estimate: Mapping[str, Any] | None, scale: Scale) -> str:

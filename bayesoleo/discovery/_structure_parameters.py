@@ -8,7 +8,8 @@ the structures' probabilities, is the posterior of a parameter given any structu
 
 A density is normal in the parameter, or in its logarithm where its prior has nothing below zero,
 and lies within the limits of the priors
-(:mod:`bayesoleo.discovery._limited_parameters`).
+(:mod:`bayesoleo.discovery._limited_parameters`). This holds near the estimate only. A parameter
+that the data determine poorly ranges far from it, and nothing is stated of one in most structures.
 
 References
 ----------
@@ -26,7 +27,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtri
 from scipy.stats import qmc
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._limited_parameters import ROUGH, STEPS, Coordinates, powers
@@ -52,6 +53,12 @@ from bayesoleo.discovery._structures import AveragedParameter, Structure
 
 #: Structures less probable than this, and parts of a mixture lighter than this, are left out.
 LEAST, LIGHTEST = 0.005, 1e-4
+#: Part of the probability in which a parameter may be determined poorly, and still be averaged.
+UNANSWERED = 0.1
+POORLY = (
+    "The data determine this parameter poorly, so that no interval is stated: sample the posterior"
+    " (`sample`)."
+)
 #: Nodes of a normal density in one dimension, in each of two, and in all of more; and how many
 #: standard deviations they reach.
 NODES, REACH = (61, 31, 1024), 6.0
@@ -96,17 +103,27 @@ def averaged(
         is that of each run with equal weight.
     """
     parts: dict[str, list[Mixture]] = {name: [] for name in names}
+    poorly, total = dict.fromkeys(names, 0.0), 0.0
     for structure in structures:
         key = frozenset(structure.effects), structure.outside
         if structure.probability < LEAST or key not in anchors:
             continue
         known = _Structure.of(structure, anchors[key], comparison, columns)
-        every = known.mixtures(anchors[key].fit)
+        normals = known.normals()
+        every, poor = known.mixtures(anchors[key].fit, normals), known.poorly(normals)
+        total += structure.probability if every else 0.0
         for name in names if every else ():
             own = [k for k, other in enumerate(known.names) if name == other]
             own = own or [k for k, n in enumerate(known.names) if n.split("[")[0] == name]
             parts[name] += [every[k].scaled(structure.probability / len(own)) for k in own]
-    return {name: Mixture.of(found).summary() for name, found in parts.items() if found}
+            poorly[name] += structure.probability * float(poor[own].any())
+    return {
+        name: Mixture.of(found).summary()
+        if poorly[name] <= UNANSWERED * total
+        else AveragedParameter.withheld(POORLY)
+        for name, found in parts.items()
+        if found
+    }
 
 
 @dataclass(frozen=True)
@@ -193,15 +210,19 @@ class _Structure:
             Likelihood(comparison.variance.size, comparison.freedom),
         )
 
-    def mixtures(self, fit: ModelFit | None = None) -> list[Mixture]:
+    def mixtures(
+        self, fit: ModelFit | None = None, normals: Sequence[_Normal] | None = None
+    ) -> list[Mixture]:
         """Posterior of each parameter; none if all of it lies outside the limits.
 
         Parameters
         ----------
         fit : ModelFit, optional
             Of the anchor, by which coordinates are chosen of what is known poorly.
+        normals : sequence, optional
+            Those of :meth:`normals`, where they are known.
         """
-        normals, coordinates = self.normals(), self.coordinates
+        normals, coordinates = normals or self.normals(), self.coordinates
         if fit is not None:
             coordinates = replace(coordinates, power=powers(fit, self.names, self._shift(normals)))
         found, logs = [list[Mixture]() for _ in self.names], list[float]()
@@ -228,12 +249,18 @@ class _Structure:
             for own in found
         ]
 
+    def poorly(self, normals: Sequence[_Normal]) -> Flags:
+        """Parameters (l,) that range far from their estimates, where the model need not be linear:
+        by a part of themselves and of what their priors allow."""
+        mean, sd = _moments(normals)
+        logarithmic = self.coordinates.logarithmic
+        of_prior = np.where(logarithmic, sd, sd / self.coordinates.spread)
+        return np.asarray((of_prior > ROUGH) & (logarithmic | (sd > ROUGH * np.abs(mean))))
+
     def _shift(self, normals: Sequence[_Normal]) -> Array:
         """How far the posterior of each logarithm that is known poorly lies, or reaches, from the
         estimate (l,); zero for the others."""
-        weight = np.array([part.weight for part in normals])
-        mean = weight @ np.array([part.mean for part in normals]) / weight.sum()
-        sd = np.sqrt(weight @ np.array([part.sd**2 for part in normals]) / weight.sum())
+        mean, sd = _moments(normals)
         away = mean - self.theta
         reach = np.maximum(np.abs(away), sd)
         # By as much as of a parameter that outputs are linear in.
@@ -304,6 +331,14 @@ class _Structure:
         stated = np.where(np.arange(precision.size) < self.offset.size, noise, 1.0)
         _, covariance, mean = solved(stated * precision)
         return float(log), mean, covariance, noise
+
+
+def _moments(normals: Sequence[_Normal]) -> tuple[Array, Array]:
+    """Means and deviations (l,) of all parts together, but for the differences of their means."""
+    weight = np.array([part.weight for part in normals])
+    mean = weight @ np.array([part.mean for part in normals]) / weight.sum()
+    sd = np.sqrt(weight @ np.array([part.sd**2 for part in normals]) / weight.sum())
+    return mean, sd
 
 
 def _by_side(

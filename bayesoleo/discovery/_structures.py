@@ -175,19 +175,27 @@ class AveragedParameter:
 
     Parameters
     ----------
-    mean, sd : float
+    mean, sd : float or None
         SI. A structure that is improbable but far off may draw the mean out of the interval.
-    low, high : float
+    low, high : float or None
         Ends of the central 90 % interval, SI.
-    median : float
+    median : float or None
         SI; always within the interval.
+    reason : str
+        Why no figures are stated, all of them being None; empty where they are.
     """
 
-    mean: float
-    sd: float
-    low: float
-    high: float
-    median: float
+    mean: float | None
+    sd: float | None
+    low: float | None
+    high: float | None
+    median: float | None
+    reason: str = ""
+
+    @classmethod
+    def withheld(cls, reason: str) -> AveragedParameter:
+        """Without figures."""
+        return cls(None, None, None, None, None, reason)
 
 
 @dataclass(frozen=True)

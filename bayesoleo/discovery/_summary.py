@@ -173,8 +173,9 @@ def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
         entries[name]["averaged"] = {
             "mean": one.mean,
             "sd": one.sd,
-            "interval": [one.low, one.high],
+            "interval": None if one.reason else [one.low, one.high],
             "median": one.median,
+            **({"reason": one.reason} if one.reason else {}),
         }
     return entries
 

@@ -257,6 +257,31 @@ def test_averaged_parameters_stand_beside_the_estimates():
     assert interval == "1.480 … 1.521"
 
 
+def test_averages_that_are_withheld_say_why():
+    reason = "The data determine this parameter poorly."
+    none = {"mean": None, "sd": None, "interval": None, "median": None, "reason": reason}
+    one = {
+        "unit": "N/m",
+        "declared": {"mean": 1520.0, "sd": 900.0},
+        "final": None,
+        "averaged": none,
+    }
+    summary = {"structures": {"parameters": {"stiffness": one, "slope": {**one, "declared": None}}}}
+    table = structures.parameters(summary)
+    assert table is not None
+    assert table.rows[0] == ["stiffness", "1.52 ± 0.9", "–", "–", "determined poorly", "kN/m"]
+    assert table.rows[1][1:5] == ["–", "–", "–", "determined poorly"]
+    assert structures.withheld(summary) == f"stiffness, slope: {reason}"
+
+
+def test_a_mean_too_large_for_a_number_leaves_the_interval():
+    averaged = {"mean": None, "sd": None, "interval": [100.0, 9e5], "median": 1.1e4}
+    one = {"unit": "s/m", "declared": None, "final": None, "averaged": averaged}
+    table = structures.parameters({"structures": {"parameters": {"slope": one}}})
+    assert table is not None
+    assert table.rows[0][4].endswith("900000")
+
+
 def test_results_without_averages_have_no_table_of_them():
     assert structures.parameters({"structures": {"nothing": 1.0}}) is None
     assert structures.parameters({}) is None
