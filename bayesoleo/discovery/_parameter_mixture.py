@@ -14,6 +14,8 @@ from bayesoleo.discovery._structures import AveragedParameter
 
 #: Tail outside a central interval of 90 %, on each side.
 TAIL = 0.05
+#: Points that stand for a density.
+POINTS = 128
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,41 @@ class Mixture:
         first = np.where(self.logarithmic, grown, self.mean)
         return first, np.where(self.logarithmic, wide, self.sd**2)
 
+    def values(self) -> tuple[Array, Array]:
+        """Weights and values of points that stand for all parts."""
+        scores = ndtri((np.arange(POINTS) + 0.5) / POINTS)
+        scores = scores if self.sd.any() else scores[:1]  # draws stand for themselves
+        places = self.mean[:, None] + self.sd[:, None] * scores
+        flags = np.broadcast_to(self.logarithmic[:, None], places.shape)
+        with np.errstate(over="ignore"):
+            places = np.where(flags, np.exp(np.where(flags, places, 0.0)), places)
+        weights = np.broadcast_to(self.weight[:, None] / scores.size, places.shape)
+        return weights.ravel(), places.ravel()
+
+    def changed(self, plain: Mixture, values: Array) -> Mixture:
+        """What becomes of it by the change that turns another mixture into values (n,) of equal
+        probability: each quantile of the other turns into one of the values."""
+        weight, place = plain.values()
+        order = np.argsort(place)
+        weight, place = weight[order] / weight.sum(), place[order]
+        own, here = self.values()
+        level = np.interp(here, place, np.cumsum(weight) - 0.5 * weight)
+        return part_of(own, np.quantile(values, np.clip(level, 0.0, 1.0)), 0.0, False)
+
     def quantile(self, chance: float) -> float:
         """Value below which the parameter lies with a probability."""
+        if not self.weight.all():
+            kept = self.weight > 0.0
+            parts = self.weight[kept], self.mean[kept], self.sd[kept], self.logarithmic[kept]
+            return Mixture(*parts).quantile(chance)
         ends = self.mean + self.sd * float(ndtri(chance))
         ends = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, ends, 0.0)), ends)
         low, high = float(ends.min()), float(ends.max())
         if not low < high:
             return low
         # Parameters range over twelve decades, and so do some that are known to a decade only.
-        stretched = bool(self.logarithmic.all())
+        # Within one, a straight scale has all digits.
+        stretched = bool(self.logarithmic.all()) or (low > 0.0 and high > 10.0 * low)
 
         def at(part: float) -> float:
             if stretched:
