@@ -24,15 +24,17 @@ Cox (1964), *Journal of the Royal Statistical Society B* 26(2), eq. 1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr, ndtri
+from scipy.special import logsumexp, ndtr, ndtri
 from scipy.stats import qmc
 
-from bayesoleo._types import Array, Flags
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.estimation._problem import Evaluation, undisturbed
 from bayesoleo.estimation._sensitivity import quantile
@@ -126,6 +128,32 @@ class Coordinates:
         own = poor & ~np.array([kind in (Normal, Correlated) for kind in kinds]) & ~np.array(exact)
         return np.asarray(own | reached)
 
+    def of_some(self, chosen: Integers) -> Coordinates:
+        """Those of some parameters."""
+        return Coordinates(
+            tuple(self.priors[k] for k in chosen),
+            self.theta[chosen],
+            self.logarithmic[chosen],
+            self.centre[chosen],
+            self.spread[chosen],
+            self.power[chosen],
+        )
+
+    def log_ratio(self, mean: Array, covariance: Array, count: int) -> float:
+        """Logarithm of the evidence under the priors over that with their normal parts, by the
+        coordinates' posterior with the latter."""
+        sd = np.sqrt(np.diag(covariance))
+        taken, total = self.rough(mean, sd), 0.0
+        if taken.any():
+            total = float(logsumexp(self.draws(mean, covariance, count)[1]) - np.log(count))
+        for k, prior in enumerate(self.priors):
+            if taken[k] or _kind(prior) is Correlated:
+                continue
+            away = (mean[k] - self.centre[k]) / self.spread[k]
+            normal = -0.5 * away**2 - np.log(self.spread[k] * np.sqrt(2 * np.pi))
+            total += float(self.log_prior(k, np.array([mean[k]]))[0] - normal)
+        return total
+
     def draws(self, mean: Array, covariance: Array, count: int) -> tuple[Array, Array]:
         """Draws under the priors themselves.
 
@@ -176,7 +204,7 @@ class Coordinates:
             log += part
         place = np.empty_like(away)
         place[:, order] = mean[order] + sd[order] * away
-        found = [self._parameter(k, values) for k, values in enumerate(place.T)]
+        found = [self.parameter(k, values) for k, values in enumerate(place.T)]
         return np.stack(found, axis=1), log
 
     def _drawn(self, k: int, centre: Array, sd: float, uniform: Array) -> tuple[Array, Array]:
@@ -188,23 +216,22 @@ class Coordinates:
         grid = np.sort(
             np.concatenate([own, np.broadcast_to(places, (len(own), places.size))], axis=1), axis=1
         )
-        logs = -0.5 * ((grid - centre[:, None]) / sd) ** 2 + self._log_prior(k, grid)
+        logs = -0.5 * ((grid - centre[:, None]) / sd) ** 2 + self.log_prior(k, grid)
         logs = np.where(np.isnan(logs), -np.inf, logs)
         return _by_cells(grid, logs, uniform, np.log(sd * np.sqrt(2 * np.pi)))
 
     def _places(self, k: int) -> Array:
         """Coordinates at which a prior changes, from the lowest to the highest, in rising order."""
         prior = self.priors[k]
-        parts = ndtr(np.linspace(-REACH, REACH, PLACES))
-        values = np.asarray(quantile(prior, parts))
+        values = _quantiles(prior)
         ends = [end for end in prior.support if np.isfinite(end)]
         if self.logarithmic[k]:
             ends = [end for end in ends if end > 0.0]
-        return np.unique(self._coordinate(k, np.concatenate([values, ends])))
+        return np.unique(self.coordinate(k, np.concatenate([values, ends])))
 
-    def _log_prior(self, k: int, place: Array) -> Array:
+    def log_prior(self, k: int, place: Array) -> Array:
         """Logarithm of the density of a prior over its coordinate, any shape."""
-        prior, value = self.priors[k], self._parameter(k, place)
+        prior, value = self.priors[k], self.parameter(k, place)
         if _kind(prior) is Correlated:  # its density is in the precision, its limits are not
             low, high = prior.support
             return np.where((value >= low) & (value <= high), 0.0, -np.inf)
@@ -217,7 +244,7 @@ class Coordinates:
             ratio = np.log(np.maximum(value, _TINY)) - np.log(self.theta[k])
             return np.asarray(log + np.log(self.theta[k]) + (1.0 - self.power[k]) * ratio)
 
-    def _parameter(self, k: int, place: Array) -> Array:
+    def parameter(self, k: int, place: Array) -> Array:
         """A parameter at coordinates, any shape."""
         if not self.logarithmic[k]:
             return place
@@ -228,13 +255,30 @@ class Coordinates:
             grown = np.maximum(1.0 + power * away, _TINY)
             return np.asarray(self.theta[k] * grown ** (1.0 / power))
 
-    def _coordinate(self, k: int, value: Array) -> Array:
+    def coordinate(self, k: int, value: Array) -> Array:
         """A coordinate of parameters, any shape."""
         if not self.logarithmic[k]:
             return value
         power, log = self.power[k], np.log(value / self.theta[k])
         bent = log if abs(power) < _ZERO else np.expm1(power * log) / power
         return np.asarray(self.place[k] + bent)
+
+    def parameters(self, place: Array) -> Array:
+        """Parameters (l,) at coordinates (l,)."""
+        power, away = self.power, place - self.place
+        with np.errstate(over="ignore", invalid="ignore"):
+            flat = np.abs(power) < _ZERO
+            grown = np.maximum(1.0 + power * away, _TINY) ** (1.0 / np.where(flat, 1.0, power))
+            factor = np.where(flat, np.exp(np.where(self.logarithmic, away, 0.0)), grown)
+        return np.where(self.logarithmic, self.theta * factor, place)
+
+    def moves(self, value: Array) -> Array:
+        """Coordinates (l,) of parameters (l,) less those about which outputs were linearised."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log = np.log(np.where(self.logarithmic, value, 1.0) / self.theta)
+            flat = np.abs(self.power) < _ZERO
+            bent = np.expm1(self.power * log) / np.where(flat, 1.0, self.power)
+        return np.where(self.logarithmic, np.where(flat, log, bent), value - self.theta)
 
 
 def _by_cells(grid: Array, logs: Array, uniform: Array, unit: float) -> tuple[Array, Array]:
@@ -260,6 +304,21 @@ def _by_cells(grid: Array, logs: Array, uniform: Array, unit: float) -> tuple[Ar
         total = top[:, 0] + np.log(sums[:, -1]) - unit
     drawn = grid[row, cell] + np.clip(share, 0.0, 1.0) * (grid[row, cell + 1] - grid[row, cell])
     return drawn, total
+
+
+def _quantiles(prior: Prior) -> Array:
+    """Values of a prior at even normal scores; of some priors they are those of draws, and are
+    therefore kept."""
+    return _kept_quantiles(prior) if isinstance(prior, Hashable) else _quantiles_of(prior)
+
+
+def _quantiles_of(prior: Prior) -> Array:
+    return np.asarray(quantile(prior, ndtr(np.linspace(-REACH, REACH, PLACES))))
+
+
+@lru_cache(maxsize=64)
+def _kept_quantiles(prior: Hashable) -> Array:
+    return _quantiles_of(cast(Prior, prior))
 
 
 def _kind(prior: Prior) -> type:

@@ -271,6 +271,16 @@ class EstimatedModel:
     effects: Mapping[Added, tuple[str, ...]]
     shapes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
+    @property
+    def amplitudes(self) -> list[int]:
+        """Numbers of the amplitudes among the unknowns, effect by effect."""
+        return [
+            k
+            for names in self.effects.values()
+            for k, name in enumerate(self.fit.problem.names)
+            if name.split("[")[0] in names
+        ]
+
 
 @dataclass(frozen=True)
 class LinearisedModel:
@@ -310,12 +320,7 @@ def linearised(anchor: EstimatedModel, data: SpectralData) -> LinearisedModel:
     problem, theta = fit.problem, fit.point.theta
     place = [fit.predictor.layout.names.index(name) for name in problem.names]
     rows = data.columns([p.sensitivity[:, place] for p in fit.predictions])
-    amplitudes = [
-        k
-        for names in anchor.effects.values()
-        for k, name in enumerate(problem.names)
-        if name.split("[")[0] in names
-    ]
+    amplitudes = anchor.amplitudes
     rest = [k for k in range(len(problem.names)) if k not in amplitudes]
     scale = PriorScale.of(problem.priors, problem.names)
     precision = (scale.root.T @ scale.root)[np.ix_(rest, rest)]

@@ -1,4 +1,4 @@
-"""Parameters of the declared model, averaged over structures.
+"""Parameters given a structure, by outputs linearised about an estimate.
 
 About an estimate a structure gives a normal density of all unknowns for each size of its effects
 and each remainder outside the catalogue, times the square of each effect's amplitude: the moment
@@ -8,8 +8,8 @@ the structures' probabilities, is the posterior of a parameter given any structu
 
 A density is normal in the parameter, or in its logarithm where its prior has nothing below zero,
 and lies within the limits of the priors
-(:mod:`bayesoleo.discovery._limited_parameters`). This holds near the estimate only. A parameter
-that the data determine poorly ranges far from it, and nothing is stated of one in most structures.
+(:mod:`bayesoleo.discovery._limited_parameters`). This holds near the estimate only: a parameter
+that the data determine poorly ranges far from it.
 
 References
 ----------
@@ -18,7 +18,7 @@ Hoeting, Madigan, Raftery and Volinsky (1999), *Statistical Science* 14(4), eq. 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -32,8 +32,9 @@ from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._limited_parameters import ROUGH, STEPS, Coordinates, powers
 from bayesoleo.discovery._parameter_mixture import Mixture, part_of
-from bayesoleo.discovery._spectral_data import EstimatedModel, linearised
+from bayesoleo.discovery._spectral_data import EstimatedModel, LinearisedModel, linearised
 from bayesoleo.discovery._structure_columns import (
+    Covariances,
     Group,
     Likelihood,
     Reduced,
@@ -49,21 +50,21 @@ from bayesoleo.discovery._structure_comparison import (
     own_groups,
     visible,
 )
-from bayesoleo.discovery._structures import AveragedParameter, Structure
+from bayesoleo.discovery._structures import Structure
 
-#: Structures less probable than this, and parts of a mixture lighter than this, are left out.
-LEAST, LIGHTEST = 0.005, 1e-4
-#: Part of the probability in which a parameter may be determined poorly, and still be averaged.
-UNANSWERED = 0.1
-POORLY = (
-    "The data determine this parameter poorly, so that no interval is stated: sample the posterior"
-    " (`sample`)."
-)
+#: Parts of a mixture lighter than this are left out.
+LIGHTEST = 1e-4
 #: Nodes of a normal density in one dimension, in each of two, and in all of more; and how many
 #: standard deviations they reach.
 NODES, REACH = (61, 31, 1024), 6.0
 #: Draws of a part of a posterior that reaches a limit: of one heavier than the last, and of others.
 MANY, FEW, HEAVY = 4096, 256, 0.05
+#: Draws that correct the evidence of one value of a parameter for the priors of the others.
+FEWEST = 128
+
+
+#: A pattern of the covariance, the variance of a law or None, their weight, sizes of the effects.
+Cell = tuple[int, float | None, float, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -81,53 +82,125 @@ class _Normal:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
-def averaged(
-    structures: Sequence[Structure],
-    anchors: Mapping[tuple[frozenset[Added], bool], EstimatedModel],
-    comparison: Comparison,
-    columns: Columns,
-    names: Sequence[str],
-) -> dict[str, AveragedParameter]:
-    """Mixtures over structures.
+@dataclass(frozen=True)
+class Frame:
+    """What a structure has about whatever vector its anchor's outputs are linearised.
 
     Parameters
     ----------
-    structures : sequence of Structure
-    anchors : mapping of (effects, outside) to EstimatedModel
-        The model about which each structure was compared.
+    structure : Structure
+    anchor : EstimatedModel
     comparison : Comparison
-    columns : Columns
-        Of all candidates.
-    names : sequence of str
-        Parameters of the declared model. Where a structure lets one differ between runs, its value
-        is that of each run with equal weight.
+    unit : ndarray, shape (k,)
+        Factors of the columns of the anchor's own effects.
+    more, law : ndarray, shape (m, n)
+        Columns of other effects as scored, and of a law outside the catalogue.
+    effects : tuple of Group
+        Columns of each effect among those of all.
+    covariances : Covariances
+    parts, sizes
+        As of :class:`GivenStructure`.
+    factors : ndarray, optional
+        By which columns of effects grow so that what can be seen of them has unit size; by default
+        those about the same vector.
     """
-    parts: dict[str, list[Mixture]] = {name: [] for name in names}
-    poorly, total = dict.fromkeys(names, 0.0), 0.0
-    for structure in structures:
-        key = frozenset(structure.effects), structure.outside
-        if structure.probability < LEAST or key not in anchors:
-            continue
-        known = _Structure.of(structure, anchors[key], comparison, columns)
-        normals = known.normals()
-        every, poor = known.mixtures(anchors[key].fit, normals), known.poorly(normals)
-        total += structure.probability if every else 0.0
-        for name in names if every else ():
-            own = [k for k, other in enumerate(known.names) if name == other]
-            own = own or [k for k, n in enumerate(known.names) if n.split("[")[0] == name]
-            parts[name] += [every[k].scaled(structure.probability / len(own)) for k in own]
-            poorly[name] += structure.probability * float(poor[own].any())
-    return {
-        name: Mixture.of(found).summary()
-        if poorly[name] <= UNANSWERED * total
-        else AveragedParameter.withheld(POORLY)
-        for name, found in parts.items()
-        if found
-    }
+
+    structure: Structure
+    anchor: EstimatedModel
+    comparison: Comparison
+    unit: Array
+    more: Array
+    law: Array
+    effects: tuple[Group, ...]
+    covariances: Covariances
+    parts: Sequence[tuple[int, float | None, float]]
+    sizes: Array
+    factors: Array | None = None
+
+    @classmethod
+    def of(
+        cls,
+        structure: Structure,
+        anchor: EstimatedModel,
+        comparison: Comparison,
+        columns: Columns,
+        here: LinearisedModel,
+    ) -> Frame:
+        """About an anchor, linearised at its estimate."""
+        keys = [key for key in structure.effects if key not in anchor.effects]
+        groups = [_best_group(columns, key, here.residual, comparison.variance) for key in keys]
+        more = [columns.rows[list(group.columns)] for group in groups]
+        remainders, sizes = grids_of(comparison, comparison.data.signal(anchor.fit))
+        outside = [
+            (k, None if j is None else float(remainders.laws[j] ** 2), weight)
+            for k, j, weight in remainders.weights[1:]
+        ]
+        return cls(
+            structure,
+            anchor,
+            comparison,
+            comparison.unit(here.own),
+            np.concatenate([columns.law[:0], *more]),
+            columns.law if structure.outside else columns.law[:0],
+            in_a_row([*own_groups(anchor, comparison), *groups], 0),
+            remainders.covariances,
+            outside if structure.outside else [(0, None, 1.0)],
+            fewer(sizes),
+        )
+
+    def about(self, here: LinearisedModel, patterns: int | None = None) -> GivenStructure:
+        """The structure about a vector of unknowns, with the first patterns of the covariance."""
+        products, logs, offset = self._products(here, patterns)
+        count, factors = len(here.names), self.factors
+        coordinates = Coordinates.of(
+            here.priors, here.theta, np.diag(here.change), here.offset[:count]
+        )
+        if factors is None:
+            factors = self._factors(products, logs, offset)
+        return GivenStructure(
+            here.names,
+            coordinates,
+            coordinates.place,
+            here.change / coordinates.slope[:, None],
+            products * factors[:, None] * factors,
+            logs,
+            in_a_row(self.effects, offset.size),
+            len(self.law),
+            offset,
+            self.parts,
+            self.sizes,
+            Likelihood(self.comparison.variance.size, self.comparison.freedom),
+        )
+
+    def fixed(self, here: LinearisedModel) -> Frame:
+        """The same with the factors of one vector wherever outputs are linearised: what is known of
+        an effect's size beforehand depends on no parameter."""
+        return replace(self, factors=self._factors(*self._products(here, 1)))
+
+    @property
+    def units(self) -> Array:
+        """Amplitudes (k,) of the anchor's effects by a unit of their coefficients, SI."""
+        assert self.factors is not None
+        first = self.factors.size - sum(map(len, (self.unit, self.more, self.law)))
+        return np.asarray(self.unit * self.factors[first : first + self.unit.size])
+
+    def _products(self, here: LinearisedModel, patterns: int | None) -> tuple[Array, Array, Array]:
+        """Products of the residual and all columns, log determinants, and centres of unknowns."""
+        shared = self.comparison.shared
+        unknowns = np.concatenate([here.unknowns, shared])
+        offset = np.concatenate([here.offset, np.zeros(len(shared))])
+        rows = [here.residual[None], unknowns, here.own * self.unit[:, None], self.more, self.law]
+        return *self.covariances.products(np.concatenate(rows), patterns), offset
+
+    def _factors(self, products: Array, logs: Array, offset: Array) -> Array:
+        """Factors of the residual and of all columns."""
+        reduced = Reduced.of(products, logs, offset.size, offset)
+        seen = visible(reduced, self.effects, self.comparison.data.samples)
+        return np.concatenate([np.ones(1 + offset.size), seen])
 
 
 @dataclass(frozen=True)
-class _Structure:
+class GivenStructure:
     """One structure about its anchor.
 
     Parameters
@@ -169,62 +242,27 @@ class _Structure:
     @classmethod
     def of(
         cls, structure: Structure, anchor: EstimatedModel, comparison: Comparison, columns: Columns
-    ) -> _Structure:
+    ) -> GivenStructure:
         """Columns of the anchor, and of the structure's other effects as scored."""
-        data, here = comparison.data, linearised(anchor, comparison.data)
-        more = [key for key in structure.effects if key not in anchor.effects]
-        groups = [_best_group(columns, key, here.residual, comparison.variance) for key in more]
-        own = here.own * comparison.unit(here.own)[:, None]
-        rows = [own, *(columns.rows[list(group.columns)] for group in groups)]
-        law = columns.law if structure.outside else columns.law[:0]
-        unknowns = np.concatenate([here.unknowns, comparison.shared])
-        offset = np.concatenate([here.offset, np.zeros(len(comparison.shared))])
-        remainders, sizes = grids_of(comparison, data.signal(anchor.fit))
-        every = np.concatenate([here.residual[None], unknowns, *rows, law])
-        products, logs = remainders.covariances.products(every)
-        effects = in_a_row([*own_groups(anchor, comparison), *groups], 0)
-        count = len(here.names)
-        coordinates = Coordinates.of(
-            here.priors, here.theta, np.diag(here.change), here.offset[:count]
-        )
-        reduced = Reduced.of(products, logs, len(unknowns), offset)
-        factors = np.concatenate(
-            [np.ones(1 + len(unknowns)), visible(reduced, effects, data.samples)]
-        )
-        outside = [
-            (k, None if j is None else float(remainders.laws[j] ** 2), weight)
-            for k, j, weight in remainders.weights[1:]
-        ]
-        return cls(
-            here.names,
-            coordinates,
-            coordinates.place,
-            here.change / coordinates.slope[:, None],
-            products * factors[:, None] * factors,
-            logs,
-            in_a_row(effects, len(unknowns)),
-            len(law),
-            offset,
-            outside if structure.outside else [(0, None, 1.0)],
-            fewer(sizes),
-            Likelihood(comparison.variance.size, comparison.freedom),
-        )
+        here = linearised(anchor, comparison.data)
+        return Frame.of(structure, anchor, comparison, columns, here).about(here)
 
     def mixtures(
-        self, fit: ModelFit | None = None, normals: Sequence[_Normal] | None = None
+        self,
+        coordinates: Coordinates | None = None,
+        normals: Sequence[_Normal] | None = None,
     ) -> list[Mixture]:
         """Posterior of each parameter; none if all of it lies outside the limits.
 
         Parameters
         ----------
-        fit : ModelFit, optional
-            Of the anchor, by which coordinates are chosen of what is known poorly.
+        coordinates : Coordinates, optional
+            Those of :meth:`bent`.
         normals : sequence, optional
             Those of :meth:`normals`, where they are known.
         """
-        normals, coordinates = normals or self.normals(), self.coordinates
-        if fit is not None:
-            coordinates = replace(coordinates, power=powers(fit, self.names, self._shift(normals)))
+        normals = normals or self.normals()
+        coordinates = coordinates or self.coordinates
         found, logs = [list[Mixture]() for _ in self.names], list[float]()
         for part in normals:
             if coordinates.rough(part.mean, part.sd).any():
@@ -249,10 +287,13 @@ class _Structure:
             for own in found
         ]
 
-    def poorly(self, normals: Sequence[_Normal]) -> Flags:
+    def bent(self, fit: ModelFit, normals: Sequence[_Normal]) -> Coordinates:
+        """Coordinates in which outputs are linear of what is known poorly, by the anchor's fit."""
+        return replace(self.coordinates, power=powers(fit, self.names, self._shift(normals)))
+
+    def poorly(self, mean: Array, sd: Array) -> Flags:
         """Parameters (l,) that range far from their estimates, where the model need not be linear:
-        by a part of themselves and of what their priors allow."""
-        mean, sd = _moments(normals)
+        by a part of themselves and of what their priors allow; from the moments of all parts."""
         logarithmic = self.coordinates.logarithmic
         of_prior = np.where(logarithmic, sd, sd / self.coordinates.spread)
         return np.asarray((of_prior > ROUGH) & (logarithmic | (sd > ROUGH * np.abs(mean))))
@@ -260,7 +301,7 @@ class _Structure:
     def _shift(self, normals: Sequence[_Normal]) -> Array:
         """How far the posterior of each logarithm that is known poorly lies, or reaches, from the
         estimate (l,); zero for the others."""
-        mean, sd = _moments(normals)
+        mean, sd = moments(normals)
         away = mean - self.theta
         reach = np.maximum(np.abs(away), sd)
         # By as much as of a parameter that outputs are linear in.
@@ -270,7 +311,7 @@ class _Structure:
 
     def normals(self) -> list[_Normal]:
         """Normal densities by remainder, sizes and sides of the effects, with their weights."""
-        found = list(self._each())
+        found = list(self.each(self.cells()))
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(logs - logsumexp(logs))
         return [
@@ -286,18 +327,28 @@ class _Structure:
             return list(product(self.sizes, repeat=number))
         return [(size,) * number for size in self.sizes]
 
-    def _each(self) -> Iterator[tuple[float, Array, Array]]:
+    def cells(self) -> list[Cell]:
+        """All remainders and sizes of the effects."""
+        return [(*part, sizes) for part, sizes in product(self.parts, self._grid())]
+
+    def _precision(self, cell: Cell) -> tuple[Array, Array]:
+        """Variances of the effects' amplitudes, and precisions of all coefficients."""
+        counts = [len(group.columns) for group in self.effects]
+        power = moment_power(np.array(cell[3]), np.array(counts))
+        law = cell[1]
+        return power, np.concatenate([
+            np.ones(self.offset.size),
+            np.repeat(1.0 / power, counts),
+            np.full(0 if law is None else self.law, 1.0 if law is None else 1.0 / law),
+        ])  # fmt: skip
+
+    def each(self, cells: Sequence[Cell]) -> Iterator[tuple[float, Array, Array]]:
         """Log weight, means and covariances of the parameters' coordinates."""
         members = [k for group in self.effects for k in group.columns]
         count = len(self.names)
-        for (pattern, law, weight), sizes in product(self.parts, self._grid()):
-            counts = [len(group.columns) for group in self.effects]
-            power = moment_power(np.array(sizes), np.array(counts))
-            precision = np.concatenate([
-                np.ones(self.offset.size),
-                np.repeat(1.0 / power, counts),
-                np.full(0 if law is None else self.law, 1.0 if law is None else 1.0 / law),
-            ])  # fmt: skip
+        for cell in cells:
+            pattern, _, weight, _ = cell
+            power, precision = self._precision(cell)
             log, mean, covariance, noise = self._posterior(pattern, precision)
             inner, root = covariance[np.ix_(members, members)], np.sqrt(noise)
             follow = self.change @ covariance[:count, members] @ np.linalg.inv(inner)
@@ -308,6 +359,44 @@ class _Structure:
                 here = moved + root * follow @ shift
                 spread_out = noise * (rest + follow @ spread @ follow.T)
                 yield log + np.log(weight) + share, here, spread_out
+
+    def log_evidence(self, cells: Sequence[Cell], power: Array) -> tuple[float, Array, Array]:
+        """Log evidence of some remainders and sizes, under the priors themselves, with means and
+        deviations (l,) of the parameters' coordinates under their normal parts.
+
+        Parameters
+        ----------
+        cells : sequence of Cell
+        power : ndarray, shape (l,)
+            Of the coordinates in which outputs are linear.
+        """
+        found = list(self.each(cells))
+        logs = np.array([log for log, _, _ in found])
+        _, mean, covariance = found[int(np.argmax(logs))]
+        total, sd = float(logsumexp(logs)), np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if self.names:
+            total += replace(self.coordinates, power=power).log_ratio(mean, covariance, FEWEST)
+        return total, mean, sd
+
+    def expected(self, cell: Cell) -> tuple[Array, Array]:
+        """Means of all coefficients, and their covariance, given a remainder and sizes."""
+        _, mean, covariance, noise = self._posterior(cell[0], self._precision(cell)[1])
+        return mean, noise * covariance
+
+    def without(self, k: int) -> GivenStructure:
+        """The same where one parameter is held."""
+        rows = np.delete(np.arange(self.products.shape[1]), 1 + k)
+        rest = np.delete(np.arange(len(self.names)), k)
+        return replace(
+            self,
+            names=tuple(self.names[j] for j in rest),
+            coordinates=self.coordinates.of_some(rest),
+            theta=self.theta[rest],
+            change=self.change[np.ix_(rest, rest)],
+            products=self.products[:, rows[:, None], rows],
+            effects=in_a_row(self.effects, self.offset.size - 1),
+            offset=np.delete(self.offset, k),
+        )
 
     def _posterior(self, pattern: int, precision: Array) -> tuple[float, Array, Array, float]:
         """Log evidence, means and covariance of the columns' coefficients, the latter in units of
@@ -333,7 +422,7 @@ class _Structure:
         return float(log), mean, covariance, noise
 
 
-def _moments(normals: Sequence[_Normal]) -> tuple[Array, Array]:
+def moments(normals: Sequence[_Normal]) -> tuple[Array, Array]:
     """Means and deviations (l,) of all parts together, but for the differences of their means."""
     weight = np.array([part.weight for part in normals])
     mean = weight @ np.array([part.mean for part in normals]) / weight.sum()

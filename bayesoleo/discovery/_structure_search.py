@@ -23,6 +23,7 @@ from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Added, Assembly, Option
+from bayesoleo.discovery._averaged_parameters import averaged
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._nonparametric_quantities import (
@@ -44,7 +45,6 @@ from bayesoleo.discovery._structure_comparison import (
     best_alone,
     evidences_about,
 )
-from bayesoleo.discovery._structure_parameters import averaged
 from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
 from bayesoleo.effects._nonparametric import Axis, balance_places
 from bayesoleo.errors import ModelError

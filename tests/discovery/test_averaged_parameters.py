@@ -8,7 +8,7 @@ from scipy import stats
 
 from bayesoleo.discovery._limited_parameters import Coordinates
 from bayesoleo.discovery._structure_columns import Group, Likelihood
-from bayesoleo.discovery._structure_parameters import _Structure
+from bayesoleo.discovery._structure_parameters import GivenStructure
 from bayesoleo.model import Normal
 
 SAMPLES, SIZE = 400, 0.2
@@ -23,12 +23,12 @@ def columns(own: float, effects: int, seed: int) -> np.ndarray:
     return np.sqrt(SAMPLES) * np.array(rows)
 
 
-def of_residual(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]) -> _Structure:
+def of_residual(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]) -> GivenStructure:
     """About an estimate of zero, with a prior of unit deviation, under known noise."""
     every = np.concatenate([residual[None], rows])
     effects = tuple(Group((1 + k,), side) for k, side in enumerate(sides))
     gram = (every @ every.T)[None]
-    return _Structure(
+    return GivenStructure(
         ("theta",), STANDARD, np.zeros(1), np.eye(1), gram, np.zeros(1), effects, 0,
         np.zeros(1), [(0, None, 1.0)], np.array([SIZE]), Likelihood(SAMPLES, 1e12),
     )  # fmt: skip

@@ -66,6 +66,24 @@ def test_good_summaries_pass():
     assert json.loads(schema.summary_json(SUMMARY)) == SUMMARY
 
 
+def averaged(**entry):
+    prior = {"nothing": 0.5, "catalogue": 0.4, "outside": 0.1, "numbers": [1.0], "families": {}}
+    one = {"unit": "N/m", "declared": None, "final": None, "averaged": entry}
+    rest = {"nothing": 1.0, "outside": 0.0, "only_outside": 0.0, "effects": [], "classes": []}
+    structures = {"prior": prior, **rest, "list": [], "parameters": {"k": one}}
+    return {**SUMMARY, "structures": structures}
+
+
+def test_averages_may_be_withheld_with_a_reason():
+    none = {"mean": None, "sd": None, "interval": None, "median": None}
+    schema.validate_summary(averaged(**none, reason="The data determine it poorly."))
+    schema.validate_summary(averaged(mean=1.0, sd=0.1, interval=[0.8, 1.2], median=1.0))
+    with pytest.raises(ResultsError, match=r"averaged\.interval"):
+        schema.validate_summary(averaged(**none | {"interval": [1.0]}))
+    with pytest.raises(ResultsError, match=r"averaged\.reason"):
+        schema.validate_summary(averaged(**none, reason=3))
+
+
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
