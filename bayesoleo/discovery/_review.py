@@ -18,7 +18,7 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
-from bayesoleo.discovery._fit import Numerics, fit_model, for_comparison
+from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import (
@@ -32,7 +32,7 @@ from bayesoleo.discovery._refit import Refit, fall_from, records_of, refit, refi
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._state import fit_state, state_of
+from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -152,12 +152,7 @@ def _smaller(
     fitted = replace(roles, held_out=(), strategy="none")
     for step in steps:
         for result, gap in _close_rivals(progress, step):
-            # What is compared here is compared on steps that show no difference, as the rival was.
-            state = (
-                state_of(result.assembly, result.fit, fitted)
-                if result.fit.point.status.ok
-                else fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
-            )
+            state = fit_state(result.assembly, fitted, numerics, start=result.fit.point.theta)
             base = state.base()
             callback(f"test whether {result.score.option.key[0]} makes another effect superfluous")
             losses = [
@@ -258,17 +253,7 @@ def place_of(
     if len(less.steps) != len(final.assembly.steps) - 1:
         return None  # other effects change the terms of this one
     fitted = replace(roles, held_out=(), strategy="none")
-    # It is compared with others only: on the steps that show no difference of the final model, or
-    # finer ones where it needs them.
-    steps = for_comparison(final.fit).steps
-    fit = fit_model(
-        less.model(),
-        fitted.fitted,
-        replace(numerics, steps=steps),
-        check_mesh=False,
-        damped=bool(less.steps),
-    )
-    without = state_of(less, fit, fitted)
+    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
     if not all(np.isfinite(run.y).all() for run in without.fit.predictions):
         return None  # a run has no solution there, and nothing can be scored
     base = without.base()

@@ -10,7 +10,7 @@ import pytest
 from fitted_states import NUMERICS, options
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo.discovery import _fit as fits, _refit as refits, _review as review
+from bayesoleo.discovery import _refit as refits, _review as review
 from bayesoleo.discovery._alternatives import followed, leads_as_far
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import SearchOptions, close_loop, searched
@@ -156,26 +156,6 @@ def test_rivals_are_compared_with_the_estimate_that_the_final_model_has(tmp_path
     assert own.fall > max(rival.refit.fall for rival in place.rivals)
     assert own.excludes_null()
     assert not place.better
-
-
-def test_what_is_only_compared_is_estimated_once(tmp_path, monkeypatch):
-    """The final model without an effect stands at its optimum, and nobody asks what finer steps
-    would do; a rival that was estimated beside the others is not estimated again."""
-    roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
-    found = begun_with_two(added_first(roles, "cubic_stiffness"), roles)
-    step = found.state.assembly.steps[0]
-    fitted = replace(roles, held_out=(), strategy="none")
-    alone = fit_state(found.state.assembly.without(step), fitted, NUMERICS)
-    monkeypatch.setattr(fits, "_mesh_shift", lambda *_: pytest.fail("asked for finer steps"))
-    monkeypatch.setattr(review, "fit_state", lambda *_, **__: pytest.fail("estimated again"))
-    place = review.place_of(found, step, 0, roles, NUMERICS, EFFECTS)
-    np.testing.assert_allclose(place.base.fit.point.theta, alone.fit.point.theta, rtol=1e-6)
-    rival, asked = place.rivals[0].refit, []
-    assert rival.fit.point.status.ok
-    # So far behind that no other effect is superfluous beside it.
-    monkeypatch.setattr(review, "_close_rivals", lambda *_: [(rival, 1e12)])
-    assert review._smaller(found, roles, NUMERICS, asked.append) is found
-    assert len(asked) == 2
 
 
 @pytest.mark.parametrize(
