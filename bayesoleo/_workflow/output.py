@@ -156,8 +156,12 @@ class ResultFolder:
 
     @property
     def due(self) -> bool:
-        """Whether what goes on has been written so long ago that it is worth writing again."""
-        return time.monotonic() - self._written > OFTEN
+        """Whether what goes on has been written so long ago that it is worth writing again, or an
+        older result stands in its place."""
+        if self.folder is None:
+            return False
+        older = not self.begun and (self.folder / RESULTS).exists()
+        return older or time.monotonic() - self._written > OFTEN
 
     def finish(self) -> None:
         """Drop the older result, and what the search would go on from: the new one is complete."""
@@ -365,9 +369,9 @@ class _Files:
 def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | None:
     """The result as it was last written, with what failed since, and a report of it.
 
-    None where nothing was written, or that cannot be read.
+    None where this calculation has written nothing, or that cannot be read.
     """
-    if output.folder is None:
+    if output.folder is None or not output.begun:
         return None
     try:
         tree = read_tree(output.folder / RESULTS)

@@ -40,6 +40,9 @@ STRAY_POWER, STRAY_RATIO = 1e-5, 20.0
 LEFT, LEAST = 0.25, 0.05
 #: Samples at the end of a record that say how far a channel moves from one to the next.
 NEAR = 50
+#: Times as far as that it may move between two pieces of one record, and times as far as that it
+#: ranges where it moves: noise alone ranges less far than it changes.
+SEAM, MOVES = 3.0, 2.0
 #: Multiples of the declared period that are tried.
 LONGER = (2, 3)
 
@@ -260,26 +263,39 @@ def _about_pieces(records: Sequence[Record]) -> list[str]:
         else:
             chain.append(record)
     return [
-        f"{_runs([one.label for one in chain])} are pieces of one record: each goes on where"
-        " another one ends. A parameter that differs from run to run may stand for what changes"
-        " along it, such as the amplitude"
+        f"{_runs([one.label for one in chain])} seem to be pieces of one record: all but the first"
+        " go on where another one ends. A parameter that differs from run to run may then stand for"
+        " what changes along it, such as the amplitude"
         for chain in chains
         if len(chain) > 1
     ]
 
 
 def _goes_on(before: Record, after: Record) -> bool:
-    """Whether one transient's clock and all of its channels go on in another one."""
-    step = float(before.time[-1] - before.time[-2])
-    if before.periodic or after.periodic or not abs(after.time[0] - before.time[-1] - step) < step:
+    """Whether one transient's clock and all of its channels that move go on in another one."""
+    if before.periodic or after.periodic or min(before.time.size, after.time.size) < NEAR:
         return False
-    shared = [name for name in before.samples if name in after.samples]
-    moves = [
-        (abs(after.samples[name][0] - before.samples[name][-1]), np.abs(np.diff(ends)))
-        for name in shared
-        for ends in [before.samples[name][-NEAR:]]
-    ]
-    return bool(moves) and all(jump <= 3.0 * moved.max() for jump, moved in moves)
+    step = float(before.time[-1] - before.time[-2])
+    if not abs(after.time[0] - before.time[-1] - step) < step:
+        return False
+    jumps = [_jump(before, after, name) for name in before.samples if name in after.samples]
+    told = [jump for jump in jumps if jump is not None]
+    return bool(told) and max(told) <= SEAM
+
+
+def _jump(before: Record, after: Record, channel: str) -> float | None:
+    """Change of a channel between two records over its usual change between two samples there; None
+    where it rests, or shows noise only."""
+    first, last = (
+        one.samples[channel][slice(None) if one.kept is None else one.kept]
+        for one in (after, before)
+    )
+    if min(first.size, last.size) < NEAR:
+        return None
+    usual = float(np.quantile(np.abs(np.diff(last[-NEAR:])), 0.9))
+    if not usual > 0.0 or not np.std(last) > MOVES * usual:
+        return None
+    return float(abs(first[0] - last[-1]) / usual)
 
 
 def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[str]:

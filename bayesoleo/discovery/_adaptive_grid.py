@@ -84,7 +84,8 @@ def on_a_grid(
         log_evidence,
         tuple(max(side, key=lambda p: abs(p - centre)) if side else centre for side in sides),
     )
-    grid.add(centre)
+    if not np.isfinite(grid.add(centre)):
+        return None
     for side in sides:
         grid.outwards(side)
     while grid.place.size < MOST and (place := grid.next_place()) is not None:

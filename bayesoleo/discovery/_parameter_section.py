@@ -165,6 +165,8 @@ class Section:
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = coordinates.coordinate(k, scores)
         ends = ends[np.isfinite(ends)]
+        if not ends.size:
+            return None
         sides = [outwards(centre, mean, sign * sd, ends) for sign in (-1.0, 1.0)]
         if known_places:  # in another structure
             below = [place for place in known_places if place < centre]
@@ -212,7 +214,8 @@ class _Along:
         places[place] = there
         held = self._about(place, there).without(self.k)
         log, mean, sd = held.log_evidence(self.cells, np.delete(self.section.power, self.k))
-        self.others[place] = mean, sd
+        if np.isfinite(log):
+            self.others[place] = mean, sd
         return log
 
     def followed(self, grid: GridDensity) -> Followed:

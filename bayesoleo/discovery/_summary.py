@@ -29,6 +29,8 @@ from bayesoleo.posterior._diagnostics import Samples
 LISTED, MOST_LISTED, OF_A_CLASS, VISIBLE = 0.99, 20, 2, 0.01
 #: Standard deviations on either side of an estimate that hold 95 %.
 _BOUND = 1.96
+#: Draws for each of several parameters whose region is asked for.
+MANY = 10
 
 
 def summarise(
@@ -356,7 +358,11 @@ def _are_zero_together(state: State, names: Sequence[str], samples: Samples | No
     else:
         draws = samples.draws[:, :, [samples.names.index(name) for name in names]]
         rows = draws.reshape(-1, len(names))
+        if len(rows) < MANY * len(names):
+            return False  # their covariance is not known
         mean, covariance = rows.mean(axis=0), np.cov(rows, rowvar=False)
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+        return False
     return bool(squared_distance(mean, covariance) <= stats.chi2.isf(0.05, len(names)))
 
 

@@ -148,9 +148,9 @@ def test_pieces_of_one_record_are_said_to_be_so(noise):
     other = first[0], 2.0 * first[1]
     for several in ((first, second), (first, second, other)):
         (said,) = about_pieces(*several)
-        assert said.startswith("runs 1, 2 are pieces of one record")
+        assert said.startswith("runs 1, 2 seem to be pieces of one record")
     (said,) = about_pieces(second, first)
-    assert said.startswith("runs 2, 1 are pieces of one record")
+    assert said.startswith("runs 2, 1 seem to be pieces of one record")
 
 
 def test_records_of_their_own_are_no_pieces():
@@ -160,3 +160,9 @@ def test_records_of_their_own_are_no_pieces():
     later = second[0] + 3 * STEP, second[1]
     for other in (anew, elsewhere, later, first):
         assert not about_pieces(first, other)
+
+
+def test_what_rests_or_is_noise_alone_goes_on_nowhere():
+    rng, t = np.random.default_rng(4), STEP * np.arange(1000)
+    for still in (np.full(1000, 2.0), rng.standard_normal(1000)):
+        assert not about_pieces((t[:500], still[:500]), (t[500:], still[500:]))

@@ -268,6 +268,20 @@ def _page_of_nothing(_, path, before):
     return []
 
 
+def test_an_older_result_is_not_taken_for_the_one_that_cannot_be_written(
+    campaign, tmp_path, monkeypatch
+):
+    without_draws(monkeypatch)
+    without_page(monkeypatch)
+    workflow.trace(campaign, damper(), SETTINGS, out=tmp_path)
+    older = (tmp_path / "results.nc").read_bytes()
+    monkeypatch.setattr(output, "result_tree", broken)
+    monkeypatch.setattr(closing, "result_tree", broken)
+    with pytest.raises(NameError):
+        workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+    assert (tmp_path / "results.nc").read_bytes() == older
+
+
 @pytest.fixture(scope="module")
 def broken_off(campaign, tmp_path_factory) -> Path:
     """Folder of a search that broke off in its second round."""
