@@ -154,7 +154,10 @@ LOOKED_FOR = 0.1
 #: Part of an output's signal, and times the residual of the estimate, that errors of the catalogue
 #: may leave to missing effects. Beyond either one the priors decide, and not the data.
 MOST_LEFT, MOST_MORE = 0.8, 1.5
-_NO_MORE = "{}: errors of the catalogue would take {:.0%} of the signal of {} for missing effects{}"
+_NO_MORE = (
+    "{} errors, although more than noise is left, so that intervals are too narrow: errors of the"
+    " catalogue would take {:.0%} of the signal of {} for missing effects{}"
+)
 _PRIOR = ", since {} lies {:.3g} standard deviations from its prior"
 #: Fall of a prior's log density that is worth a word.
 _UNLIKELY = 4.5
@@ -238,9 +241,9 @@ def _unless_priors_decide(fit: ModelFit, noise: Noise, reason: str) -> tuple[str
         if after.status.ok:
             left = float(np.sqrt(np.mean(after.residual[b] ** 2)))
         if left > max(MOST_LEFT * signal, MOST_MORE * float(np.sqrt(np.mean(before[b] ** 2)))):
-            word, plain = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
+            word, _ = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
             part = min(left / signal, 1.0)
-            return word, _NO_MORE.format(plain, part, output, _conflict(fit))
+            return word, _NO_MORE.format(word, part, output, _conflict(fit))
     return CATALOGUE, reason
 
 

@@ -76,6 +76,9 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     found = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
     assert found.error_model == "independent"
     assert "100% of the signal of force" in found.reason
+    # More than noise is left there, and that is not denied.
+    assert "although more than noise is left" in found.reason
+    assert "no more than noise" not in found.reason
     assert fit.problem.signatures is None
 
 
