@@ -48,8 +48,8 @@ UNKNOWN, MISSED = 0.15, 0.3
 #: Probabilities outside one end of an interval of 90 % that show it to be false.
 LEAST_TAIL, MOST_TAIL = 0.02, 0.08
 POORLY = (
-    "The data determine this parameter poorly, so that no average over structures is stated. What"
-    " the final model makes of it is in the posterior that is sampled."
+    "The data determine this parameter poorly, so that no average over structures is stated. A"
+    " sampled posterior holds what the final model makes of it."
 )
 
 

@@ -155,9 +155,10 @@ LOOKED_FOR = 0.1
 #: may leave to missing effects. Beyond either one the priors decide, and not the data.
 MOST_LEFT, MOST_MORE = 0.8, 1.5
 _NO_MORE = (
-    "{} errors, although more than noise is left, so that intervals are too narrow: errors of the"
-    " catalogue would take {:.0%} of the signal of {} for missing effects{}"
+    "{} errors, although {}. Errors of the catalogue would take {:.0%} of the signal of {} for"
+    " missing effects{}; intervals may be too narrow"
 )
+_BECAUSE = " errors, chosen because "
 _PRIOR = ", since {} lies {:.3g} standard deviations from its prior"
 #: Fall of a prior's log density that is worth a word.
 _UNLIKELY = 4.5
@@ -243,7 +244,8 @@ def _unless_priors_decide(fit: ModelFit, noise: Noise, reason: str) -> tuple[str
         if left > max(MOST_LEFT * signal, MOST_MORE * float(np.sqrt(np.mean(before[b] ** 2)))):
             word, _ = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
             part = min(left / signal, 1.0)
-            return word, _NO_MORE.format(word, part, output, _conflict(fit))
+            cause = reason.partition(_BECAUSE)[2]
+            return word, _NO_MORE.format(word, cause, part, output, _conflict(fit))
     return CATALOGUE, reason
 
 
@@ -289,7 +291,7 @@ def error_model_by(
     found = rise(coloured)
     if found > MORE_THAN_NOISE:
         word, left = CATALOGUE, _LEFT.format(found)
-    return word, f"{word} errors, chosen because {left}"
+    return word, f"{word}{_BECAUSE}{left}"
 
 
 #: Rise of the log-likelihood above which neighbouring residuals are alike: one chance in a

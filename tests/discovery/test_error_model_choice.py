@@ -79,6 +79,10 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     # More than noise is left there, and that is not denied.
     assert "although more than noise is left" in found.reason
     assert "no more than noise" not in found.reason
+    # Nor is it said where effects are undecided and noise alone is left.
+    monkeypatch.setattr(inference, "linearised_of", lambda *_: Linearised(-9.0, np.zeros(3), None))
+    undecided = chosen_for(Inference("auto"), replace(fit), assembly, undecided=["drag"], jobs=1)
+    assert "although effects that the data do not tell apart are left: drag." in undecided.reason
     assert fit.problem.signatures is None
 
 
