@@ -272,6 +272,116 @@ class _Call:
             return self._sent
 
 
+class StandingCall[S, T, R]:
+    """One function of what stays the same and an item, called many times with few items.
+
+    What stays the same is sent once. Other processes take part from the moment when they have it;
+    until then, and where one is lost, all is done here.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that other processes find it.
+    shared : object
+        What all calls need.
+    jobs : int, optional
+        Processes, this one included; by default the cores that it may use.
+    """
+
+    #: Seconds of such work here from which on processes that run are asked, and one is started.
+    WORTH = (1.0, WORTH_STARTING)
+
+    def __init__(self, function: Callable[[S, T], R], shared: S, jobs: int | None = None) -> None:
+        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+        self.function, self.shared, self._most = function, shared, jobs - 1
+        self._ready: list[int] = []
+        self._begun, self._mine = list[threading.Thread](), False
+
+    @property
+    def others(self) -> int:
+        """Number of other processes that can be asked."""
+        return len(self._ready)
+
+    def begin(self, took: float, item: T) -> None:
+        """Have other processes made ready in the meantime, where that is worth it.
+
+        Parameters
+        ----------
+        took : float
+            Seconds that such work has taken here: what comes is likely to take as long.
+        item : object
+            Done by each of them first, for which it loads what it needs.
+        """
+        if self._begun or self._most < 1 or not _usable():
+            return
+        if took < self.WORTH[not _workers] or not _in_use.acquire(blocking=False):
+            return
+        self._mine = True
+        for number in range(self._most):
+            thread = threading.Thread(target=self._prepare, args=(number, item), daemon=True)
+            self._begun.append(thread)
+            thread.start()
+
+    def _prepare(self, number: int, item: T) -> None:
+        with suppress(_LostError):
+            worker = _worker(number)
+            worker.ask(_sent((self.function, self.shared, None)))
+            if worker.ask(_sent((0, item)))[0] != _ERROR:
+                self._ready.append(number)
+
+    def __call__(self, items: Sequence[T]) -> list[R]:
+        """Results in the order of the items: the first from here, one from each other process, and
+        what is left over from here."""
+        asked = self._ready[: len(items) - 1]
+        found: dict[int, R] = {}
+        failed: list[BaseException] = []
+
+        def ask(number: int, index: int) -> None:
+            try:
+                kind, value = _worker(number).ask(_sent((index, items[index])))
+                if kind == _ERROR:
+                    failed.append(value)
+                else:
+                    found[index] = value
+            except _LostError:
+                self._ready.remove(number)
+                _forget(number)
+
+        threads = [
+            threading.Thread(target=ask, args=(number, 1 + k), daemon=True)
+            for k, number in enumerate(asked)
+        ]
+        for thread in threads:
+            thread.start()
+        try:
+            for index in (0, *range(1 + len(asked), len(items))):
+                found[index] = self.function(self.shared, items[index])
+        except BaseException:
+            kill_processes()  # nobody waits for what they are doing
+            raise
+        finally:
+            for thread in threads:
+                thread.join()
+        if failed:
+            raise failed[0]
+        for index in range(len(items)):
+            if index not in found:
+                found[index] = self.function(self.shared, items[index])
+        return [found[index] for index in range(len(items))]
+
+    def end(self) -> None:
+        """The processes need no memory of this any more."""
+        if not self._mine:
+            return
+        for thread in self._begun:
+            thread.join()
+        for number in self._ready:
+            with suppress(_LostError):
+                _worker(number).ask(_dumps((None, None, None)))
+        self._ready, self._mine = [], False
+        _in_use.release()
+
+
 # -- processes ------------------------------------------------------------------------------------
 
 _workers: dict[int, _Worker] = {}

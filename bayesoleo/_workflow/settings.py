@@ -319,7 +319,8 @@ class Settings:
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
         "shared-discrepancy (and is partly alike in all runs), catalogue (all effects that the "
         "model might lack), power (independent, by effective samples). The default, auto, "
-        "chooses among independent, correlated and catalogue by what the data show, and says why.",
+        "chooses among independent, correlated, catalogue and power by what the data show, and says"
+        " why.",
         metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(

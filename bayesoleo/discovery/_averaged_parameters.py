@@ -76,8 +76,12 @@ class _Known:
         frame = Frame.of(structure, anchor, comparison, columns, here)
         about = frame.about(here)
         normals = about.normals()
+        if not normals:
+            none = np.zeros(len(here.names))
+            return cls(structure, frame, here, about, none, none, none, [], none > 0)
         coordinates, (mean, sd) = about.bent(anchor.fit, normals), moments(normals)
-        mixtures, poor = about.mixtures(coordinates, normals), about.poorly(mean, sd)
+        mixtures = about.mixtures(coordinates, normals, structure.probability)
+        poor = about.poorly(mean, sd)
         poor &= np.array([_own(anchor, here, k) for k in range(len(here.names))])
         return cls(structure, frame, here, about, coordinates.power, mean, sd, mixtures, poor)
 

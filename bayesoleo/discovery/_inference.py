@@ -10,21 +10,22 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
+from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
+from bayesoleo.discovery._catalogue_mean import linearised_of, shifted
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._signatures import (
     COLOUR_FALSE_ALARM,
     FittedSignatures,
-    Noise,
     more_than_noise_p,
     noise_of,
 )
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._base import Frame
-from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors, Linearised
+from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors
 from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors, effective_samples
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.error_models._independent import IndependentErrors
@@ -32,7 +33,6 @@ from bayesoleo.error_models._registry import AUTO, ERROR_MODELS, check_word
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._identifiability import multistart
-from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._model import Model
 from bayesoleo.posterior._hierarchy import hierarchical
@@ -137,12 +137,8 @@ def effective_at(problem: ResidualProblem, theta: Array) -> Array:
 
 #: Log odds of the data above which noise alone does not explain a residual.
 MORE_THAN_NOISE = 1.5
-#: Times that the estimate under the catalogue's errors is linearised anew.
-_PASSES = 3
 #: Fewest samples of which correlation is judged.
 _FEWEST = 20
-#: Step, in standard deviations, below which it is not.
-_SMALL = 0.1
 _PLAIN = "the noise is white, and no more than noise is left"
 _COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
 _LEFT = "more than noise is left: log odds {:.0f} against noise alone"
@@ -164,6 +160,7 @@ _PRIOR = ", since {} lies {:.3g} standard deviations from its prior"
 _UNLIKELY = 4.5
 
 
+@single_blas_thread()  # matrices are small: threads take longer to meet than to work
 def chosen_for(
     inference: Inference,
     fit: ModelFit,
@@ -223,27 +220,27 @@ def chosen_for(
         undecided,
     )
     if word == CATALOGUE:
-        word, reason = _unless_priors_decide(fit, noise, reason)
+        word, reason = _unless_priors_decide(fit, reason)
     # Curves are for draws: what runs that were not fitted need of them is computed for these only.
     fit.problem.signatures = found.with_curves(jobs) if word == CATALOGUE else None
     return replace(inference, error_model=word, reason=reason)
 
 
-def _unless_priors_decide(fit: ModelFit, noise: Noise, reason: str) -> tuple[str, str]:
+def _unless_priors_decide(fit: ModelFit, reason: str) -> tuple[str, str]:
     """The catalogue's errors, unless they leave most of a signal to effects that may be missing.
 
     A flexible discrepancy can explain anything, so that the estimate goes where the priors want it.
     """
     before = fit.problem.evaluate(fit.point.theta).residual
-    after = fit.problem.evaluate(_shifted(fit.problem, fit.point.theta)[0])
+    after = fit.problem.evaluate(shifted(fit.problem, fit.point.theta)[0])
     for b, output in enumerate(fit.predictor.outputs):
         signal = float(np.std(np.concatenate([run.measured[b] for run in fit.predictor.runs])))
         left = np.inf
         if after.status.ok:
             left = float(np.sqrt(np.mean(after.residual[b] ** 2)))
         if left > max(MOST_LEFT * signal, MOST_MORE * float(np.sqrt(np.mean(before[b] ** 2)))):
-            word, _ = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
-            part = min(left / signal, 1.0)
+            # What is left is alike from sample to sample, and is not to count as if it were noise.
+            word, part = PowerErrors.word, min(left / signal, 1.0)
             cause = reason.partition(_BECAUSE)[2]
             return word, _NO_MORE.format(word, cause, part, output, _conflict(fit))
     return CATALOGUE, reason
@@ -331,31 +328,6 @@ def function_errors(problem: ResidualProblem, theta: Array, word: str) -> tuple[
     return plain, f"{plain} errors, chosen because neighbouring residuals are not alike"
 
 
-def linearised_of(problem: CampaignProblem, theta: Array) -> Linearised:
-    """Posterior about an estimate with effects of the catalogue and a smooth remainder.
-
-    Unknowns are in units of their priors' standard deviations. See
-    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the problem has signatures.
-    """
-    errors = CatalogueErrors(Frame.of(problem))
-    evaluation, counts = problem.evaluate(theta), problem.counts
-    ends = np.cumsum(counts, axis=0)
-
-    def by_run(columns: Sequence[Array]) -> list[list[Array]]:
-        return [
-            [column[..., a:b] for column, a, b in zip(columns, first, last, strict=True)]
-            for first, last in zip(ends - counts, ends, strict=True)
-        ]
-
-    scale = PriorScale.of(problem.priors, problem.names)
-    # Unknowns in units of their priors' deviations, lest the system depend on units.
-    pull = scale.slope(theta) * scale.sd / scale.unit(theta)
-    sensitivity = by_run([(j * scale.sd).T for j in evaluation.sensitivity])
-    return errors.linearised(
-        sensitivity, by_run(evaluation.residual), scale.root.T @ scale.root, pull
-    )
-
-
 def mode_of(density: LogDensity, fit: ModelFit) -> Mode:
     """The mode next to an estimate; with the catalogue's errors the mean of the posterior.
 
@@ -364,29 +336,10 @@ def mode_of(density: LogDensity, fit: ModelFit) -> Mode:
     plain = isinstance(density.unknowns, PlainUnknowns)
     if density.errors.word != CATALOGUE or not plain:
         return find_mode(density, start_coordinates(density, fit.point.theta))
-    theta, found, _ = _shifted(fit.problem, fit.point.theta)
+    theta, found, _ = shifted(fit.problem, fit.point.theta)
     sd = np.array([prior.sd for prior in fit.problem.priors])
     fit.problem.freeze(theta)
     return _summary_mode(density, theta, found.covariance * np.outer(sd, sd))
-
-
-def _shifted(problem: CampaignProblem, theta: Array) -> tuple[Array, Linearised, Array]:
-    """Mean of the posterior under the catalogue's errors, the last linearisation and its place."""
-    sd = np.array([prior.sd for prior in problem.priors])
-    low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
-    for _ in range(_PASSES):
-        found, place = linearised_of(problem, theta), theta
-        step = found.shift * sd
-        with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(step > 0, (high - theta) / step, (low - theta) / step)
-        length = min(1.0, 0.5 * float(np.nanmin(np.where(step == 0, np.inf, room))))
-        trial = theta + length * step
-        if not problem.evaluate(trial).status.ok:
-            break
-        theta = trial
-        if np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd):
-            break
-    return theta, found, place
 
 
 def _summary_mode(density: LogDensity, theta: Array, covariance: Array) -> Mode:
@@ -445,7 +398,7 @@ def _catalogue_mixture(density: LogDensity, theta: Array) -> Mixture:
     These are what the posterior under errors of the catalogue is made of.
     """
     problem = cast(CampaignProblem, density.problem)
-    centre, found, origin = _shifted(problem, theta)
+    centre, found, origin = shifted(problem, theta)
     sd = np.array([prior.sd for prior in problem.priors])
     low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
     modes = []

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo import _schema as schema
+from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
@@ -229,6 +230,7 @@ class ClosedLoop:
         return bool((1.0 - same) * fall > stats.chi2.isf(local, 1))
 
 
+@single_blas_thread()  # matrices are small: threads take longer to meet than to work
 def close_loop(
     assembly: Assembly,
     roles: Roles,

@@ -24,10 +24,11 @@ from functools import cache
 from itertools import product
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, ndtri
 from scipy.stats import qmc
 
-from bayesoleo._types import Array, Flags
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._limited_parameters import ROUGH, STEPS, Coordinates, powers
@@ -57,8 +58,11 @@ LIGHTEST = 1e-4
 #: Nodes of a normal density in one dimension, in each of two, and in all of more; and how many
 #: standard deviations they reach.
 NODES, REACH = (61, 31, 1024), 6.0
-#: Draws of a part of a posterior that reaches a limit: of one heavier than the last, and of others.
-MANY, FEW, HEAVY = 4096, 256, 0.05
+#: Draws of a part of a posterior that reaches a limit: at most, at least, and by its weight.
+MANY, FEW, OF_ALL = 4096, 16, 32768
+#: Logarithm by which a part is farther below the lightest one that counts before it is left out by
+#: a bound, and by how much amplitudes may be larger than those by which it is bounded.
+FAR, AMPLER = 7.0, 2.0
 #: Draws that correct the evidence of one value of a parameter for the priors of the others.
 FEWEST = 128
 
@@ -251,6 +255,7 @@ class GivenStructure:
         self,
         coordinates: Coordinates | None = None,
         normals: Sequence[_Normal] | None = None,
+        share: float = 1.0,
     ) -> list[Mixture]:
         """Posterior of each parameter; none if all of it lies outside the limits.
 
@@ -260,13 +265,15 @@ class GivenStructure:
             Those of :meth:`bent`.
         normals : sequence, optional
             Those of :meth:`normals`, where they are known.
+        share : float
+            The structure's part of what is averaged: a light one needs fewer draws.
         """
         normals = normals or self.normals()
         coordinates = coordinates or self.coordinates
         found, logs = [list[Mixture]() for _ in self.names], list[float]()
         for part in normals:
             if coordinates.rough(part.mean, part.sd).any():
-                count = MANY if part.weight > HEAVY else FEW
+                count = _draws_of(share * part.weight)
                 values, log = coordinates.draws(part.mean, part.covariance, count)
                 total = float(logsumexp(log))
                 if not np.isfinite(total):
@@ -311,7 +318,14 @@ class GivenStructure:
 
     def normals(self) -> list[_Normal]:
         """Normal densities by remainder, sizes and sides of the effects, with their weights."""
-        found = list(self.each(self.cells()))
+        found, best = list[tuple[float, Array, Array]](), -np.inf
+        for bound, cell in self._bounds():
+            if bound < best + np.log(LIGHTEST) - FAR:
+                break
+            found += self.each([cell])
+            best = max((log for log, _, _ in found), default=-np.inf)
+        if not found:
+            return []  # no side of an effect is both physical and likely
         logs = np.array([log for log, _, _ in found])
         weights = np.exp(logs - logsumexp(logs))
         return [
@@ -319,6 +333,57 @@ class GivenStructure:
             for w, (_, mean, covariance) in zip(weights, found, strict=True)
             if w > LIGHTEST
         ]
+
+    def _bounds(self) -> list[tuple[float, Cell]]:
+        """All cells with bounds of their log weights, the largest first.
+
+        Errors of inputs and the law are eliminated once for all sizes of the effects. An effect's
+        moment is at most that of an amplitude far out in its density.
+        """
+        found = []
+        for part in self.parts:
+            reduced, log_det = self._without_others(part[0], part[1])
+            for sizes in self._grid():
+                cell = (*part, sizes)
+                found.append((self._bound(cell, reduced, log_det), cell))
+        return sorted(found, key=lambda item: -item[0])
+
+    def _without_others(self, pattern: int, law: float | None) -> tuple[Array, float]:
+        """Products of the residual, parameters and effects with all other columns projected out,
+        and what these add to the log determinant."""
+        count, known = len(self.names), self.offset.size
+        end = 1 + known + sum(len(group.columns) for group in self.effects)
+        own = np.r_[0 : 1 + count, 1 + known : end]
+        others = np.r_[1 + count : 1 + known, end : end + (0 if law is None else self.law)]
+        gram = self.products[pattern]
+        precision = np.ones(others.size)
+        precision[known - count :] = 1.0 if law is None else 1.0 / law
+        block, across = gram[np.ix_(others, others)], gram[np.ix_(others, own)]
+        root, along = _root_and_solution(block, precision, across)
+        log_det = 2 * np.log(np.diag(root)).sum() - np.log(precision).sum()
+        return gram[np.ix_(own, own)] - along.T @ along, log_det + float(self.logs[pattern])
+
+    def _bound(self, cell: Cell, reduced: Array, log_det: float) -> float:
+        """The log weight of a cell is less than this."""
+        count, known = len(self.names), self.offset.size
+        power, precision = self._precision(cell)
+        members = reduced.shape[0] - 1 - count
+        precision = np.concatenate([precision[:count], precision[known : known + members]])
+        centre = np.concatenate([self.offset[:count], np.zeros(members)])
+        right = reduced[1:, 0] + precision * centre
+        covariance = np.linalg.inv(reduced[1:, 1:] + np.diag(precision))
+        mean = covariance @ right
+        square = np.array(reduced[0, 0] + precision @ centre**2 - right @ mean)
+        own = -np.linalg.slogdet(covariance)[1] - np.log(precision).sum() + log_det
+        total = float(self.likelihood(square, own)) + float(np.log(cell[2]))
+        root = np.sqrt(float(self.likelihood.noise(square)))
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        farthest, start = (np.abs(mean) / root + REACH * sd)[count:] * AMPLER, 0
+        for group, variance in zip(self.effects, power, strict=True):
+            end = start + len(group.columns)
+            total += float(np.log(2.0 * np.mean(farthest[start:end] ** 2) / variance))
+            start = end
+        return total
 
     def _grid(self) -> list[tuple[float, ...]]:
         """Sizes of the effects; of more than two one size for all."""
@@ -346,16 +411,17 @@ class GivenStructure:
         """Log weight, means and covariances of the parameters' coordinates."""
         members = [k for group in self.effects for k in group.columns]
         count = len(self.names)
+        wanted = np.array([*range(count), *members], dtype=int)
         for cell in cells:
             pattern, _, weight, _ = cell
             power, precision = self._precision(cell)
-            log, mean, covariance, noise = self._posterior(pattern, precision)
-            inner, root = covariance[np.ix_(members, members)], np.sqrt(noise)
-            follow = self.change @ covariance[:count, members] @ np.linalg.inv(inner)
+            log, mean, covariance, noise = self._posterior(pattern, precision, wanted)
+            inner, root = covariance[count:, count:], np.sqrt(noise)
+            follow = self.change @ covariance[:count, count:] @ np.linalg.inv(inner)
             rest = self.change @ covariance[:count, :count] @ self.change.T
             rest = rest - follow @ inner @ follow.T
             moved = self.theta + self.change @ mean[:count]
-            for share, shift, spread in _by_side(self.effects, power, mean[members] / root, inner):
+            for share, shift, spread in _by_side(self.effects, power, mean[count:] / root, inner):
                 here = moved + root * follow @ shift
                 spread_out = noise * (rest + follow @ spread @ follow.T)
                 yield log + np.log(weight) + share, here, spread_out
@@ -380,7 +446,9 @@ class GivenStructure:
 
     def expected(self, cell: Cell) -> tuple[Array, Array]:
         """Means of all coefficients, and their covariance, given a remainder and sizes."""
-        _, mean, covariance, noise = self._posterior(cell[0], self._precision(cell)[1])
+        precision = self._precision(cell)[1]
+        every = np.arange(precision.size)
+        _, mean, covariance, noise = self._posterior(cell[0], precision, every)
         return mean, noise * covariance
 
     def without(self, k: int) -> GivenStructure:
@@ -398,28 +466,50 @@ class GivenStructure:
             offset=np.delete(self.offset, k),
         )
 
-    def _posterior(self, pattern: int, precision: Array) -> tuple[float, Array, Array, float]:
-        """Log evidence, means and covariance of the columns' coefficients, the latter in units of
-        the noise, and its variance over that measured."""
+    def _posterior(
+        self, pattern: int, precision: Array, wanted: Integers
+    ) -> tuple[float, Array, Array, float]:
+        """Log evidence, means and covariance of some coefficients, the latter in units of the
+        noise, and its variance over that measured."""
         size = 1 + precision.size
+        # What is wanted stands last in the root, whose last rows are all that its moments need.
+        order = np.concatenate([np.setdiff1d(np.arange(precision.size), wanted), wanted])
         gram = self.products[pattern, :size, :size]
+        inner, cross = gram[1:, 1:][np.ix_(order, order)], gram[1:, 0][order]
         centre = np.zeros(precision.size)
         centre[: self.offset.size] = self.offset
+        precision, centre = precision[order], centre[order]
 
-        def solved(precision: Array) -> tuple[Array, Array, Array]:
-            right = gram[1:, 0] + precision * centre
-            covariance = np.linalg.inv(gram[1:, 1:] + np.diag(precision))
-            return right, covariance, covariance @ right
-
-        right, covariance, mean = solved(precision)
-        square = np.array(gram[0, 0] + precision @ centre**2 - right @ mean)
-        log_det = -np.linalg.slogdet(covariance)[1] - np.log(precision).sum() + self.logs[pattern]
+        right = cross + precision * centre
+        root, whole = _root_and_solution(inner, precision, right)
+        square = np.array(gram[0, 0] + precision @ centre**2 - whole @ whole)
+        log_det = 2 * np.log(np.diag(root)).sum() - np.log(precision).sum() + self.logs[pattern]
         log, noise = self.likelihood(square, log_det), float(self.likelihood.noise(square))
         # What is known of an unknown beforehand is not known worse where noise is larger than it
         # was measured.
-        stated = np.where(np.arange(precision.size) < self.offset.size, noise, 1.0)
-        _, covariance, mean = solved(stated * precision)
-        return float(log), mean, covariance, noise
+        precision = np.where(order < self.offset.size, noise, 1.0) * precision
+        right = cross + precision * centre
+        root, whole = _root_and_solution(inner, precision, right)
+        first = order.size - wanted.size
+        inverse = solve_triangular(root[first:, first:], np.eye(wanted.size), lower=True)
+        return float(log), inverse.T @ whole[first:], inverse.T @ inverse, noise
+
+
+def _root_and_solution(gram: Array, precision: Array, right: Array) -> tuple[Array, Array]:
+    """Lower triangular root ``L`` of products of columns and precisions, and ``L^-1 r``.
+
+    Unknowns differ in size by decades: the matrix is scaled to a unit diagonal before.
+    """
+    matrix = gram + np.diag(precision)
+    scale = np.sqrt(np.diag(matrix))
+    least = float(np.min(precision / scale**2, initial=1.0))
+    root = scale[:, None] * root_of(matrix / np.outer(scale, scale), least)
+    return root, np.asarray(solve_triangular(root, right, lower=True))
+
+
+def _draws_of(weight: float) -> int:
+    """Draws of a part of a posterior, a power of two: draws of all parts weigh about the same."""
+    return int(np.clip(2 ** np.ceil(np.log2(weight * OF_ALL)), FEW, MANY))
 
 
 def moments(normals: Sequence[_Normal]) -> tuple[Array, Array]:

@@ -405,16 +405,7 @@ class CatalogueErrors(ErrorModel):
         ----------
         Patterson and Thompson (1971), Biometrika 58, 545-554 (restricted likelihood).
         """
-        both = {
-            r: [np.vstack([j, e]) for j, e in zip(columns, left, strict=True)]
-            for r, (columns, left) in enumerate(zip(sensitivity, residual, strict=True))
-        }
-        rows, count = self._rows(both), int(self.frame.counts.sum())
-        found = [
-            self._components(rows, count, g, a, precision, pull)
-            for g in (0.0, *REMAINDERS)
-            for a in (0.0, *(EFFECTS if self._variances.size else ()))
-        ]
+        found = self._over_sizes(sensitivity, residual, precision, pull)
         none = float(found[0][0][0])
         height = np.concatenate([one[0] for one in found])
         height = height - np.log(len(found))
@@ -425,6 +416,38 @@ class CatalogueErrors(ErrorModel):
         spread = np.stack([one[2] for one in found])
         _, centre, covariance = _moments(weight, mean, spread)
         return Linearised(more, centre, covariance, _grouped(weight, mean, spread))
+
+    def log_evidence(self, residual: Sequence[Sequence[Array]]) -> float:
+        """Logarithm of the evidence of residuals whose unknowns are known, up to a constant.
+
+        Over the same sizes and effects as :meth:`linearised`.
+
+        Parameters
+        ----------
+        residual : sequence over runs of sequence over outputs of ndarray, shape (n,)
+        """
+        none = [[np.empty((0, one.size)) for one in row] for row in residual]
+        found = self._over_sizes(none, residual, np.empty((0, 0)), np.empty(0))
+        return float(logsumexp(np.concatenate([heights for heights, _, _ in found])))
+
+    def _over_sizes(
+        self,
+        sensitivity: Sequence[Sequence[Array]],
+        residual: Sequence[Sequence[Array]],
+        precision: Array,
+        pull: Array,
+    ) -> list[tuple[Array, Array, Array]]:
+        """The components at each size of the remainder and of effects, both zero first."""
+        both = {
+            r: [np.vstack([j, e]) for j, e in zip(columns, left, strict=True)]
+            for r, (columns, left) in enumerate(zip(sensitivity, residual, strict=True))
+        }
+        rows, count = self._rows(both), int(self.frame.counts.sum())
+        return [
+            self._components(rows, count, g, a, precision, pull)
+            for g in (0.0, *REMAINDERS)
+            for a in (0.0, *(EFFECTS if self._variances.size else ()))
+        ]
 
     def _components(
         self,
@@ -462,8 +485,10 @@ class CatalogueErrors(ErrorModel):
         size = len(mean)
         return (
             np.append(start, height.ravel()),
-            np.concatenate([mean[None], means.reshape(-1, size)]),
-            np.concatenate([covariance[None] * left / count, spread.reshape(-1, size, size)]),
+            np.concatenate([mean[None], means.reshape(height.size, size)]),
+            np.concatenate(
+                [covariance[None] * left / count, spread.reshape(height.size, size, size)]
+            ),
         )
 
     # -- start, and draws --------------------------------------------------------------------

@@ -64,12 +64,17 @@ LEAST_SHARE, LARGEST_SHARE = 0.05, 0.95
 
 @dataclass(eq=False)
 class _Counted:
-    """Heights in whitened coordinates, and how many rows they took."""
+    """Heights in whitened coordinates, how many rows they took, and how many they may take."""
 
     log_density: Density
     centre: Array
     factor: Array
+    most: float
     rows: int = field(default=0)
+
+    def afford(self, rows: int) -> bool:
+        """Whether so many more rows may be evaluated."""
+        return self.rows + rows <= self.most
 
     def __call__(self, y: Array) -> Array:
         self.rows += len(y)
@@ -83,7 +88,11 @@ class _Counted:
 
 
 def with_other_modes(
-    log_density: Density, start: Mixture, climbs: int, rng: np.random.Generator
+    log_density: Density,
+    start: Mixture,
+    climbs: int,
+    rng: np.random.Generator,
+    most: float = np.inf,
 ) -> tuple[Mixture, int]:
     """Search for modes beside those of a mixture, and add them to it.
 
@@ -98,6 +107,9 @@ def with_other_modes(
         Points from which to climb.
     rng : numpy.random.Generator
         Scatters them.
+    most : float
+        Rows of the log density that it may take. Climbs end where the next step would take more,
+        and what is not known to be a mode by then is left out.
 
     Returns
     -------
@@ -108,15 +120,15 @@ def with_other_modes(
     """
     # Points where the density overflows are left out.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _search(log_density, start, climbs, rng)
+        return _search(log_density, start, climbs, rng, most)
 
 
 def _search(
-    log_density: Density, start: Mixture, climbs: int, rng: np.random.Generator
+    log_density: Density, start: Mixture, climbs: int, rng: np.random.Generator, most: float
 ) -> tuple[Mixture, int]:
     heaviest = int(np.argmax(start.log_weights))
     factor = np.linalg.cholesky(start.covariances[heaviest])
-    height = _Counted(log_density, start.centres[heaviest], factor)
+    height = _Counted(log_density, start.centres[heaviest], factor, most)
     y, values = _scattered(height, start, climbs, rng)
     known = [_component(height, start, k) for k in range(len(start.centres))]
     if y.size == 0 or not any(np.isfinite(mode.log_weight) for mode in known):
@@ -204,7 +216,7 @@ def _mirrored(height: _Counted) -> Array:
 
 
 def _climb(
-    height: Height, y: Array, values: Array, known: list[Array], top: float
+    height: _Counted, y: Array, values: Array, known: list[Array], top: float
 ) -> tuple[Array, Array]:
     """Climb from all points together by BFGS.
 
@@ -216,7 +228,7 @@ def _climb(
     inverse = np.repeat(np.eye(d)[None], count, axis=0)
     slopes, going = _slopes(height, y, values), np.arange(count)
     for iteration in range(ITERATIONS):
-        if going.size == 0:
+        if going.size == 0 or not height.afford(going.size * (LENGTHS.size + d)):
             break
         direction = np.einsum("kij,kj->ki", inverse[going], slopes[going])
         length = np.linalg.norm(direction, axis=1, keepdims=True)
@@ -313,6 +325,8 @@ def _polished(height: _Counted, y: Array) -> Mode | None:
     d = y.size
     factor, size = np.eye(d), np.inf
     for _ in range(NEWTON_STEPS):
+        if not height.afford(1 + d + d * d):
+            return None
         top, gradient, hessian = derivatives(height, y, factor)
         if not (np.isfinite(top) and np.isfinite(gradient).all() and np.isfinite(hessian).all()):
             return None

@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from tqdm.auto import tqdm
 
-from bayesoleo._parallel import connected
+from bayesoleo._parallel import connected, single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import unwatched
 from bayesoleo.posterior._checkpoints import Segment, Store, open_store
 from bayesoleo.posterior._diagnostics import (
@@ -27,9 +30,10 @@ from bayesoleo.posterior._ensemble_moves import (
     DistributedDensity,
     Ensembles,
     MoveWeights,
+    SharedDensity,
     default_walkers,
 )
-from bayesoleo.posterior._log_density import Density
+from bayesoleo.posterior._log_density import Density, LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
 
@@ -40,6 +44,8 @@ SEARCHING = 0.25
 #: Evaluations of the log density at which a quick run ends, converged or not, but not before this
 #: number of steps of each walker: minutes, where a motion takes milliseconds.
 QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+#: Acceptance of the independence move below which its mixture misses the posterior.
+MISSES = 0.15
 #: Draws that are handed on at least, where each one costs a factorisation for each run.
 ENOUGH = 4_000
 
@@ -118,6 +124,7 @@ class Quality:
         return short
 
 
+@single_blas_thread()  # matrices are small: threads take longer to meet than to work
 def sample(
     log_density: Density,
     start: Mixture,
@@ -222,13 +229,29 @@ def sample(
         try:
             if not store.segments:
                 store.append(_first(group, start, seed, number, schedule))
-            _warm_up(store, group, schedule, bar)
-            if weights is None:
-                group = replace(group, weights=_tuned(store.segments))
-            quality, short = _keep(store, group, schedule, bar)
+            with _shared(group) as group:
+                _warm_up(store, group, schedule, bar, quick and weights is None)
+                if weights is None:
+                    group = replace(group, weights=_tuned(store.segments))
+                quality, short = _keep(store, group, schedule, bar)
         finally:
             bar.close()
         return _samples(store.segments, group, quality, short)
+
+
+@contextmanager
+def _shared(group: Ensembles) -> Iterator[Ensembles]:
+    """The ensembles with a density that other processes of this machine evaluate too, if theirs is
+    one of a campaign."""
+    density = group.log_density
+    if not isinstance(density, LogDensity) or not isinstance(density.problem, CampaignProblem):
+        yield group
+        return
+    shared = SharedDensity(density)
+    try:
+        yield replace(group, log_density=shared)
+    finally:
+        shared.end()
 
 
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
@@ -274,15 +297,22 @@ def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: S
         rng = np.random.default_rng([seed, climbs])
         # What it looks at lies far beyond what is sampled: jumps there say nothing of that.
         with unwatched(group.log_density):
-            start, spent = with_other_modes(group.log_density, start, climbs, rng)
+            most = SEARCHING * schedule.max_evaluations
+            start, spent = with_other_modes(group.log_density, start, climbs, rng, most)
     first = group.start(start, seed)
     return replace(first, evaluations=first.evaluations + spent)
 
 
-def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar) -> None:
-    """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau."""
+def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar, tuned: bool) -> None:
+    """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau.
+
+    Where rounds are few, the weights of the moves are tuned too, after one whose mixture missed:
+    its proposals would be most of what is evaluated.
+    """
     while not _is_warm(store.segments, schedule):
         rounds = sum(s.phase == "warm-up" for s in store.segments)
+        if tuned and rounds and _independence(store.segments[-1]) < MISSES:
+            group = replace(group, weights=_tuned(store.segments))
         steps = schedule.warm_up * 2**rounds
         bar.show("warm-up", 0.0, store.segments)
         store.append(group.advance(store.segments[-1], steps, "warm-up"))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 from bayesoleo.discovery._limited_parameters import Coordinates
 from bayesoleo.discovery._structure_columns import Group, Likelihood
-from bayesoleo.discovery._structure_parameters import GivenStructure
+from bayesoleo.discovery._structure_parameters import LIGHTEST, GivenStructure
 from bayesoleo.model import Normal
 
 SAMPLES, SIZE = 400, 0.2
@@ -91,3 +92,47 @@ def test_intervals_cover_where_data_say_little_of_the_structure():
         inside += found.low < theta < found.high
     # Three standard errors of a proportion of 0.9.
     assert inside / draws == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / draws))
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, 30.0, 3000.0])
+@pytest.mark.parametrize("sides", [(0.5,), (0.5, 1.0), (0.5, 0.5, 0.0)])
+def test_parts_that_are_left_out_by_bounds_weigh_nothing(size, sides):
+    """No part weighs more than its bound says, and those that count are those of all cells."""
+    rows = columns(0.3, len(sides), 3)
+    residual = size * rows[1:].sum(axis=0) + np.random.default_rng(4).standard_normal(rows.shape[1])
+    found = of_residual(residual, rows, sides)
+    for bound, cell in found._bounds():
+        assert max((log for log, _, _ in found.each([cell])), default=-np.inf) < bound
+    every = list(found.each(found.cells()))
+    if not every:  # three effects with one that is never below zero, and is
+        assert sides == (0.5, 0.5, 0.0)
+        assert found.normals() == []
+        return
+    logs, means, _ = zip(*every, strict=True)
+    weights = np.exp(logs - logsumexp(logs))
+    order = np.argsort(-weights)
+    counted = order[weights[order] > LIGHTEST]
+    normals = sorted(found.normals(), key=lambda part: -part.weight)
+    assert len(normals) == len(counted)
+    # What was left out altogether is less than one in a million.
+    np.testing.assert_allclose([part.weight for part in normals], weights[counted], rtol=1e-5)
+    mean = sum(part.weight * part.mean for part in normals)
+    np.testing.assert_allclose(
+        mean, sum(weights[k] * means[k] for k in counted), rtol=1e-5, atol=1e-9
+    )
+
+
+def test_moments_of_some_coefficients_are_those_of_all():
+    """Only the last rows of a root are solved for: against the inverse of the whole matrix."""
+    rows = columns(0.3, 2, 5)
+    found = of_residual(np.random.default_rng(6).standard_normal(rows.shape[1]), rows, (0.5, 0.5))
+    precision = np.linspace(0.5, 2.0, 3)
+    log, mean, covariance, noise = found._posterior(0, precision, np.array([2, 0]))
+    everything = found._posterior(0, precision, np.arange(3))
+    assert (log, noise) == pytest.approx((everything[0], everything[3]), rel=1e-12)
+    np.testing.assert_allclose(mean, everything[1][[2, 0]], rtol=1e-9)
+    np.testing.assert_allclose(covariance, everything[2][np.ix_([2, 0], [2, 0])], rtol=1e-9)
+    gram = found.products[0]
+    stated = precision * np.where(np.arange(3) < found.offset.size, noise, 1.0)
+    inverse = np.linalg.inv(gram[1:, 1:] + np.diag(stated))
+    np.testing.assert_allclose(everything[2], inverse, rtol=1e-9)

@@ -70,11 +70,12 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     assert kept.error_model == "catalogue"
     monkeypatch.setattr(
         inference,
-        "_shifted",
+        "shifted",
         lambda problem, theta: (0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
     )
     found = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
-    assert found.error_model == "independent"
+    # What is left is alike from sample to sample: it does not count as noise.
+    assert found.error_model == "power"
     assert "100% of the signal of force" in found.reason
     # More than noise is left there, and that is not denied.
     assert "although more than noise is left" in found.reason

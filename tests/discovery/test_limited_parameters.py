@@ -226,7 +226,7 @@ def test_a_density_changes_as_another_did():
 def test_a_prior_is_not_widened_where_noise_is_larger_than_measured():
     made = structure([Normal(0.0, 1.0)], [0.0], [[1e-9]], [0.0])
     loud = GivenStructure(*(*vars(made).values(),)[:-1], Likelihood(100, 10.0))
-    assert loud._posterior(0, np.ones(1))[3] > 50.0  # the noise
+    assert loud._posterior(0, np.ones(1), np.arange(1))[3] > 50.0  # the noise
     low, _, high = quantiles_of(loud)[0]
     assert high - low == pytest.approx(2 * 1.64485, rel=1e-3)
 

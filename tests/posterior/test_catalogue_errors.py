@@ -287,3 +287,43 @@ def test_evidence_of_more_than_noise_is_that_of_dense_covariances():
     assert found.log_odds == pytest.approx(odds, rel=1e-9)
     centre = np.linalg.solve(rows @ rows.T + precision, rows @ e + pull)
     np.testing.assert_allclose(found.shift, centre, atol=0.05)
+
+
+def test_evidence_of_known_unknowns_is_that_of_dense_covariances():
+    """What steps of an estimate under these errors are judged by."""
+    campaign = campaign_of(("force", "pressure"), (41, 60), 0.5, (WHITE, WHITE), 0)
+    model, rng = error_model("catalogue", campaign), np.random.default_rng(4)
+    heights = []
+    for scale in (1.0, 3.0):
+        residual = [
+            [scale * rng.standard_normal(n) for _ in campaign.outputs] for n in campaign.lengths
+        ]
+        e, logs = np.concatenate([part for run in residual for part in run]), []
+        for size in (0.0, *REMAINDERS):
+            matrix = np.eye(e.size)
+            if size:
+                matrix = dense(campaign, model, model.coordinates(np.array([[0.0, 0.0, size]]))[0])
+            left = e @ np.linalg.solve(matrix, e)
+            logs.append(-0.5 * (e.size * np.log(left) + np.linalg.slogdet(matrix)[1]))
+        heights.append((model.log_evidence(residual), logsumexp(logs)))
+    (one, expected), (other, also) = heights
+    # Up to a constant.
+    assert one - other == pytest.approx(expected - also, rel=1e-9)
+
+
+def test_evidence_falls_with_what_no_effect_explains():
+    campaign = campaign_of(*CASES["two outputs, one coloured"])
+    model, rng = error_model("catalogue", campaign), np.random.default_rng(5)
+    noise = [
+        [0.1 * s * rng.standard_normal(n) for s in (1.5, 0.3)] for n in campaign.lengths
+    ]  # fmt: skip
+    alike = [
+        [e + 3 * campaign.signatures.columns[r][b, 0] for b, e in enumerate(row)]
+        for r, row in enumerate(noise)
+    ]
+    size = [np.std(np.concatenate([row[b] for row in alike])) for b in range(2)]
+    any_other = [
+        [s * rng.standard_normal(e.size) for s, e in zip(size, row, strict=True)] for row in noise
+    ]
+    heights = [model.log_evidence(each) for each in (noise, alike, any_other)]
+    assert heights[0] > heights[1] > heights[2]

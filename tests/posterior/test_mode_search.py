@@ -103,9 +103,20 @@ def test_a_search_is_bounded_by_the_evaluations_allowed():
     assert samples.evaluations == target.evaluations
 
 
+@pytest.mark.parametrize("most", [200, 1000, 5000])
+def test_a_search_takes_no_more_than_its_share(most):
+    """Climbs and Newton steps end before it is used up, and the highest places come first."""
+    target = Bimodal(6, 12.0, 1.0, 0.5, seed=3)
+    mixture, spent = with_other_modes(target, at_rest(6), 4, np.random.default_rng(0), most)
+    assert spent == target.evaluations
+    # What begins a search, a few points about the start, is always looked at.
+    assert spent <= max(most, 250)
+    assert len(mixture.centres) == (1 if most == 200 else 2)
+
+
 def test_points_are_scattered_at_all_distances():
     target = Gaussian(np.ones(3))
-    height = mode_search._Counted(target, np.zeros(3), np.eye(3))
+    height = mode_search._Counted(target, np.zeros(3), np.eye(3), np.inf)
     rng = np.random.default_rng(2)
     y, values = mode_search._scattered(height, at_rest(3), 32, rng)
     distance = np.linalg.norm(y, axis=1)

@@ -11,7 +11,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._datatree import choose_all
-from bayesoleo.posterior._ensemble_moves import Ensembles
+from bayesoleo.posterior._ensemble_moves import Ensembles, MoveWeights
 
 
 def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
@@ -91,6 +91,30 @@ def test_a_first_look_warms_up_once_where_the_mixture_is_the_posterior(monkeypat
         within_error(samples, np.zeros(3), sd)
         rounds[name] = phases.count("warm-up")
     assert rounds == {"near": 1, "far": 2, "full": 2}
+
+
+def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(monkeypatch):
+    shares, advance = list[float](), Ensembles.advance
+
+    def noted(group, last, steps, phase):
+        shares.append(group.weights.independence)
+        return advance(group, last, steps, phase)
+
+    monkeypatch.setattr(Ensembles, "advance", noted)
+    sd = np.ones(6)
+    mixture = normal_mixture(sd, stretch=30.0)
+    found = sample(Gaussian(sd), mixture, seed=1, quick=True, progress=False, climbs=0)
+    first, second = shares[:2]
+    assert first == 0.8
+    assert second == 0.3
+    # With 80 % of them it took 38 320, of which 9 in 100 were accepted in the end.
+    assert found.reached
+    assert found.evaluations < 25_000
+    # A user's own weights stay.
+    shares.clear()
+    own = MoveWeights(0.5, 0.4, 0.1)
+    sample(Gaussian(sd), mixture, seed=1, quick=True, progress=False, climbs=0, weights=own)
+    assert set(shares) == {0.5}
 
 
 @pytest.mark.slow

@@ -1,0 +1,112 @@
+"""Where unknowns are if errors are those of the catalogue: the mean of their posterior.
+
+The posterior is a mixture of normal distributions where outputs are linear in the unknowns
+(:meth:`~bayesoleo.error_models.CatalogueErrors.linearised`). Elsewhere its mean is approached in
+steps, as in the method of Gauss and Newton. A missing effect that may be large lets the mean lie
+far from the estimate, where the slopes of the outputs no longer hold. A step is therefore halved
+until the density at its end is what the slopes foresee.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.error_models._base import Frame
+from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors, Linearised
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.estimation._problem import Evaluation
+
+#: Times that the estimate under the catalogue's errors is linearised anew.
+_PASSES = 8
+#: Step, in standard deviations, below which it is not.
+_SMALL = 0.1
+#: Times that a step is halved, and the fall of the log density from what the slopes foresee above
+#: which it is.
+_HALVINGS, _DOUBTED = 8, 2.0
+
+
+def linearised_of(problem: CampaignProblem, theta: Array) -> Linearised:
+    """Posterior about an estimate with effects of the catalogue and a smooth remainder.
+
+    Unknowns are in units of their priors' standard deviations. See
+    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the problem has signatures.
+    """
+    return _About(problem).linearised(theta, problem.evaluate(theta))
+
+
+class _About:
+    """Errors of the catalogue for the residuals of a problem that has signatures."""
+
+    def __init__(self, problem: CampaignProblem) -> None:
+        self.problem = problem
+        self.errors = CatalogueErrors(Frame.of(problem))
+        self.scale = PriorScale.of(problem.priors, problem.names)
+
+    def linearised(self, theta: Array, found: Evaluation) -> Linearised:
+        """Posterior about what was evaluated there."""
+        scale = self.scale
+        # Unknowns in units of their priors' deviations, lest the system depend on units.
+        pull = scale.slope(theta) * scale.sd / scale.unit(theta)
+        sensitivity = self._by_run([(j * scale.sd).T for j in found.sensitivity])
+        precision = scale.root.T @ scale.root
+        return self.errors.linearised(sensitivity, self._by_run(found.residual), precision, pull)
+
+    def height(self, theta: Array, residual: Sequence[Array]) -> float:
+        """Log posterior density of unknowns with such residuals, up to a constant."""
+        prior = float(self.scale.log_density(theta[None])[0])
+        return prior + self.errors.log_evidence(self._by_run(residual))
+
+    def _by_run(self, columns: Sequence[Array]) -> list[list[Array]]:
+        counts = self.problem.counts
+        ends = np.cumsum(counts, axis=0)
+        return [
+            [column[..., a:b] for column, a, b in zip(columns, first, last, strict=True)]
+            for first, last in zip(ends - counts, ends, strict=True)
+        ]
+
+
+def shifted(problem: CampaignProblem, theta: Array) -> tuple[Array, Linearised, Array]:
+    """Mean of the posterior under the catalogue's errors, the last linearisation and its place."""
+    about = _About(problem)
+    sd, here = about.scale.sd, problem.evaluate(theta)
+    for _ in range(_PASSES):
+        found, place = about.linearised(theta, here), theta
+        step = found.shift * sd
+        small = bool(np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd))
+        moved = _as_far_as_believed(about, theta, here, step)
+        if moved is None:
+            break
+        theta, here = moved
+        if small:
+            break
+    return theta, found, place
+
+
+def _as_far_as_believed(
+    about: _About, theta: Array, here: Evaluation, step: Array
+) -> tuple[Array, Evaluation] | None:
+    """The step's largest part of one, a half, a quarter, ... that the outputs' slopes foresee.
+
+    A step to the mean of a linearised posterior may go far where an effect that is missing could
+    explain much: the density there must not be much less than what is promised, or than at the
+    start. None if no part does.
+    """
+    low, high = np.array([prior.support for prior in about.problem.priors], dtype=float).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        room = np.where(step > 0, (high - theta) / step, (low - theta) / step)
+    length = min(1.0, 0.5 * float(np.nanmin(np.where(step == 0, np.inf, room))))
+    before = about.height(theta, here.residual)
+    for _ in range(_HALVINGS):
+        trial = theta + length * step
+        there = about.problem.evaluate(trial)
+        if there.status.ok:
+            slopes = zip(here.residual, here.sensitivity, strict=True)
+            foreseen = about.height(trial, [e - j @ (trial - theta) for e, j in slopes])
+            if about.height(trial, there.residual) > min(before, foreseen) - _DOUBTED:
+                return trial, there
+        length /= 2
+    return None
