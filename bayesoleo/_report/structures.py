@@ -238,7 +238,10 @@ def parameters(summary: Mapping[str, Any]) -> Table | None:
         # too large for a number.
         middle = average.get("median", average["mean"])
         numbers = [average["mean"], middle, *(one[k]["mean"] for k in COMPARED if one[k]), 0.0]
-        size = abs(next(value for value in numbers if value is not None))
+        spreads = [average["sd"], *(one[k]["sd"] for k in COMPARED if one[k])]
+        # What is zero but for round-off has the size of its deviation.
+        least = min((sd for sd in spreads if sd is not None), default=0.0)
+        size = max(abs(next(value for value in numbers if value is not None)), least)
         scale = engineering(one["unit"], size)
         cells = [_with_sd(one[key], scale) for key in COMPARED]
         if average["interval"] is None:

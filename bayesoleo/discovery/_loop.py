@@ -399,6 +399,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             effects=search.effects,
             seed=search.seed,
             limit=limit,
+            ahead=len(state.assembly.steps) + 2 <= max_effects,
             keep_columns=search.keep_columns,
             callback=callback,
         )

@@ -24,6 +24,7 @@ from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import corrected_p, effective_tests
 from bayesoleo.discovery._state import State
+from bayesoleo.discovery._two_effects import confirmed_together
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -74,6 +75,7 @@ def examine(
     effects: Sequence[Effect] | None,
     seed: int,
     limit: str = "",
+    ahead: bool = False,
     keep_columns: bool = False,
     callback: ProgressCallback,
 ) -> Round:
@@ -93,6 +95,9 @@ def examine(
         For the correction for the search.
     limit : str
         Why effects are only ranked and none is accepted; empty where one may be.
+    ahead : bool
+        Whether to look one round ahead where all that is confirmed is an effect that names no
+        cause.
     keep_columns : bool
         Whether a round that accepts no effect keeps what the candidates change in the outputs.
     callback : callable
@@ -121,11 +126,25 @@ def examine(
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
+    if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
+
+        def follow(one: State) -> Round:
+            return examine(
+                one, roles, numerics, effects=effects, seed=seed, ahead=False, callback=callback
+            )
+
+        pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback)
+        accepted, after, reason = pair or (accepted, after, reason)
     if accepted is not None and after is not None and np.isnan(after.worst_ratio):
         reason = f"with {accepted.effect} a run has no solution at the estimate"
         accepted, after = None, None
     scanned = scanned if after is None else None  # of a model that is final
     return Round(state, ranking, failed, accepted, after, reason, tests, _scanned=scanned)
+
+
+def _explains_nothing(result: Refit) -> bool:
+    """Whether an effect names no cause and leaves more than noise."""
+    return result.score.option.candidate.family in ABSORBING_FAMILIES and not result.reached
 
 
 def _stopping_reason(

@@ -285,3 +285,17 @@ def test_a_mean_too_large_for_a_number_leaves_the_interval():
 def test_results_without_averages_have_no_table_of_them():
     assert structures.parameters({"structures": {"nothing": 1.0}}) is None
     assert structures.parameters({}) is None
+
+
+def test_an_average_of_zero_is_told_in_its_own_unit():
+    """Zero but for round-off: in units of its deviation, not in millionths of them."""
+    about = {"mean": -1.3e-17, "sd": 1.0}
+    one = {
+        "unit": "1",
+        "declared": {"mean": 0.0, "sd": 1.0},
+        "final": about,
+        "averaged": {"mean": 5e-4, "median": -6e-4, "sd": 0.99, "interval": [-1.65, 1.64]},
+    }
+    table = structures.parameters({"structures": {"parameters": {"force_baseline_error[1]": one}}})
+    assert table is not None
+    assert table.rows[0][1:] == ["0.0 ± 1", "0.0 ± 1", "0.00", "−1.65 … 1.64", ""]

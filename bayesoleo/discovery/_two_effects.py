@@ -1,0 +1,91 @@
+"""Two effects of which neither alone predicts runs that were not fitted.
+
+A search adds one effect after the other, and confirms each on the hold-out runs. Where two are
+missing that both matter, such as dry friction and drag of one swing, a model with one of them may
+fit better and predict worse than one with none. All that is confirmed then may be a parameter that
+differs from run to run, which explains nothing. So before such a parameter is added, the named
+effects that fit best are each followed one round further.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bayesoleo._types import ProgressCallback
+from bayesoleo.discovery._assembly import Roles
+from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, judged
+from bayesoleo.discovery._ranking import Ranked
+from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._state import State, fit_state
+
+if TYPE_CHECKING:
+    from bayesoleo.discovery._round import Round
+
+#: Effects that are followed.
+MOST = 3
+
+
+def confirmed_together(
+    state: State,
+    ranking: Sequence[Ranked],
+    refits: Mapping[int, Refit],
+    roles: Roles,
+    numerics: Numerics,
+    follow: Callable[[State], Round],
+    callback: ProgressCallback,
+) -> tuple[Ranked, State, str] | None:
+    """An effect that with the one found after it lowers the error on hold-out runs.
+
+    Parameters
+    ----------
+    state : State
+        The model that was examined.
+    ranking : sequence of Ranked
+        Best first.
+    refits : mapping of int to Refit
+        Estimates, by the id of their scores.
+    roles : Roles
+    numerics : Numerics
+    follow : callable
+        The round after a state.
+    callback : callable
+        Receives a message at each step.
+
+    Returns
+    -------
+    (Ranked, State, str) or None
+        The effect, the model with it, and why it is added: that of the pair which lowers the error
+        most. None where no pair does.
+    """
+    level, best = numerics.policy.significance, None
+    able = [item for item in ranking if item.refitted and item.p_value < level and not item.absorbs]
+    for item in [one for one in able if _may_be(refits[id(one.score)])][:MOST]:
+        callback(f"follow {item.effect}, which hold-out runs do not confirm alone")
+        result = refits[id(item.score)]
+        one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+        then = follow(one)
+        if then.accepted is None or then.after is None or then.accepted.absorbs:
+            continue
+        if not then.after.hold_errors.entries or np.isnan(then.after.worst_ratio):
+            continue
+        fall = fall_on_hold_out(*judged(state, then.after), result.inflation)
+        if fall.confirms and (best is None or fall.value > best[3].value):
+            best = item, one, then.accepted.effect, fall
+    return None if best is None else (best[0], best[1], _reason(*best))
+
+
+def _may_be(result: Refit) -> bool:
+    """Whether an estimate explains enough, and is not as good as none."""
+    return bool(result.share >= result.policy.fair_share and result.excludes_null())
+
+
+def _reason(item: Ranked, _: State, other: str, fall: Fall) -> str:
+    return (
+        f"{item.effect} explains {100 * item.gain:.0f} % of the excess, and with {other} lowers the"
+        f" error on hold-out runs, which it does not alone: the weighted squared error falls by"
+        f" {fall}"
+    )
