@@ -46,8 +46,9 @@ SEARCHING = 0.25
 QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
 #: Acceptance of the independence move below which its mixture misses the posterior.
 MISSES = 0.15
-#: Draws that are handed on at least, where each one costs a factorisation for each run.
-ENOUGH = 4_000
+#: Draws that are handed on at least, where each one costs a factorisation for each run, and by
+#: quick runs.
+ENOUGH, ENOUGH_QUICK = 4_000, 1_000
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def sample(
                 quality, short = _keep(store, group, schedule, bar)
         finally:
             bar.close()
-        return _samples(store.segments, group, quality, short)
+        return _samples(store.segments, group, quality, short, quick)
 
 
 @contextmanager
@@ -405,9 +406,14 @@ def _quality(kept: list[Segment], group: Ensembles) -> Quality:
     )
 
 
-def _every(group: Ensembles, quality: Quality, draws: int) -> int:
-    """Of how many draws one is handed on; all are, unless each one costs a factorisation a run."""
+def _every(group: Ensembles, quality: Quality, draws: int, quick: bool) -> int:
+    """Of how many draws one is handed on; all are, unless each one costs a factorisation a run, or
+    the run is quick: every draw that is handed on is solved for once more."""
     errors = getattr(group.log_density, "errors", None)
+    if quick:
+        # An autocorrelation time loses a quarter of the information on the quantity that moves
+        # most quickly, and less on the others.
+        return int(max(1, min(draws // ENOUGH_QUICK, quality.times.min())))
     if errors is None or not errors.over_runs:
         return 1
     # A quarter of the autocorrelation time loses a hundredth of the information at most.
@@ -415,11 +421,11 @@ def _every(group: Ensembles, quality: Quality, draws: int) -> int:
 
 
 def _samples(
-    segments: list[Segment], group: Ensembles, quality: Quality, short: list[str]
+    segments: list[Segment], group: Ensembles, quality: Quality, short: list[str], quick: bool
 ) -> Samples:
     kept = [s for s in segments if s.phase == "kept"]
     coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
-    every = _every(group, quality, coords.shape[0] * coords.shape[1])
+    every = _every(group, quality, coords.shape[0] * coords.shape[1], quick)
     # The last draw of each few, with what failed on the way to all of them.
     first = np.arange(coords.shape[1] % every, coords.shape[1], every)
     last = first + every - 1

@@ -11,6 +11,7 @@ from bayesoleo.errors import InputError
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._datatree import choose_all
+from bayesoleo.posterior._diagnostics import effective_size
 from bayesoleo.posterior._ensemble_moves import Ensembles, MoveWeights
 
 
@@ -115,6 +116,25 @@ def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(mon
     own = MoveWeights(0.5, 0.4, 0.1)
     sample(Gaussian(sd), mixture, seed=1, quick=True, progress=False, climbs=0, weights=own)
     assert set(shares) == {0.5}
+
+
+def test_a_quick_run_hands_on_draws_that_tell_something_new():
+    """Walkers that move slowly: one draw of each autocorrelation time, with what failed between."""
+    sd, slow = np.ones(8), MoveWeights(0.02, 0.9, 0.08)
+    options = {"seed": 1, "progress": False, "climbs": 0, "weights": slow}
+    mixture = normal_mixture(sd)
+    few = sample(Gaussian(sd), mixture, quick=True, **options)
+    chains, draws, _ = few.draws.shape
+    assert chains * draws >= 1000
+    tau = few.autocorrelation_time
+    assert tau.min() > 10
+    kept = few.evaluations // chains
+    assert draws < kept / (tau.min() - 1)
+    assert len(few.failed) == len(few.log_density[0]) == draws
+    # What is handed on tells as much as is said of all, but for a quarter and scatter.
+    own = effective_size(few.draws)
+    assert own.min() > 0.6 * few.effective_size.min()
+    within_error(few, np.zeros(8), sd)
 
 
 @pytest.mark.slow
