@@ -294,7 +294,7 @@ class StandingCall[S, T, R]:
     def __init__(self, function: Callable[[S, T], R], shared: S, jobs: int | None = None) -> None:
         jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
         self.function, self.shared, self._most = function, shared, jobs - 1
-        self._ready: list[int] = []
+        self._ready: dict[int, _Worker] = {}
         self._begun, self._mine = list[threading.Thread](), False
 
     @property
@@ -319,49 +319,50 @@ class StandingCall[S, T, R]:
         self._mine = True
         for number in range(self._most):
             thread = threading.Thread(target=self._prepare, args=(number, item), daemon=True)
-            self._begun.append(thread)
             thread.start()
+            self._begun.append(thread)
 
     def _prepare(self, number: int, item: T) -> None:
         with suppress(_LostError):
             worker = _worker(number)
             worker.ask(_sent((self.function, self.shared, None)))
             if worker.ask(_sent((0, item)))[0] != _ERROR:
-                self._ready.append(number)
+                self._ready[number] = worker
 
     def __call__(self, items: Sequence[T]) -> list[R]:
         """Results in the order of the items: the first from here, one from each other process, and
         what is left over from here."""
-        asked = self._ready[: len(items) - 1]
+        asked = list(self._ready.items())[: len(items) - 1]
         found: dict[int, R] = {}
         failed: list[BaseException] = []
 
-        def ask(number: int, index: int) -> None:
+        def ask(number: int, worker: _Worker, index: int) -> None:
             try:
-                kind, value = _worker(number).ask(_sent((index, items[index])))
+                kind, value = worker.ask(_sent((index, items[index])))
                 if kind == _ERROR:
                     failed.append(value)
                 else:
                     found[index] = value
             except _LostError:
-                self._ready.remove(number)
+                # One that is started in its place would not know what to do.
+                self._ready.pop(number, None)
                 _forget(number)
 
         threads = [
-            threading.Thread(target=ask, args=(number, 1 + k), daemon=True)
-            for k, number in enumerate(asked)
+            threading.Thread(target=ask, args=(*one, 1 + k), daemon=True)
+            for k, one in enumerate(asked)
         ]
-        for thread in threads:
-            thread.start()
         try:
+            for thread in threads:
+                thread.start()
             for index in (0, *range(1 + len(asked), len(items))):
                 found[index] = self.function(self.shared, items[index])
-        except BaseException:
-            kill_processes()  # nobody waits for what they are doing
-            raise
-        finally:
             for thread in threads:
                 thread.join()
+        except BaseException:
+            kill_processes()  # nobody waits for what they are doing
+            self._ready.clear()
+            raise
         if failed:
             raise failed[0]
         for index in range(len(items)):
@@ -375,10 +376,10 @@ class StandingCall[S, T, R]:
             return
         for thread in self._begun:
             thread.join()
-        for number in self._ready:
+        for worker in self._ready.values():
             with suppress(_LostError):
-                _worker(number).ask(_dumps((None, None, None)))
-        self._ready, self._mine = [], False
+                worker.ask(_dumps((None, None, None)))
+        self._ready, self._mine = {}, False
         _in_use.release()
 
 

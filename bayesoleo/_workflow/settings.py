@@ -251,7 +251,8 @@ class Settings:
     error_model : {"auto", "independent", "per-run", "full", "correlated", "discrepancy", ...}
         What the errors of the outputs have in common; see
         :mod:`bayesoleo.error_models`. By default the data decide: ``correlated`` where noise is
-        coloured, ``catalogue`` where more than noise is left, else ``independent``.
+        coloured, ``catalogue`` where more than noise is left (``power`` where that would let the
+        priors decide), else ``independent``.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated
         (:func:`bayesoleo.posterior.hierarchical`).

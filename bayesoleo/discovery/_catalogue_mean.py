@@ -4,12 +4,13 @@ The posterior is a mixture of normal distributions where outputs are linear in t
 (:meth:`~bayesoleo.error_models.CatalogueErrors.linearised`). Elsewhere its mean is approached in
 steps, as in the method of Gauss and Newton. A missing effect that may be large lets the mean lie
 far from the estimate, where the slopes of the outputs no longer hold. A step is therefore halved
-until the density at its end is what the slopes foresee.
+until the density at its end is about what the slopes foresee.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,15 +19,17 @@ from bayesoleo.error_models._base import Frame
 from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors, Linearised
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._least_squares import PriorScale
-from bayesoleo.estimation._problem import Evaluation
+from bayesoleo.estimation._problem import Evaluation, undisturbed
 
 #: Times that the estimate under the catalogue's errors is linearised anew.
 _PASSES = 8
 #: Step, in standard deviations, below which it is not.
 _SMALL = 0.1
-#: Times that a step is halved, and the fall of the log density from what the slopes foresee above
-#: which it is.
-_HALVINGS, _DOUBTED = 8, 2.0
+#: Times that a step is halved, the part of a foreseen rise of the log density that must come, and
+#: what it may lack of that or fall below a foreseen fall.
+_HALVINGS, _SOME, _DOUBTED = 8, 0.25, 0.1
+#: How far below the mean's an effect's own density may lie where that effect acts alone.
+_FAR = 20.0
 
 
 def linearised_of(problem: CampaignProblem, theta: Array) -> Linearised:
@@ -69,31 +72,67 @@ class _About:
         ]
 
 
-def shifted(problem: CampaignProblem, theta: Array) -> tuple[Array, Linearised, Array]:
-    """Mean of the posterior under the catalogue's errors, the last linearisation and its place."""
+@dataclass(frozen=True)
+class CatalogueMean:
+    """Where unknowns are if errors are those of the catalogue.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (l,)
+        Mean of their posterior, as far as the slopes of the outputs lead there.
+    found : Linearised
+        The last linearisation.
+    place : ndarray, shape (l,)
+        Where that was.
+    followed : bool
+        Whether it was reached, or a part of the way to it: not if no part of the first step was
+        believed.
+    """
+
+    theta: Array
+    found: Linearised
+    place: Array
+    followed: bool = True
+
+
+def shifted(problem: CampaignProblem, theta: Array) -> CatalogueMean:
+    """Mean of the posterior under the catalogue's errors, from an estimate."""
     about = _About(problem)
-    sd, here = about.scale.sd, problem.evaluate(theta)
-    for _ in range(_PASSES):
+    sd, here, followed = about.scale.sd, problem.evaluate(theta), True
+    for number in range(_PASSES):
         found, place = about.linearised(theta, here), theta
         step = found.shift * sd
         small = bool(np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd))
-        moved = _as_far_as_believed(about, theta, here, step)
-        if moved is None:
+        reached = _as_far_as_believed(about, theta, here, step)
+        if reached is None:
+            followed = small or number > 0
             break
-        theta, here = moved
+        theta, here = reached, problem.evaluate(reached)
         if small:
             break
-    return theta, found, place
+    return CatalogueMean(theta, found, place, followed)
 
 
-def _as_far_as_believed(
-    about: _About, theta: Array, here: Evaluation, step: Array
-) -> tuple[Array, Evaluation] | None:
-    """The step's largest part of one, a half, a quarter, ... that the outputs' slopes foresee.
+def believed(problem: CampaignProblem, place: Array, other: Array) -> bool:
+    """Whether the density at a place is not far below that at another one.
+
+    Both are in units of the unknowns, shape (l,).
+    """
+    about, heights = _About(problem), []
+    for theta in (place, other):
+        with undisturbed(problem):
+            there = problem.evaluate(theta)
+        heights.append(about.height(theta, there.residual) if there.status.ok else -np.inf)
+    return bool(heights[0] > heights[1] - _FAR)
+
+
+def _as_far_as_believed(about: _About, theta: Array, here: Evaluation, step: Array) -> Array | None:
+    """The end of the step's largest part of one, a half, a quarter, ... that is believed.
 
     A step to the mean of a linearised posterior may go far where an effect that is missing could
-    explain much: the density there must not be much less than what is promised, or than at the
-    start. None if no part does.
+    explain much. Where the slopes foresee a rise of the density, it must rise by some of that;
+    where they foresee a fall, for the mean of a mixture need not be its top, it must not fall
+    further. None if no part does.
     """
     low, high = np.array([prior.support for prior in about.problem.priors], dtype=float).T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -102,11 +141,13 @@ def _as_far_as_believed(
     before = about.height(theta, here.residual)
     for _ in range(_HALVINGS):
         trial = theta + length * step
-        there = about.problem.evaluate(trial)
+        with undisturbed(about.problem):
+            there = about.problem.evaluate(trial)
         if there.status.ok:
             slopes = zip(here.residual, here.sensitivity, strict=True)
-            foreseen = about.height(trial, [e - j @ (trial - theta) for e, j in slopes])
-            if about.height(trial, there.residual) > min(before, foreseen) - _DOUBTED:
-                return trial, there
+            rise = about.height(trial, [e - j @ (trial - theta) for e, j in slopes]) - before
+            least = _SOME * rise if rise > 0.0 else rise
+            if about.height(trial, there.residual) - before > least - _DOUBTED:
+                return trial
         length /= 2
     return None

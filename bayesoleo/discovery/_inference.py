@@ -13,7 +13,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._catalogue_mean import linearised_of, shifted
+from bayesoleo.discovery._catalogue_mean import believed, linearised_of, shifted
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._scanned_columns import Scanned
@@ -117,13 +117,13 @@ class Inference:
         """The log posterior density of a fitted model; the solver starts from the estimate."""
         problem, point = fit.problem, fit.point
         unknowns = None
+        if self.error_model == PowerErrors.word:
+            problem.effective = effective_at(problem, point.theta)
         if self.between_runs:
             unknowns = hierarchical(
                 problem, self.between_runs, theta=point.theta, errors=self.error_model
             )
         problem.freeze(point.theta)
-        if self.error_model == PowerErrors.word:
-            problem.effective = effective_at(problem, point.theta)
         density = LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
         density.reason = self.reason
         return density
@@ -153,6 +153,10 @@ MOST_LEFT, MOST_MORE = 0.8, 1.5
 _NO_MORE = (
     "{} errors, although {}. Errors of the catalogue would take {:.0%} of the signal of {} for"
     " missing effects{}; intervals may be too narrow"
+)
+_NOT_FOLLOWED = (
+    "{} errors, although {}. Outputs are too far from linear about the estimate to say where it"
+    " would be under errors of the catalogue{}; intervals may be too narrow"
 )
 _BECAUSE = " errors, chosen because "
 _PRIOR = ", since {} lies {:.3g} standard deviations from its prior"
@@ -232,7 +236,11 @@ def _unless_priors_decide(fit: ModelFit, reason: str) -> tuple[str, str]:
     A flexible discrepancy can explain anything, so that the estimate goes where the priors want it.
     """
     before = fit.problem.evaluate(fit.point.theta).residual
-    after = fit.problem.evaluate(shifted(fit.problem, fit.point.theta)[0])
+    mean = shifted(fit.problem, fit.point.theta)
+    if not mean.followed:
+        cause = reason.partition(_BECAUSE)[2]
+        return PowerErrors.word, _NOT_FOLLOWED.format(PowerErrors.word, cause, _conflict(fit))
+    after = fit.problem.evaluate(mean.theta)
     for b, output in enumerate(fit.predictor.outputs):
         signal = float(np.std(np.concatenate([run.measured[b] for run in fit.predictor.runs])))
         left = np.inf
@@ -336,7 +344,8 @@ def mode_of(density: LogDensity, fit: ModelFit) -> Mode:
     plain = isinstance(density.unknowns, PlainUnknowns)
     if density.errors.word != CATALOGUE or not plain:
         return find_mode(density, start_coordinates(density, fit.point.theta))
-    theta, found, _ = shifted(fit.problem, fit.point.theta)
+    mean = shifted(fit.problem, fit.point.theta)
+    theta, found = mean.theta, mean.found
     sd = np.array([prior.sd for prior in fit.problem.priors])
     fit.problem.freeze(theta)
     return _summary_mode(density, theta, found.covariance * np.outer(sd, sd))
@@ -398,14 +407,16 @@ def _catalogue_mixture(density: LogDensity, theta: Array) -> Mixture:
     These are what the posterior under errors of the catalogue is made of.
     """
     problem = cast(CampaignProblem, density.problem)
-    centre, found, origin = shifted(problem, theta)
+    mean = shifted(problem, theta)
+    centre, found, origin = mean.theta, mean.found, mean.place
     sd = np.array([prior.sd for prior in problem.priors])
     low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
     modes = []
-    for weight, mean, covariance in found.groups:
-        place = origin + mean * sd
-        inside = np.all((place > low) & (place < high)) and problem.evaluate(place).status.ok
-        if inside and weight > 0:
+    for weight, shift, covariance in found.groups:
+        place = origin + shift * sd
+        inside = weight > 0 and np.all((place > low) & (place < high))
+        # A step that was not believed leads nowhere for one effect alone either.
+        if inside and believed(problem, place, centre):
             mode = _summary_mode(density, place, covariance * np.outer(sd, sd))
             modes.append(replace(mode, log_weight=float(np.log(weight))))
     if not modes:

@@ -387,7 +387,7 @@ def searched(known: Progress, search: SearchOptions) -> Progress:
 def _rounds(known: Progress, search: SearchOptions) -> Progress:
     """Continue a search until a round accepts no effect."""
     numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
-    roles = _with_noise(search.roles, known)
+    roles, refused = _with_noise(search.roles, known), None
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
@@ -399,10 +399,16 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             effects=search.effects,
             seed=search.seed,
             limit=limit,
-            ahead=len(state.assembly.steps) + 2 <= max_effects,
+            ahead=state is not refused and len(state.assembly.steps) + 2 <= max_effects,
             keep_columns=search.keep_columns,
             callback=callback,
         )
+        if rounds and rounds[-1].on_trial and _names_no_cause(outcome):
+            callback("take back the last effect: no other one is confirmed with it")
+            refused = rounds[-1].before
+            known = replace(known, state=refused, rounds=rounds[:-1])
+            roles = _with_noise(search.roles, known)
+            continue
         if outcome.after is None and search.nonparametric and max_effects > 0:
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects
@@ -416,6 +422,11 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         known = known.after(outcome, state, notes)
         search.keep(known)
     return known
+
+
+def _names_no_cause(outcome: Round) -> bool:
+    """Whether a round added nothing that names a cause."""
+    return outcome.after is None or outcome.accepted is None or outcome.accepted.absorbs
 
 
 def _with_noise(roles: Roles, known: Progress) -> Roles:

@@ -63,6 +63,8 @@ class Round:
     reason: str
     tests: float
     nonparametric: CurveSearch | None = None
+    #: Whether the effect was added because of the one that the next round is to confirm.
+    on_trial: bool = False
     #: What the candidates change in the outputs, where it was kept.
     _scanned: Scanned | None = field(default=None, compare=False, repr=False)
 
@@ -126,6 +128,7 @@ def examine(
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
+    pair = None
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
 
         def follow(one: State) -> Round:
@@ -139,7 +142,10 @@ def examine(
         reason = f"with {accepted.effect} a run has no solution at the estimate"
         accepted, after = None, None
     scanned = scanned if after is None else None  # of a model that is final
-    return Round(state, ranking, failed, accepted, after, reason, tests, _scanned=scanned)
+    trial = pair is not None and after is not None
+    return Round(
+        state, ranking, failed, accepted, after, reason, tests, on_trial=trial, _scanned=scanned
+    )
 
 
 def _explains_nothing(result: Refit) -> bool:

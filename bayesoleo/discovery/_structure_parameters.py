@@ -335,7 +335,7 @@ class GivenStructure:
         ]
 
     def _bounds(self) -> list[tuple[float, Cell]]:
-        """All cells with bounds of their log weights, the largest first.
+        """All cells with rough bounds of their log weights, the largest first.
 
         Errors of inputs and the law are eliminated once for all sizes of the effects. An effect's
         moment is at most that of an amplitude far out in its density.
@@ -364,7 +364,8 @@ class GivenStructure:
         return gram[np.ix_(own, own)] - along.T @ along, log_det + float(self.logs[pattern])
 
     def _bound(self, cell: Cell, reduced: Array, log_det: float) -> float:
-        """The log weight of a cell is less than this."""
+        """What the log weight of a cell does not exceed by more than a small part of :data:`FAR`:
+        priors of unknowns are not scaled by its noise here."""
         count, known = len(self.names), self.offset.size
         power, precision = self._precision(cell)
         members = reduced.shape[0] - 1 - count

@@ -3,8 +3,9 @@
 A search adds one effect after the other, and confirms each on the hold-out runs. Where two are
 missing that both matter, such as dry friction and drag of one swing, a model with one of them may
 fit better and predict worse than one with none. All that is confirmed then may be a parameter that
-differs from run to run, which explains nothing. So before such a parameter is added, the named
-effects that fit best are each followed one round further.
+differs from run to run, which explains nothing. So before such a parameter is added, the few named
+effects that fit best are followed one round further. The first of a pair is added on trial: the
+next round must confirm another one, or it is taken back.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import stats
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
@@ -62,30 +64,40 @@ def confirmed_together(
         most. None where no pair does.
     """
     level, best = numerics.policy.significance, None
+    if not state.hold_errors.entries:
+        return None
     able = [item for item in ranking if item.refitted and item.p_value < level and not item.absorbs]
     for item in [one for one in able if _may_be(refits[id(one.score)])][:MOST]:
-        callback(f"follow {item.effect}, which hold-out runs do not confirm alone")
+        callback(f"follow {item.effect} one round further")
         result = refits[id(item.score)]
         one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+        if np.isnan(one.worst_ratio):
+            continue
         then = follow(one)
         if then.accepted is None or then.after is None or then.accepted.absorbs:
             continue
-        if not then.after.hold_errors.entries or np.isnan(then.after.worst_ratio):
-            continue
-        fall = fall_on_hold_out(*judged(state, then.after), result.inflation)
-        if fall.confirms and (best is None or fall.value > best[3].value):
+        other = then.accepted.refit
+        inflation = max(result.inflation, other.inflation if other is not None else 0.0)
+        fall = fall_on_hold_out(*judged(state, then.after), inflation)
+        if _confirms(fall) and (best is None or fall.value > best[3].value):
             best = item, one, then.accepted.effect, fall
     return None if best is None else (best[0], best[1], _reason(*best))
 
 
 def _may_be(result: Refit) -> bool:
-    """Whether an estimate explains enough, and is not as good as none."""
-    return bool(result.share >= result.policy.fair_share and result.excludes_null())
+    """Whether an estimate explains enough, is not as good as none, and is no stopgap itself."""
+    enough = result.share >= result.policy.fair_share and not result.unusual
+    return bool(enough and result.excludes_null())
+
+
+def _confirms(fall: Fall) -> bool:
+    """Whether the fall by two effects is significant, although a few pairs are tried."""
+    enough = float(stats.norm.isf(fall.policy.false_confirmation / MOST))
+    return bool(fall.value > max(enough * fall.error, 2.0 * enough**2))
 
 
 def _reason(item: Ranked, _: State, other: str, fall: Fall) -> str:
     return (
         f"{item.effect} explains {100 * item.gain:.0f} % of the excess, and with {other} lowers the"
-        f" error on hold-out runs, which it does not alone: the weighted squared error falls by"
-        f" {fall}"
+        f" error on hold-out runs: the weighted squared error falls by {fall}"
     )

@@ -39,6 +39,8 @@ POINTS_BESIDE, WITHIN_PRIOR = 2, 100.0
 BEYOND = 1e8
 #: By how much the logarithms of errors are enlarged at draws of a prior: far off, errors are large.
 LARGER_ERRORS = (0.0, 3.0, 6.0, 10.0)
+#: Part of the rows that may be taken before modes are made of what climbs have found.
+CLIMBING = 0.6
 #: Iterations of a climb, its differences, and the lengths tried of a step.
 ITERATIONS, DIFFERENCE = 25, 0.02
 LENGTHS = np.array([1.0, 3.0, 10.0, 30.0, 0.5, 0.25, 0.1, 0.03, 0.01, 1e-3])
@@ -135,7 +137,9 @@ def _search(
         return start, height.rows
     tops = height(height.whitened(start.centres))
     places = [height.whitened(mode.centre) for mode in known]
+    height.most = CLIMBING * most  # the rest is for what is found
     y, values = _climb(height, y, values, places, float(tops.max()))
+    height.most = most
     found: list[Mode] = []
     for place in np.argsort(-values):
         if values[place] < np.max(tops) + LOW or len(found) >= MOST_MODES:

@@ -312,11 +312,12 @@ def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar, tune
     """
     while not _is_warm(store.segments, schedule):
         rounds = sum(s.phase == "warm-up" for s in store.segments)
-        if tuned and rounds and _independence(store.segments[-1]) < MISSES:
-            group = replace(group, weights=_tuned(store.segments))
+        missed = tuned and rounds and _independence(store.segments[-1]) < MISSES
+        # By what is stored alone, so that a run that goes on after a stop has the same draws.
+        now = replace(group, weights=_tuned(store.segments)) if missed else group
         steps = schedule.warm_up * 2**rounds
         bar.show("warm-up", 0.0, store.segments)
-        store.append(group.advance(store.segments[-1], steps, "warm-up"))
+        store.append(now.advance(store.segments[-1], steps, "warm-up"))
 
 
 def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:

@@ -63,13 +63,16 @@ def test_one_step_is_enough_where_outputs_are_linear():
     rows = np.stack([NODES, np.cos(7 * NODES)], axis=1)
     priors = (Normal(0.5, 2.0), Normal(-1.0, 1.0))
     problem = Problem(lambda t: rows @ t, lambda _: rows, (2.0, -0.3), priors)
-    theta, found, place = shifted(problem, np.array([-1.0, 1.0]))
+    mean = shifted(problem, np.array([-1.0, 1.0]))
+    theta, found, place = mean.theta, mean.found, mean.place
+    assert mean.followed
     precision = rows.T @ rows + np.diag([0.25, 1.0])
     right = rows.T @ problem.data + np.array([0.5 / 4.0, -1.0])
     np.testing.assert_allclose(theta, np.linalg.solve(precision, right), rtol=1e-9)
     np.testing.assert_allclose(place, theta, rtol=1e-9)
     np.testing.assert_allclose(found.shift, 0.0, atol=1e-9)
-    assert len(problem.tried) == 3  # where it began, the step, and the small one that ended it
+    # Where it began; the step, and once more to stay there; and the small one that ended it.
+    assert len(problem.tried) == 5
 
 
 def saturating(gain):
@@ -91,7 +94,7 @@ def test_no_step_ends_far_below_what_slopes_foresee(start):
     curve, slope = saturating(10.0)
     priors = (Normal(0.0, 5.0), Normal(0.0, 5.0))
     problem = Problem(curve, slope, (1.0, 0.0), priors)
-    theta, _, _ = shifted(problem, np.array(start))
+    theta = shifted(problem, np.array(start)).theta
     begun, heights = problem.height(np.array(start)), problem.height(theta)
     assert heights > begun
     # What is left of the way within the passes is small beside the prior.
@@ -105,7 +108,7 @@ def test_a_step_into_what_cannot_be_solved_is_halved():
         return rows @ theta if theta[0] < 1.2 else np.full(NODES.size, np.nan)
 
     problem = Problem(curve, lambda _: rows, (1.0, 0.0), (Normal(6.0, 0.3), Normal(0.0, 1.0)))
-    theta, _, _ = shifted(problem, np.array([0.0, 0.0]))
+    theta = shifted(problem, np.array([0.0, 0.0])).theta
     assert 0.0 < theta[0] < 1.2
 
 
@@ -113,7 +116,7 @@ def test_supports_are_not_left():
     rows = np.stack([NODES, np.ones_like(NODES)], axis=1)
     priors = (LogNormal(1.0, 0.5), Uniform(-1.0, 1.0))
     problem = Problem(lambda t: rows @ t, lambda _: rows, (0.05, 0.99), priors)
-    theta, _, _ = shifted(problem, np.array([1.0, 0.0]))
+    theta = shifted(problem, np.array([1.0, 0.0])).theta
     assert all(tried[0] > 0.0 and abs(tried[1]) < 1.0 for tried in problem.tried)
     assert problem.height(theta) > problem.height(np.array([1.0, 0.0]))
 
@@ -127,8 +130,42 @@ def test_nothing_moves_where_no_part_of_a_step_is_believed():
 
     problem = Problem(curve, slope, (0.0, 0.0), (Normal(1.0, 1.0), Normal(1.0, 1.0)))
     start = np.array([0.0, 0.0])
-    theta, found, place = shifted(problem, start)
+    mean = shifted(problem, start)
+    theta, found, place = mean.theta, mean.found, mean.place
+    assert not mean.followed
     np.testing.assert_array_equal(theta, start)
     np.testing.assert_array_equal(place, start)
     assert np.isfinite(found.shift).all()
     assert len(problem.tried) == 2 + catalogue_mean._HALVINGS - 1
+
+
+def test_steps_do_not_go_downhill_where_a_rise_is_foreseen():
+    """A bent valley, along which each slope promises a rise."""
+
+    def curve(theta):
+        return np.array([10.0 * (theta[0] ** 2 - theta[1]), theta[0]])
+
+    def slope(theta):
+        return np.array([[20.0 * theta[0], -10.0], [1.0, 0.0]])
+
+    problem = Problem(curve, slope, (1.0, 1.0), (Normal(0.0, 30.0), Normal(0.0, 30.0)))
+    start = np.array([-1.5, 2.25])
+    height, theta = problem.height(start), start
+    for _ in range(3):
+        theta = shifted(problem, theta).theta
+        assert problem.height(theta) > height - 0.1 * catalogue_mean._PASSES
+        height = problem.height(theta)
+    np.testing.assert_allclose(theta, 1.0, atol=0.05)
+
+
+def test_an_effect_alone_is_believed_where_its_density_is_not_far_below():
+    rows = np.stack([NODES, np.ones_like(NODES)], axis=1)
+    problem = Problem(lambda t: rows @ t, lambda _: rows, (1.0, 0.0), (Normal(0.0, 9.0),) * 2)
+    mean = np.array([1.0, 0.0])
+    assert catalogue_mean.believed(problem, mean + 0.1, mean)
+    assert not catalogue_mean.believed(problem, mean + 10.0, mean)
+    cut = Problem(
+        lambda t: rows @ t if t[0] < 2.0 else np.full(NODES.size, np.nan),
+        lambda _: rows, (1.0, 0.0), (Normal(0.0, 9.0),) * 2,
+    )  # fmt: skip
+    assert not catalogue_mean.believed(cut, np.array([2.5, 0.0]), mean)

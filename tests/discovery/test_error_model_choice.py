@@ -12,6 +12,7 @@ from small_campaigns import damper, damper_campaign, spring_damper_force, with_f
 
 from bayesoleo.discovery import _inference as inference, _signatures as signatures
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
+from bayesoleo.discovery._catalogue_mean import CatalogueMean
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import LOOKED_FOR, Inference, chosen_for
 from bayesoleo.discovery._ranking import score_candidates
@@ -71,7 +72,7 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     monkeypatch.setattr(
         inference,
         "shifted",
-        lambda problem, theta: (0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
+        lambda problem, theta: CatalogueMean(0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
     )
     found = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
     # What is left is alike from sample to sample: it does not count as noise.
@@ -80,11 +81,38 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     # More than noise is left there, and that is not denied.
     assert "although more than noise is left" in found.reason
     assert "no more than noise" not in found.reason
+    monkeypatch.setattr(
+        inference,
+        "shifted",
+        lambda problem, theta: CatalogueMean(
+            theta, Linearised(9.0, theta, np.eye(3)), theta, followed=False
+        ),
+    )
+    lost = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
+    assert lost.error_model == "power"
+    assert "too far from linear about the estimate" in lost.reason
     # Nor is it said where effects are undecided and noise alone is left.
+    monkeypatch.setattr(
+        inference,
+        "shifted",
+        lambda problem, theta: CatalogueMean(0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
+    )
     monkeypatch.setattr(inference, "linearised_of", lambda *_: Linearised(-9.0, np.zeros(3), None))
     undecided = chosen_for(Inference("auto"), replace(fit), assembly, undecided=["drag"], jobs=1)
     assert "although effects that the data do not tell apart are left: drag." in undecided.reason
     assert fit.problem.signatures is None
+
+
+def test_power_errors_go_with_scatter_between_runs(tmp_path):
+    """As `auto` may choose them where a user lets a parameter scatter."""
+    both = Inference("power", ("damping",))
+    campaign = damper_campaign(tmp_path, with_friction)
+    model = both.declare(damper())
+    fit = fit_model(model, assign(campaign.records).fitted, NUMERICS, check_mesh=False)
+    density = both.density(fit)
+    assert any("damping" in name for name in density.names)
+    phi = density.coordinates(density.natural(np.zeros((1, density.dimension))))
+    np.testing.assert_allclose(phi, 0.0, atol=1e-9)
 
 
 EFFECTS = tuple(

@@ -84,12 +84,16 @@ def test_rows_are_the_same_to_the_last_bit(fit, eager):
     assert alone.failures.total() == 3
 
 
-def test_a_lost_process_costs_nothing_but_time(fit, eager):
+@pytest.mark.parametrize("known", [False, True])
+def test_a_lost_process_costs_nothing_but_time(fit, eager, known):
+    """Whether or not it is known to be lost when it is asked next."""
     phi = near(fit)
     expected, _ = density_of(fit, 1)(phi)
     shared = ready(SharedDensity(density_of(fit)), phi)
     try:
         processes._workers[0].process.kill()
+        if known:
+            processes._workers[0].process.wait()
         np.testing.assert_array_equal(shared(phi)[0], expected)
         assert shared._rows.others == 0
         np.testing.assert_array_equal(shared(phi)[0], expected)
