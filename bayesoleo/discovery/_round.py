@@ -131,10 +131,9 @@ def examine(
     pair = None
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
 
-        def follow(one: State) -> Round:
-            return examine(
-                one, roles, numerics, effects=effects, seed=seed, ahead=False, callback=callback
-            )
+        def follow(one: State) -> tuple[Ranked | None, State | None]:
+            then = examine(one, roles, numerics, effects=effects, seed=seed, callback=callback)
+            return then.accepted, then.after
 
         pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback)
         accepted, after, reason = pair or (accepted, after, reason)

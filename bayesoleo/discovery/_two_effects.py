@@ -11,7 +11,6 @@ next round must confirm another one, or it is taken back.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import stats
@@ -24,9 +23,6 @@ from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._state import State, fit_state
 
-if TYPE_CHECKING:
-    from bayesoleo.discovery._round import Round
-
 #: Effects that are followed.
 MOST = 3
 
@@ -37,7 +33,7 @@ def confirmed_together(
     refits: Mapping[int, Refit],
     roles: Roles,
     numerics: Numerics,
-    follow: Callable[[State], Round],
+    follow: Callable[[State], tuple[Ranked | None, State | None]],
     callback: ProgressCallback,
 ) -> tuple[Ranked, State, str] | None:
     """An effect that with the one found after it lowers the error on hold-out runs.
@@ -53,7 +49,7 @@ def confirmed_together(
     roles : Roles
     numerics : Numerics
     follow : callable
-        The round after a state.
+        Of a model: the effect that the next round adds to it, and the model with both.
     callback : callable
         Receives a message at each step.
 
@@ -73,14 +69,13 @@ def confirmed_together(
         one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         if np.isnan(one.worst_ratio):
             continue
-        then = follow(one)
-        if then.accepted is None or then.after is None or then.accepted.absorbs:
+        other, both = follow(one)
+        if other is None or both is None or other.absorbs:
             continue
-        other = then.accepted.refit
-        inflation = max(result.inflation, other.inflation if other is not None else 0.0)
-        fall = fall_on_hold_out(*judged(state, then.after), inflation)
+        inflation = max(result.inflation, 0.0 if other.refit is None else other.refit.inflation)
+        fall = fall_on_hold_out(*judged(state, both), inflation)
         if _confirms(fall) and (best is None or fall.value > best[3].value):
-            best = item, one, then.accepted.effect, fall
+            best = item, one, other.effect, fall
     return None if best is None else (best[0], best[1], _reason(*best))
 
 

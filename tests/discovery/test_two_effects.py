@@ -43,12 +43,12 @@ def looked(monkeypatch, items, then, falls, held=(1,)):
         followed.append(one.name)
         other = then.get(one.name)
         if other is None:
-            return SimpleNamespace(accepted=None, after=None)
+            return None, None
         after = SimpleNamespace(
             hold_errors=SimpleNamespace(entries=[1]), worst_ratio=2.0, first=one.name
         )
         accepted = SimpleNamespace(effect=other, absorbs=other == "varies by run", refit=None)
-        return SimpleNamespace(accepted=accepted, after=after)
+        return accepted, after
 
     monkeypatch.setattr(two_effects, "fit_state", fitted)
     monkeypatch.setattr(two_effects, "judged", lambda before, after: (before, after))
