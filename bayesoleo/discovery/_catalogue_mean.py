@@ -84,6 +84,8 @@ class CatalogueMean:
         The last linearisation.
     place : ndarray, shape (l,)
         Where that was.
+    about : _About
+        The errors, for what is asked of other places.
     followed : bool
         Whether it was reached, or a part of the way to it: not if no part of the first step was
         believed.
@@ -92,7 +94,18 @@ class CatalogueMean:
     theta: Array
     found: Linearised
     place: Array
+    about: _About
     followed: bool = True
+
+    def near(self, places: Sequence[Array]) -> list[bool]:
+        """Whether the density at places, each of shape (l,), is not far below that at the mean."""
+        heights = []
+        for theta in (self.theta, *places):
+            with undisturbed(self.about.problem):
+                there = self.about.problem.evaluate(theta)
+            known = there.status.ok
+            heights.append(self.about.height(theta, there.residual) if known else -np.inf)
+        return [bool(height > heights[0] - _FAR) for height in heights[1:]]
 
 
 def shifted(problem: CampaignProblem, theta: Array) -> CatalogueMean:
@@ -110,20 +123,7 @@ def shifted(problem: CampaignProblem, theta: Array) -> CatalogueMean:
         theta, here = reached, problem.evaluate(reached)
         if small:
             break
-    return CatalogueMean(theta, found, place, followed)
-
-
-def believed(problem: CampaignProblem, place: Array, other: Array) -> bool:
-    """Whether the density at a place is not far below that at another one.
-
-    Both are in units of the unknowns, shape (l,).
-    """
-    about, heights = _About(problem), []
-    for theta in (place, other):
-        with undisturbed(problem):
-            there = problem.evaluate(theta)
-        heights.append(about.height(theta, there.residual) if there.status.ok else -np.inf)
-    return bool(heights[0] > heights[1] - _FAR)
+    return CatalogueMean(theta, found, place, about, followed)
 
 
 def _as_far_as_believed(about: _About, theta: Array, here: Evaluation, step: Array) -> Array | None:

@@ -13,7 +13,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._catalogue_mean import believed, linearised_of, shifted
+from bayesoleo.discovery._catalogue_mean import linearised_of, shifted
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._scanned_columns import Scanned
@@ -411,12 +411,13 @@ def _catalogue_mixture(density: LogDensity, theta: Array) -> Mixture:
     centre, found, origin = mean.theta, mean.found, mean.place
     sd = np.array([prior.sd for prior in problem.priors])
     low, high = np.array([prior.support for prior in problem.priors], dtype=float).T
+    groups = [(weight, origin + shift * sd, spread) for weight, shift, spread in found.groups]
+    groups = [one for one in groups if one[0] > 0 and np.all((one[1] > low) & (one[1] < high))]
+    # A step that was not believed leads nowhere for one effect alone either.
+    near = mean.near([place for _, place, _ in groups])
     modes = []
-    for weight, shift, covariance in found.groups:
-        place = origin + shift * sd
-        inside = weight > 0 and np.all((place > low) & (place < high))
-        # A step that was not believed leads nowhere for one effect alone either.
-        if inside and believed(problem, place, centre):
+    for (weight, place, covariance), known in zip(groups, near, strict=True):
+        if known:
             mode = _summary_mode(density, place, covariance * np.outer(sd, sd))
             modes.append(replace(mode, log_weight=float(np.log(weight))))
     if not modes:

@@ -160,12 +160,13 @@ def test_steps_do_not_go_downhill_where_a_rise_is_foreseen():
 
 def test_an_effect_alone_is_believed_where_its_density_is_not_far_below():
     rows = np.stack([NODES, np.ones_like(NODES)], axis=1)
-    problem = Problem(lambda t: rows @ t, lambda _: rows, (1.0, 0.0), (Normal(0.0, 9.0),) * 2)
-    mean = np.array([1.0, 0.0])
-    assert catalogue_mean.believed(problem, mean + 0.1, mean)
-    assert not catalogue_mean.believed(problem, mean + 10.0, mean)
-    cut = Problem(
-        lambda t: rows @ t if t[0] < 2.0 else np.full(NODES.size, np.nan),
-        lambda _: rows, (1.0, 0.0), (Normal(0.0, 9.0),) * 2,
-    )  # fmt: skip
-    assert not catalogue_mean.believed(cut, np.array([2.5, 0.0]), mean)
+
+    def curve(theta):
+        return rows @ theta if theta[0] < 2.0 else np.full(NODES.size, np.nan)
+
+    problem = Problem(curve, lambda _: rows, (1.0, 0.0), (Normal(0.0, 9.0),) * 2)
+    mean = shifted(problem, np.array([0.5, 0.1]))
+    # Near it, far below it, and where nothing can be solved.
+    places = [mean.theta + 0.1, mean.theta - 10.0, np.array([2.5, 0.0])]
+    assert mean.near(places) == [True, False, False]
+    assert mean.near([]) == []

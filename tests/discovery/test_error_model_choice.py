@@ -72,7 +72,9 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     monkeypatch.setattr(
         inference,
         "shifted",
-        lambda problem, theta: CatalogueMean(0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
+        lambda problem, theta: CatalogueMean(
+            0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta, None
+        ),
     )
     found = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
     # What is left is alike from sample to sample: it does not count as noise.
@@ -85,7 +87,7 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
         inference,
         "shifted",
         lambda problem, theta: CatalogueMean(
-            theta, Linearised(9.0, theta, np.eye(3)), theta, followed=False
+            theta, Linearised(9.0, theta, np.eye(3)), theta, None, followed=False
         ),
     )
     lost = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)
@@ -95,7 +97,9 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     monkeypatch.setattr(
         inference,
         "shifted",
-        lambda problem, theta: CatalogueMean(0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta),
+        lambda problem, theta: CatalogueMean(
+            0.0 * theta, Linearised(9.0, theta, np.eye(3)), theta, None
+        ),
     )
     monkeypatch.setattr(inference, "linearised_of", lambda *_: Linearised(-9.0, np.zeros(3), None))
     undecided = chosen_for(Inference("auto"), replace(fit), assembly, undecided=["drag"], jobs=1)
