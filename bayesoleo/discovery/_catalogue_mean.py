@@ -23,8 +23,8 @@ from bayesoleo.estimation._problem import Evaluation, undisturbed
 
 #: Times that the estimate under the catalogue's errors is linearised anew.
 _PASSES = 8
-#: Step, in standard deviations, below which it is not.
-_SMALL = 0.1
+#: Step, in standard deviations, below which it is not, and below which the mean is known.
+_SMALL, _KNOWN = 0.1, 1.0
 #: Times that a step is halved, the part of a foreseen rise of the log density that must come, and
 #: what it may lack of that or fall below a foreseen fall.
 _HALVINGS, _SOME, _DOUBTED = 8, 0.25, 0.1
@@ -86,16 +86,16 @@ class CatalogueMean:
         Where that was.
     about : _About
         The errors, for what is asked of other places.
-    followed : bool
-        Whether it was reached, or a part of the way to it: not if no part of the first step was
-        believed.
+    settled : bool
+        Whether the mean was reached: the last step to it was shorter than a standard deviation, and
+        not the first one if no part of that was believed.
     """
 
     theta: Array
     found: Linearised
     place: Array
     about: _About
-    followed: bool = True
+    settled: bool = True
 
     def near(self, places: Sequence[Array]) -> list[bool]:
         """Whether the density at places, each of shape (l,), is not far below that at the mean."""
@@ -111,19 +111,44 @@ class CatalogueMean:
 def shifted(problem: CampaignProblem, theta: Array) -> CatalogueMean:
     """Mean of the posterior under the catalogue's errors, from an estimate."""
     about = _About(problem)
-    sd, here, followed = about.scale.sd, problem.evaluate(theta), True
+    sd, here, length = about.scale.sd, problem.evaluate(theta), np.inf
     for number in range(_PASSES):
         found, place = about.linearised(theta, here), theta
-        step = found.shift * sd
-        small = bool(np.all(np.abs(step) < _SMALL * np.sqrt(np.diag(found.covariance)) * sd))
-        reached = _as_far_as_believed(about, theta, here, step)
+        step = _inside(found, _room(about, theta))
+        length = float(np.max(np.abs(step) / np.sqrt(np.diag(found.covariance))))
+        reached = _as_far_as_believed(about, theta, here, step * sd)
         if reached is None:
-            followed = small or number > 0
+            length = np.inf if number == 0 and length >= _SMALL else length
             break
         theta, here = reached, problem.evaluate(reached)
-        if small:
+        if length < _SMALL:
             break
-    return CatalogueMean(theta, found, place, about, followed)
+    return CatalogueMean(theta, found, place, about, length < _KNOWN)
+
+
+def _room(about: _About, theta: Array) -> tuple[Array, Array]:
+    """From unknowns to the limits of their supports, in units of the priors' deviations."""
+    low, high = np.array([prior.support for prior in about.problem.priors], dtype=float).T
+    return (low - theta) / about.scale.sd, (high - theta) / about.scale.sd
+
+
+def _inside(found: Linearised, room: tuple[Array, Array]) -> Array:
+    """The step to the mean, in units of the priors' deviations, that leaves no support.
+
+    An unknown that would go further goes half the way to its limit, and all others where they are
+    most likely given that.
+    """
+    least, most = (0.5 * one for one in room)
+    mean, covariance = found.shift, found.covariance
+    step, held = mean, np.zeros(mean.size, dtype=bool)
+    while True:
+        beyond = ~held & ((step < least) | (step > most))
+        if not beyond.any():
+            return step
+        held |= beyond
+        step = np.where(held, np.clip(step, least, most), mean)
+        off = np.linalg.solve(covariance[np.ix_(held, held)], (step - mean)[held])
+        step[~held] += covariance[np.ix_(~held, held)] @ off
 
 
 def _as_far_as_believed(about: _About, theta: Array, here: Evaluation, step: Array) -> Array | None:
@@ -134,11 +159,7 @@ def _as_far_as_believed(about: _About, theta: Array, here: Evaluation, step: Arr
     where they foresee a fall, for the mean of a mixture need not be its top, it must not fall
     further. None if no part does.
     """
-    low, high = np.array([prior.support for prior in about.problem.priors], dtype=float).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(step > 0, (high - theta) / step, (low - theta) / step)
-    length = min(1.0, 0.5 * float(np.nanmin(np.where(step == 0, np.inf, room))))
-    before = about.height(theta, here.residual)
+    length, before = 1.0, about.height(theta, here.residual)
     for _ in range(_HALVINGS):
         trial = theta + length * step
         with undisturbed(about.problem):

@@ -154,7 +154,7 @@ _NO_MORE = (
     "{} errors, although {}. Errors of the catalogue would take {:.0%} of the signal of {} for"
     " missing effects{}; intervals may be too narrow"
 )
-_NOT_FOLLOWED = (
+_NOT_SETTLED = (
     "{} errors, although {}. Outputs are too far from linear about the estimate to say where it"
     " would be under errors of the catalogue{}; intervals may be too narrow"
 )
@@ -237,9 +237,9 @@ def _unless_priors_decide(fit: ModelFit, reason: str) -> tuple[str, str]:
     """
     before = fit.problem.evaluate(fit.point.theta).residual
     mean = shifted(fit.problem, fit.point.theta)
-    if not mean.followed:
+    if not mean.settled:
         cause = reason.partition(_BECAUSE)[2]
-        return PowerErrors.word, _NOT_FOLLOWED.format(PowerErrors.word, cause, _conflict(fit))
+        return PowerErrors.word, _NOT_SETTLED.format(PowerErrors.word, cause, _conflict(fit))
     after = fit.problem.evaluate(mean.theta)
     for b, output in enumerate(fit.predictor.outputs):
         signal = float(np.std(np.concatenate([run.measured[b] for run in fit.predictor.runs])))

@@ -41,9 +41,9 @@ from bayesoleo.posterior._mode_search import with_other_modes
 CLIMBS, QUICK_CLIMBS = 32, 16
 #: Fraction of the evaluations that the mode search may take.
 SEARCHING = 0.25
-#: Evaluations of the log density at which a quick run ends, converged or not, but not before this
-#: number of steps of each walker: minutes, where a motion takes milliseconds.
-QUICK_EVALUATIONS, QUICK_STEPS = 40_000, 100
+#: Evaluations of the log density at which a quick run ends, converged or not, or before that many
+#: time steps are solved in all, but not before this number of steps of each walker: a few minutes.
+QUICK_EVALUATIONS, QUICK_TIME_STEPS, QUICK_STEPS = 40_000, 100_000_000, 64
 #: Acceptance of the independence move below which its mixture misses the posterior.
 MISSES = 0.15
 #: Draws that are handed on at least, where each one costs a factorisation for each run, and by
@@ -178,7 +178,7 @@ def sample(
         Draws of the longest checkpointed segment.
     quick : bool
         Shorter warm-up, an effective size of at most 200 and not more than
-        :data:`QUICK_EVALUATIONS`.
+        :data:`QUICK_EVALUATIONS`, fewer where each solves long runs.
     climbs : int, optional
         Starting points of the search for modes that the start does not have, by default
         32, with ``quick`` 16; zero disables it. Without the search, walkers that all start in one
@@ -218,7 +218,8 @@ def sample(
         log_density, ensembles, walkers or default_walkers(dimension), weights or MoveWeights()
     )
     if quick:
-        max_evaluations = min(max_evaluations, max(QUICK_EVALUATIONS, QUICK_STEPS * group.chains))
+        most = max(_quick_evaluations(log_density), QUICK_STEPS * group.chains)
+        max_evaluations = min(max_evaluations, most)
     schedule = _schedule(effective_size, max_evaluations, segment, quick)
     number = (QUICK_CLIMBS if quick else CLIMBS) if climbs is None else climbs
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
@@ -253,6 +254,15 @@ def _shared(group: Ensembles) -> Iterator[Ensembles]:
         yield replace(group, log_density=shared)
     finally:
         shared.end()
+
+
+def _quick_evaluations(log_density: Density) -> int:
+    """Evaluations of a quick run: fewer where the runs of one take many time steps."""
+    problem = getattr(log_density, "problem", None)
+    if not isinstance(problem, CampaignProblem):
+        return QUICK_EVALUATIONS
+    steps = sum(run.steps for run in problem.predictor.runs)
+    return min(QUICK_EVALUATIONS, QUICK_TIME_STEPS // max(steps, 1))
 
 
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:

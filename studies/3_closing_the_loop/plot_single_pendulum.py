@@ -45,8 +45,10 @@ figure = study.figure("course", lambda: pages.course(tree, "angle", "validation 
 # 1.6 rad to 0.3: what differs from run to run is what changes with the amplitude. Viscous friction
 # of each run's own takes that up, on the validation records too, where it is estimated on them.
 # Dry friction with drag of the air is a pair, and no effect alone. The present search looks one
-# round ahead before it adds what differs from run to run: before its end it had found backlash with
-# breakaway friction, which leave 0.87 mrad of the fitted records and 6.4 mrad of the others.
+# round ahead before it adds what differs from run to run. It ends with power-law damping, Bouc-Wen
+# hysteresis and a constant force, which leave 0.87 mrad of the fitted records and 6.4 mrad of the
+# others. On its way it had backlash with breakaway friction, which leave more of the fitted records
+# and less of the others.
 # ``python tests/benchmarks/measured_limits.py --only pendulum`` fits it by code of its own: sharp
 # Coulomb friction, drag and a constant force leave 0.94 mrad of the fitted records and 4.3 mrad of
 # the others. Friction over a wide range of velocities leaves 0.84 and 9.5 mrad: the fitted records

@@ -65,7 +65,7 @@ def test_one_step_is_enough_where_outputs_are_linear():
     problem = Problem(lambda t: rows @ t, lambda _: rows, (2.0, -0.3), priors)
     mean = shifted(problem, np.array([-1.0, 1.0]))
     theta, found, place = mean.theta, mean.found, mean.place
-    assert mean.followed
+    assert mean.settled
     precision = rows.T @ rows + np.diag([0.25, 1.0])
     right = rows.T @ problem.data + np.array([0.5 / 4.0, -1.0])
     np.testing.assert_allclose(theta, np.linalg.solve(precision, right), rtol=1e-9)
@@ -121,6 +121,37 @@ def test_supports_are_not_left():
     assert problem.height(theta) > problem.height(np.array([1.0, 0.0]))
 
 
+def test_others_go_where_they_are_most_likely_beside_one_at_its_limit():
+    """The density of a linear model is highest at a limit: known in closed form."""
+    rows = np.stack([NODES, np.ones_like(NODES)], axis=1)
+    priors = (Uniform(0.5, 3.0), Normal(0.0, 3.0))
+    problem = Problem(lambda t: rows @ t, lambda _: rows, (-2.0, 1.0), priors)
+    mean = shifted(problem, np.array([1.0, -0.5]))
+    assert mean.settled
+    # The first unknown nears its limit by halves, up to a tenth of its standard deviation of 0.5. A
+    # uniform prior has no slope.
+    assert 0.5 < mean.theta[0] < 0.55
+    left = problem.data - rows[:, 0] * mean.theta[0]
+    best = left @ rows[:, 1] / (rows[:, 1] @ rows[:, 1] + 1 / 9.0)
+    assert mean.theta[1] == pytest.approx(best, abs=0.02)
+
+
+def test_a_mean_that_is_still_far_off_is_not_settled():
+    """A bent valley, along which eight steps do not lead to the end."""
+
+    def curve(theta):
+        return np.array([300.0 * (theta[0] ** 2 - theta[1]), theta[0]])
+
+    def slope(theta):
+        return np.array([[600.0 * theta[0], -300.0], [1.0, 0.0]])
+
+    priors = (Normal(0.0, 300.0), Normal(0.0, 300.0))
+    problem = Problem(curve, slope, (9.0, 81.0), priors)
+    first = shifted(problem, np.array([-9.0, 81.0]))
+    assert not first.settled
+    assert shifted(problem, np.array([9.0, 81.0])).settled
+
+
 def test_nothing_moves_where_no_part_of_a_step_is_believed():
     def curve(theta):
         return np.full(NODES.size, np.nan) if theta[0] else np.ones(NODES.size)
@@ -132,7 +163,7 @@ def test_nothing_moves_where_no_part_of_a_step_is_believed():
     start = np.array([0.0, 0.0])
     mean = shifted(problem, start)
     theta, found, place = mean.theta, mean.found, mean.place
-    assert not mean.followed
+    assert not mean.settled
     np.testing.assert_array_equal(theta, start)
     np.testing.assert_array_equal(place, start)
     assert np.isfinite(found.shift).all()

@@ -87,7 +87,7 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
         inference,
         "shifted",
         lambda problem, theta: CatalogueMean(
-            theta, Linearised(9.0, theta, np.eye(3)), theta, None, followed=False
+            theta, Linearised(9.0, theta, np.eye(3)), theta, None, settled=False
         ),
     )
     lost = chosen_for(Inference("auto"), replace(fit), assembly, jobs=1)

@@ -1,6 +1,7 @@
 """Sampling against closed forms and quadrature, and when it stops."""
 
 from itertools import groupby
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from posterior_gas_spring import gas_spring, quadrature
 from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
-from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture, sample
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.posterior import LogDensity, Mixture, _sampler, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._datatree import choose_all
 from bayesoleo.posterior._diagnostics import effective_size
@@ -43,6 +45,30 @@ def test_interrupt_passes_without_a_word(capfd):
     with pytest.raises(KeyboardInterrupt):
         sample(Interrupted(np.ones(2)), mixture, seed=1, progress=False)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("steps", "evaluations"), [((128,) * 11, 40_000), ((4436, 4600, 4460, 4688), 5499)]
+)
+def test_a_quick_run_evaluates_less_where_runs_are_long(steps, evaluations):
+    problem = object.__new__(CampaignProblem)
+    problem.predictor = SimpleNamespace(runs=[SimpleNamespace(steps=n) for n in steps])
+    assert _sampler._quick_evaluations(SimpleNamespace(problem=problem)) == evaluations
+
+
+def test_what_is_no_campaign_has_no_long_runs():
+    assert _sampler._quick_evaluations(Gaussian(np.ones(2))) == _sampler.QUICK_EVALUATIONS
+
+
+def test_a_quick_run_of_long_runs_still_keeps_draws(monkeypatch):
+    """However long runs are, each walker moves often enough for draws to be kept."""
+    monkeypatch.setattr(_sampler, "_quick_evaluations", lambda _: 1)
+    target = Banana(np.ones(4))
+    samples = sample(target, normal_mixture(np.ones(4)), seed=1, quick=True, progress=False)
+    chains, draws = samples.draws.shape[:2]
+    assert draws >= 4
+    assert samples.evaluations <= _sampler.QUICK_STEPS * chains
+    assert samples.reached or "evaluations" in samples.warning
 
 
 @pytest.mark.parametrize("dimension", [1, 2, 9])
