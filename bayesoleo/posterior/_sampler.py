@@ -41,8 +41,8 @@ from bayesoleo.posterior._mode_search import with_other_modes
 CLIMBS, QUICK_CLIMBS = 32, 16
 #: Fraction of the evaluations that the mode search may take.
 SEARCHING = 0.25
-#: Evaluations of the log density at which a quick run ends, converged or not, or before that many
-#: time steps are solved in all, but not before this number of steps of each walker: a few minutes.
+#: Evaluations of the log density at which a quick run ends, converged or not, and time steps in all
+#: after which it ends too, but not before this number of moves of each walker: a few minutes.
 QUICK_EVALUATIONS, QUICK_TIME_STEPS, QUICK_STEPS = 40_000, 100_000_000, 64
 #: Acceptance of the independence move below which its mixture misses the posterior.
 MISSES = 0.15
@@ -178,7 +178,8 @@ def sample(
         Draws of the longest checkpointed segment.
     quick : bool
         Shorter warm-up, an effective size of at most 200 and not more than
-        :data:`QUICK_EVALUATIONS`, fewer where each solves long runs.
+        :data:`QUICK_EVALUATIONS`, fewer where each solves long runs, but
+        :data:`QUICK_STEPS` moves of each walker.
     climbs : int, optional
         Starting points of the search for modes that the start does not have, by default
         32, with ``quick`` 16; zero disables it. Without the search, walkers that all start in one
