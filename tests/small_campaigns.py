@@ -78,6 +78,7 @@ def damper_campaign(
     per_period: float = 100.37,
     offsets: Mapping[str, float] | None = None,
     coloured: float = 0.0,
+    transient: bool = False,
 ) -> ReducedCampaign:
     """Displacement-controlled runs; noise in N and m, white or AR(1) with a coefficient."""
     rng = np.random.default_rng(seed)
@@ -87,11 +88,16 @@ def damper_campaign(
         omega = 2 * np.pi * frequency
         x = amplitude * (np.sin(omega * time) + 0.05 * np.cos(2 * omega * time))
         v = amplitude * omega * (np.cos(omega * time) - 0.1 * np.sin(2 * omega * time))
+        if transient:
+            x = x + 0.4 * amplitude * np.sin(0.618 * omega * time)
+            v = v + 0.4 * amplitude * 0.618 * omega * np.cos(0.618 * omega * time)
         y = force(x, v, time) + (offsets or {}).get(label, 0.0)
         y = y + noise * _coloured(rng, time.size, coloured)
         x = x + input_noise * rng.standard_normal(time.size)
         samples = {"displacement": x, "force": y}
-        made.append(SimulatedRun(label, time, samples, frequency, role=role))
+        kind = "transient" if transient else "periodic"
+        known = None if transient else frequency
+        made.append(SimulatedRun(label, time, samples, known, role=role, kind=kind))
     write_campaign(
         folder,
         name="damper",

@@ -34,7 +34,9 @@ from bayesoleo.discovery._hold_out_confirmation import (
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, score_candidates
 from bayesoleo.discovery._refit import (
+    Inflation,
     Refit,
+    colour_of,
     compare,
     fall_from,
     inflation_along,
@@ -43,7 +45,7 @@ from bayesoleo.discovery._refit import (
     schwarz_price,
     start_from,
 )
-from bayesoleo.discovery._round import Progress, Round
+from bayesoleo.discovery._round import JUDGED, Progress, Round
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._effect import Effect
@@ -64,9 +66,14 @@ class Loss:
         Number of unknowns of the effect.
     scale : float
         Variance of the samples' noise along the change by the effect, over that of white noise,
-        times the dispersion of the residual.
+        times the dispersion of the residual; of transients the colour of the residual, by which
+        effects are taken on trial.
     price : float
         Price of one unknown, in units of the scale.
+    noise : float
+        Variance of the rise over that in white noise of the samples.
+    freedom : int
+        Degrees of freedom with which this is known; zero where it is assumed.
     """
 
     step: AddedEffect
@@ -74,6 +81,8 @@ class Loss:
     size: int
     scale: float
     price: float
+    noise: float
+    freedom: int
 
     @property
     def worth(self) -> float:
@@ -81,7 +90,7 @@ class Loss:
         return self.rise / self.scale - self.price * self.size
 
     def __str__(self) -> str:
-        error = float(np.sqrt(self.scale * (4.0 * max(self.rise, 0.0) + 2.0 * self.size)))
+        error = float(np.sqrt(self.noise * (4.0 * max(self.rise, 0.0) + 2.0 * self.size)))
         unknowns = "its unknown is" if self.size == 1 else f"its {self.size} unknowns are"
         return (
             f"without it the weighted squared error on fitted runs rises by"
@@ -164,7 +173,8 @@ def plainly_needed(
 
     The criterion is Wald's statistic. Where it differs much from the fall of the sum of squares, it
     is the smaller of the two (Hauck and Donner 1977, JASA 72, 851-853). An effect that was just
-    found to be needed is doubted only if that statistic is below the price of its unknowns.
+    found to be needed is doubted only if that statistic is below the price of its unknowns. What is
+    left of a transient is seldom white: its colour lowers the statistic.
     """
     point, names = state.fit.point, state.fit.problem.names
     index = [k for k, name in enumerate(names) if name.split("[")[0] in step.amplitudes]
@@ -173,25 +183,38 @@ def plainly_needed(
         return False
     distance = squared_distance(point.theta[index], covariance)
     factor = 1.0 if just_added else base.policy.plainly_needed
-    return bool(distance > factor * schwarz_price(base) * len(index))
+    enough = factor * schwarz_price(base) * len(index)
+    if distance > enough and not all(record.periodic for record in state.fit.records):
+        known = colour_of(state.fit, [names[k] for k in index])
+        distance = distance / known[0] if known is not None else 0.0
+    return bool(distance > enough)
 
 
 def loss_without(state: State, base: Base, step: AddedEffect, numerics: Numerics) -> Loss:
     """The loss without one effect of a model, after a new fit of all other unknowns."""
+    return compared_without(state, base, step, numerics)[0]
+
+
+def compared_without(
+    state: State, base: Base, step: AddedEffect, numerics: Numerics
+) -> tuple[Loss, ModelFit]:
+    """The loss without one effect of a model, and the fit of all other unknowns."""
     without = state.assembly.without(step).model()
     fit = quick_fit(base, without, base.fit.values, numerics)
     share, changes = compare(base, fit)
     names = [n for n in base.fit.problem.names if n not in fit.problem.names]
     measured = inflation_along(base, base.fit, names, changes)
+    found, spread = Inflation(1.0, 0) if measured is None else measured, dispersion(base)
+    scale = (found.value if found.colour is None else found.colour) * spread
     # The logarithm is that of the effective number of independent samples.
-    scale = (measured or (1.0, 0))[0] * dispersion(base)
     price = max(schwarz_price(base) - float(np.log(scale)), 1.0)
-    return Loss(step, -share * base.fall_back, len(names), scale, price)
+    rise, noise = -share * base.fall_back, found.value * spread
+    return Loss(step, rise, len(names), scale, price, noise, found.freedom), fit
 
 
 def dispersion(base: Base) -> float:
     """Mean square of the residual of periodic runs over that of the noise, at least one. For
-    transients it is one, because their inflation is measured on the whole residual."""
+    transients it is one, because their inflation holds it."""
     if not all(record.periodic for record in base.fit.records) or not base.excess > base.feigned:
         return 1.0
     return 1.0 + base.excess / max(base.noise, 1e-300)
@@ -310,8 +333,22 @@ def best_of_beam(
         callback(f"search again with {first.effect} as the first effect")
         other = _followed(progress, first, roles, numerics, follow, max_effects, callback)
         if other is not None and other.state.assembly.added:
-            best = _better(best, other, numerics.policy, callback)
-    return best
+            declared = roles.strategy == "declared"
+            best = _better(best, other, declared, numerics.policy, callback)
+    if best is progress or not _was_limited(best, max_effects):
+        return best
+    callback("go on with these effects")
+    return follow(replace(best, rounds=best.rounds[:-1]), max_effects)
+
+
+def _was_limited(found: Progress, max_effects: int) -> bool:
+    """Whether a search ended because it was to add no more effects, and more may be added."""
+    last = found.rounds[-1]
+    if last.reason == JUDGED:
+        return False
+    few = len(found.state.assembly.added) < max_effects and not found.state.at_floor
+    limited = found.finished and last.ranking and not any(item.refitted for item in last.ranking)
+    return bool(few and limited)
 
 
 def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
@@ -331,7 +368,7 @@ def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
         for item in opening.ranking
         if item.refit is not None
         and np.isfinite(item.refit.share)
-        and item.p_value < policy.significance
+        and item.may_be_tried(policy.significance)
         and not item.absorbs
         and item.score.option.candidate.family != FAMILY
     ]
@@ -390,11 +427,16 @@ def _together_confirmed(found: Progress) -> bool:
 
 
 def _better(
-    best: Progress, other: Progress, policy: SearchPolicy, callback: ProgressCallback
+    best: Progress,
+    other: Progress,
+    declared: bool,
+    policy: SearchPolicy,
+    callback: ProgressCallback,
 ) -> Progress:
     """The better of two finished searches; if both are about as likely, the other's effects join
-    its classes."""
-    gap, scale = likelihood_gap(best, other)
+    its classes. Hold-out runs count with the fitted ones where they are declared."""
+    fitted, scale = likelihood_gap(best, other)
+    gap = fitted + (scale * hold_out_gap(best.state, other.state) if declared else 0.0)
     if set(best.state.assembly.added) == set(other.state.assembly.added):
         return best
     if (best.state.at_floor and not other.state.at_floor) or contradicted(
@@ -405,7 +447,7 @@ def _better(
     symptom = _absorbs(best) and not _absorbs(other)
     equal = policy.equal_likelihood
     if gap > scale * (policy.decisive if curve else -equal if symptom else equal):
-        return _with_notes(best, other, gap, callback)
+        return _with_notes(best, other, fitted, callback, symptom=symptom)
     if abs(gap) <= equal * scale and not curve:
         return _with_classes(best, other)
     return best
@@ -417,7 +459,7 @@ def _absorbs(found: Progress) -> bool:
 
 
 def _with_notes(
-    best: Progress, other: Progress, gap: float, callback: ProgressCallback
+    best: Progress, other: Progress, gap: float, callback: ProgressCallback, *, symptom: bool = True
 ) -> Progress:
     """The other search, with a note on the effects that it replaces."""
     names, present = (
@@ -425,7 +467,12 @@ def _with_notes(
         for one in (other, best)
     )
     callback(f"take {names} instead of {present}")
-    way = f"falls by {gap:.3g}" if gap > 0 else f"rises by {-gap:.3g} only, and they name causes"
+    if gap > 0:
+        way = f"falls by {gap:.3g}"
+    elif symptom:
+        way = f"rises by {-gap:.3g} only, and they name causes"
+    else:
+        way = f"rises by {-gap:.3g}, and hold-out runs speak for them by more"
     note = (
         f"instead of {present} the model has {names}: with unknowns counted (Schwarz 1978) the"
         f" weighted squared error on fitted runs {way}"
@@ -447,6 +494,19 @@ def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
         worth.append(fall - price * len(state.fit.problem.names))
     left = replace(base, excess=base.excess - max(falls))
     return worth[1] - worth[0], dispersion(left) * max(map(_inflation, (one, other)))
+
+
+def hold_out_gap(one: State, other: State) -> float:
+    """Advantage of another model on the hold-out runs, as twice a logarithm of likelihoods.
+
+    The fall of the sum of squares is divided by the variance of the noise along the difference of
+    both models, over that of white noise. Errors of the parameters are part of this noise, of the
+    model that is known less.
+    """
+    fall = fall_on_hold_out(*judged(one, other))
+    error = max(fall.error, fall.scatter)
+    # Noise of the variance I gives the fall the variance 4 I times its mean.
+    return 4.0 * fall.expected * fall.value / error**2 if error > 0 else 0.0
 
 
 def _inflation(found: Progress) -> float:

@@ -17,13 +17,15 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo._types import Array, ProgressCallback
+from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._assembly import Roles, in_halves
 from bayesoleo.discovery._fit import Numerics, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._refit import Refit, noise_of_fit
 from bayesoleo.discovery._run_predictions import Prediction, crossed
 from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.prediction._run_errors import input_columns
 
 
@@ -62,6 +64,12 @@ class Fall:
         cause at the same significance."""
         enough = self.policy.confirming_errors
         return bool(self.value > max(enough * self.error, enough**2))
+
+    @property
+    def may_be_tried(self) -> bool:
+        """Whether the fall is large enough for an effect to be added on trial."""
+        least = self.policy.confirming_errors**2
+        return bool(self.value > max(self.policy.trial_errors * self.error, least))
 
     @property
     def contradicts(self) -> bool:
@@ -117,15 +125,17 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
     covariance ``1/w + B B'`` in ``y - a``, the input's included, gives it the variance
     ``4 d' w (1/w + B B') w d`` with ``d = b - a``; coloured noise multiplies the first part by the
     inflation. The remaining model error adds to it, and so do the errors of the parameters:
-    ``4 d' w J S J' w d`` with their sensitivities and covariance. Runs that could not be solved in
-    both states do not count.
+    ``4 d' w J S J' w d`` with their sensitivities and covariance. What the model leaves of a
+    transient holds all noise and the remaining error: its spectrum gives both parts. Runs that
+    could not be solved in both states do not count.
 
     Parameters
     ----------
     before, after : State
         Without and with the effect.
     inflation : float
-        Variance of the output's noise along the change by the effect, over that of white noise.
+        Variance of the output's noise along the change by the effect, over that of white noise;
+        for transients it is measured here instead.
 
     Returns
     -------
@@ -133,22 +143,24 @@ def fall_on_hold_out(before: State, after: State, inflation: float = 1.0) -> Fal
         The fall is reduced for each parameter that only the model with the effect estimates on
         the runs themselves: by the noise that such a parameter absorbs on average.
     """
-    fall = expected = variance = 0.0
+    runs: list[_RunFall] = []
     pulls = [np.zeros(len(state.fit.problem.names)) for state in (before, after)]
-    charged = sum(p.re_estimated for p in after.held_out)
-    charged -= sum(p.re_estimated for p in before.held_out)
+    charge = 0.0
     for old, new in zip(before.held_out, after.held_out, strict=True):
-        if not (old.status.ok and new.status.ok):
-            continue
-        parts = _of_run(before, after, old, new, inflation)
-        fall, expected, variance = fall + parts[0], expected + parts[1], variance + parts[2]
-        pulls[0] += _pull(before, old, before, new.y - old.y)
-        pulls[1] += _pull(after, new, before, new.y - old.y)
+        more, absorbs = new.re_estimated - old.re_estimated, inflation
+        if old.status.ok and new.status.ok:
+            runs.append(_of_run(before, after, old, new, inflation))
+            absorbs = runs[-1].inflation
+            pulls[0] += _pull(before, old, before, new.y - old.y)
+            pulls[1] += _pull(after, new, before, new.y - old.y)
+        charge += more * absorbs
+    variance = sum(run.variance for run in runs)
     error, spread = (
-        float(np.sqrt(variance + 4.0 * inflation * _known_to(state, pull)))
-        for state, pull in zip((before, after), pulls, strict=True)
+        float(np.sqrt(variance + 4.0 * _known_to(state, other, pull, inflation)))
+        for state, other, pull in zip((before, after), (after, before), pulls, strict=True)
     )
-    return Fall(fall - inflation * charged, error, expected, spread, before.policy)
+    value, expected = sum(run.value for run in runs), sum(run.expected for run in runs)
+    return Fall(value - charge, error, expected, spread, before.policy)
 
 
 def _pull(state: State, prediction: Prediction, measured: State, change: Array) -> Array:
@@ -169,22 +181,46 @@ def _pull(state: State, prediction: Prediction, measured: State, change: Array) 
     return found
 
 
-def _known_to(state: State, pull: Array) -> float:
-    """Variance along a direction by the errors of a fit's parameters."""
+def _known_to(state: State, other: State, pull: Array, inflation: float) -> float:
+    """Variance along a direction by the errors of a fit's parameters.
+
+    Those of transients follow the noise, with its spectrum, by what the better of both fits leaves.
+    """
     covariance = state.fit.point.covariance
     if not np.isfinite(covariance).all():
         return 0.0
-    return max(float(pull @ covariance @ pull), 0.0)
+    white = max(float(pull @ covariance @ pull), 0.0)
+    if not pull.any() or all(record.periodic for record in state.fit.records):
+        return inflation * white
+    mine, its = noise_of_fit(state.fit), noise_of_fit(other.fit)
+    level = float(np.mean(other.fit.point.variance / state.fit.point.variance))
+    if level < 1.0:
+        unit = np.sqrt(other.fit.point.variance / state.fit.point.variance)[:, None]
+        pairs = zip(mine, its, strict=True)
+        mine = [replace(run, residual=quiet.residual * unit) for run, quiet in pairs]
+    moved = [np.tensordot(covariance @ pull, run.columns, axes=1) for run in mine]
+    return max(coloured_variance(moved, mine)[0], min(level, 1.0) * white)
+
+
+@dataclass(frozen=True)
+class _RunFall:
+    """Fall in one run, its mean if the effect is right, its variance, and the variance of noise
+    along the change over that of a sample."""
+
+    value: float
+    expected: float
+    variance: float
+    inflation: float
 
 
 def _of_run(
     before: State, after: State, old: Prediction, new: Prediction, inflation: float
-) -> tuple[float, float, float]:
-    """Fall in one run, its mean if the effect is right, and its variance."""
+) -> _RunFall:
     predictor, record = old.predictor, old.record
     columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
     fall = expected = noise = remainder = 0.0
     moved: Array | float = 0.0
+    scaled = []
     for b, output in enumerate(new.predictor.outputs):
         entry = before.hold_errors.at(output, record.label)
         weight = entry.average.sigma**-2
@@ -196,13 +232,40 @@ def _of_run(
         expected += size
         pulled = weight * entry.input_scale * (columns[b] @ change)
         moved = moved + pulled
-        own = inflation * size + float(np.sum(np.square(pulled)))
-        noise += inflation * size
+        along = max(inflation * size, weight**2 * _between_harmonics(entry.spectrum, change))
+        own = along + float(np.sum(np.square(pulled)))
+        noise += along
+        scaled.append((change / entry.average.sigma, left / entry.average.sigma))
         if record.periodic and not after.at_floor:
             ratio = after.hold_errors.at(output, record.label).ratio_to_expected
             spread = max(ratio**2 - 1.0, 0.0) * own
             remainder += min(spread, weight**2 * surrogate_variance(change, left))
-    return fall, expected, 4.0 * (noise + float(np.sum(np.square(moved))) + remainder)
+    variance = noise + float(np.sum(np.square(moved))) + remainder
+    if not record.periodic:
+        changes, rests = (np.array(rows) for rows in zip(*scaled, strict=True))
+        variance = max(_noise_along(changes, rests), expected + float(np.sum(np.square(moved))))
+        inflation = variance / expected if expected > 0 else 1.0
+    return _RunFall(fall, expected, 4.0 * variance, inflation)
+
+
+def _between_harmonics(spectrum: NoiseSpectrum | None, change: Array) -> float:
+    """Variance of ``change @ noise`` in a periodic run, by its own noise between the harmonics;
+    zero where it has none."""
+    return 0.0 if spectrum is None else float(spectrum.power(change) @ spectrum.level)
+
+
+def _noise_along(changes: Array, rests: Array) -> float:
+    """Variance of ``changes @ noise`` in a transient, by what the better of two models leaves.
+
+    Parameters
+    ----------
+    changes, rests : ndarray, shape (ny, N)
+        What the second model changes, and what it leaves, in units of the noise of each output.
+    """
+    # No model leaves less than the noise: the smaller of the two residuals is nearer to it.
+    left = min(rests, rests + changes, key=lambda values: float(np.sum(values**2)))
+    nothing = np.zeros((0, *left.shape))
+    return coloured_variance([changes], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
 
 
 def surrogate_variance(change: Array, left: Array) -> float:
@@ -229,8 +292,14 @@ def confirmed(
     roles: Roles,
     numerics: Numerics,
     callback: ProgressCallback,
+    *,
+    on_trial: bool = False,
 ) -> tuple[State | None, str]:
-    """The state with an estimated effect, if the hold-out runs confirm it, and the reason."""
+    """The state with an estimated effect, if the hold-out runs confirm it, and the reason.
+
+    In transients an effect may be added on trial where the fall exceeds fewer standard errors: it
+    is judged in the final model (``_judged_together.py``).
+    """
     if not np.isfinite(result.share):
         return None, f"{item.effect} could not be estimated"
     policy = numerics.policy
@@ -264,6 +333,9 @@ def confirmed(
         other = fall_on_hold_out(*pair, result.inflation)
         fall = fall.and_by(other)
         where += f", which hardly shows it, and by {other} on the second half of fitted ones"
+    tried = on_trial and not all(record.periodic for record in state.fit.records)
+    if tried and fall.may_be_tried and not fall.confirms:
+        return after, f"{_explains(item)}; it is added on trial, because on {where}"
     if not fall.confirms:
         errors, alarms = policy.confirming_errors, 100 * policy.false_confirmation
         asked = f"{errors:.2f} standard errors are required (false alarms {alarms:g} %)"

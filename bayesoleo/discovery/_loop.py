@@ -24,11 +24,12 @@ from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
+from bayesoleo.discovery._judged_together import judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
-from bayesoleo.discovery._round import Progress, Round, examine
+from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state, state_of
@@ -387,11 +388,11 @@ def searched(known: Progress, search: SearchOptions) -> Progress:
 def _rounds(known: Progress, search: SearchOptions) -> Progress:
     """Continue a search until a round accepts no effect."""
     numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
-    roles, refused = _with_noise(search.roles, known), None
+    roles, refused, together = _with_noise(search.roles, known), None, None
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
-        limit = _limit(state, len(rounds), max_effects)
+        limit = JUDGED if state is together else _limit(state, len(rounds), max_effects)
         outcome = examine(
             state,
             roles,
@@ -409,6 +410,11 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             known = replace(known, state=refused, rounds=rounds[:-1])
             roles = _with_noise(search.roles, known)
             continue
+        if outcome.after is None and state is not together:
+            together = judged_together(state, roles, numerics, outcome.tests, notes, callback)
+            if together is not state:
+                known = replace(known, state=together, notes=tuple(notes))
+                continue
         if outcome.after is None and search.nonparametric and max_effects > 0:
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects

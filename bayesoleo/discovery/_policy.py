@@ -230,6 +230,13 @@ class SearchPolicy:
         0.025,
         "Probability that an effect is confirmed although it does not lower the hold-out error.",
     )
+    trial_errors: float = _value(
+        1.0,
+        "Standard errors by which the hold-out error must fall for an effect in a transient to be"
+        " added on trial.",
+        "beside what several missing effects leave none is significant; each is judged in the final"
+        " model",
+    )
     missed_confirmation: float = _value(
         0.025,
         "Probability of missing a real effect above which hold-out runs cannot judge it alone.",

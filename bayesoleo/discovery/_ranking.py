@@ -233,6 +233,8 @@ class Ranked:
     beside : Refit or None
         Its estimate beside the other effects of the final model, where these have changed since
         it was added.
+    p_on_trial : float or None
+        The p-value by which it is taken on trial; see :attr:`Refit.trial`.
     """
 
     score: Score
@@ -243,6 +245,11 @@ class Ranked:
     refit: Refit | None = None
     closest: tuple[tuple[str, float], ...] = ()
     beside: Refit | None = None
+    p_on_trial: float | None = None
+
+    def may_be_tried(self, level: float) -> bool:
+        """Whether it is significant enough to be added on trial."""
+        return (self.p_value if self.p_on_trial is None else self.p_on_trial) < level
 
     @property
     def effect(self) -> str:
@@ -341,15 +348,20 @@ def rank(
             fitted = None  # a failed estimate adds nothing to the score
         # The excess is known up to noise, so that a share may exceed one; it is limited to one.
         gain = min(score.share if fitted is None else max(fitted.share, 0.0), 1.0)
-        p = corrected_p(score if fitted is None else _estimated(score, fitted), tests)
-        ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted))
+        p = corrected_p(score if fitted is None else estimated(score, fitted), tests)
+        trial = None if fitted is None else corrected_p(_on_trial(score, fitted), tests)
+        ranked.append(Ranked(score, p, gain, fitted is not None, same, fitted, p_on_trial=trial))
     # Estimates are more reliable than scores and come first.
     return tuple(sorted(ranked, key=lambda item: (not item.refitted, -item.gain)))
 
 
-def _estimated(score: Score, fitted: Refit) -> Score:
+def estimated(score: Score, fitted: Refit) -> Score:
     """A score with the estimated values in place of those expected at the null."""
     return replace(score, fall=fitted.fall, inflation=fitted.inflation, freedom=fitted.freedom)
+
+
+def _on_trial(score: Score, fitted: Refit) -> Score:
+    return replace(estimated(score, fitted), inflation=fitted.trial)
 
 
 def _same(

@@ -53,7 +53,8 @@ class Refit:
         Remaining sum of squares beyond that of the noise, plus the excess that noise alone can
         cause.
     inflation : float
-        Variance of the new amplitudes over what white noise gives, where noise is coloured.
+        Variance of the fall of the sum of squares over what white noise gives, where noise is
+        coloured or, in a transient, larger than differences of neighbouring samples show.
     freedom : int
         Degrees of freedom of the inflation; zero where it is that of the score.
     fall : float
@@ -66,6 +67,9 @@ class Refit:
     policy : SearchPolicy
     feigned : float
         Excess that noise alone can cause.
+    colour : float, optional
+        Variance of the new amplitudes over that of the fit, which takes what is left for white; by
+        default the inflation.
     """
 
     score: Score
@@ -81,6 +85,7 @@ class Refit:
     price: float
     policy: SearchPolicy = SearchPolicy()
     feigned: float = 0.0
+    colour: float | None = None
 
     def resembles(self, other: Refit) -> bool:
         """Whether the data cannot distinguish two estimated effects.
@@ -143,6 +148,16 @@ class Refit:
         """Fall of the sum of squares beyond the price of the unknowns."""
         return self.fall - self.price * self.size
 
+    @property
+    def trial(self) -> float:
+        """Inflation by which an effect is taken on trial: the colour alone.
+
+        In a transient, slow noise and the error of the model look alike. Of several missing effects
+        each leaves the others, and beside them none would be significant. They are judged when what
+        is left is known: in the final model, beside each other.
+        """
+        return self.inflation if self.colour is None else self.colour
+
     def excludes_null(self) -> bool:
         """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
 
@@ -154,14 +169,14 @@ class Refit:
         851-853).
         """
         level, price = self.policy.excluded_null, self.policy.excluded_price * self.price
-        if self.fall / self.inflation > price * self.size:
+        if self.fall / self.trial > price * self.size:
             return True
         names = [name for name in self.fit.problem.names if name in self.score.names]
         index = [self.fit.problem.names.index(name) for name in names]
         value = self.fit.point.theta[index]
         # Coloured noise, measured by its scatter between periods, widens the white covariance.
         white = self.fit.point.covariance[np.ix_(index, index)]
-        covariance = white * self.inflation
+        covariance = white * self.trial
         if not np.isfinite(covariance).all():
             return False
         free = self.freedom or np.inf
@@ -215,13 +230,13 @@ def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Ref
     remaining = max(base.excess - share * base.fall_back, 0.0) + base.feigned
     grown = assembly.with_values(fit.shared)
     measured = inflation_along(base, fit, score.names, changes)
-    inflation, freedom = (score.inflation, score.freedom) if measured is None else measured
+    noise = Inflation(score.inflation, score.freedom) if measured is None else measured
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
     price = schwarz_price(base)
     return Refit(
-        score, grown, fit, share, contribution, remaining, inflation, freedom, fall, reached, price,
-        base.policy, base.feigned,
+        score, grown, fit, share, contribution, remaining, noise.value, noise.freedom, fall,
+        reached, price, base.policy, base.feigned, noise.colour,
     )  # fmt: skip
 
 
@@ -247,11 +262,30 @@ def schwarz_price(base: Base) -> float:
     return float(np.log(sum(run.residual.size for run in base.runs)))
 
 
+@dataclass(frozen=True)
+class Inflation:
+    """How much more an effect's part of the noise varies than white noise of the samples would.
+
+    Parameters
+    ----------
+    value : float
+        Of the sum of squares in units of the samples' noise, at least one.
+    freedom : int
+        Degrees of freedom with which it is known; zero where it is assumed.
+    colour : float, optional
+        Of the unknowns, over what the residual gives if it is taken for white; by default the
+        same.
+    """
+
+    value: float
+    freedom: int
+    colour: float | None = None
+
+
 def inflation_along(
     base: Base, fit: ModelFit, names: Sequence[str], changes: Sequence[Array]
-) -> tuple[float, int] | None:
-    """Variance of an effect's unknowns over that in white noise, and its degrees of freedom; None
-    where it is not finite.
+) -> Inflation | None:
+    """Variance along an effect over that in white noise; None where it is not finite.
 
     Parameters
     ----------
@@ -270,24 +304,32 @@ def inflation_along(
     at the null is poor for some effects, such as a lag where friction switches: its error is no
     noise, and the estimate avoids it. The residual of a transient is seldom white, and at the null
     it is mostly the effect itself. There the inflation is measured on the residual of the estimate.
-    Its white level is the residual's own, so that the inflation tells the colour alone.
+    Its colour is over the residual's own white level. A sum of squares is in units of the samples'
+    noise, which differences of neighbours show: slow noise and the remaining error of the model
+    are larger, and inflate it by their level too.
     """
+    if not all(np.isfinite(change).all() for change in changes):
+        return None
     if all(record.periodic for record in fit.records):
-        if not all(np.isfinite(change).all() for change in changes):
-            return None
-        return inflation_of(base, changes)
-    runs = [
-        _columns(run, predicted, fit)
-        for run, predicted in zip(fit.predictor.runs, fit.predictions, strict=True)
-    ]
-    if not all(np.isfinite(item).all() for pair in runs for item in pair):
+        return Inflation(*inflation_of(base, changes))
+    known = colour_of(fit, names)
+    if known is None:
+        return None
+    colour, freedom = known
+    return Inflation(colour * _level_along(base, fit, changes), freedom, colour)
+
+
+def colour_of(fit: ModelFit, names: Sequence[str]) -> tuple[float, int] | None:
+    """Largest variance of some unknowns over that of the fit, at least one, by the spectrum of what
+    it leaves, and its degrees of freedom; None where a run has no solution."""
+    noise = noise_of_fit(fit)
+    if not all(np.isfinite(part).all() for run in noise for part in (run.columns, run.residual)):
         return None
     covariance, worst, freedom = fit.point.covariance, 1.0, 0
-    noise = [RunNoise(residual, columns, covariance) for columns, residual in runs]
     for k, name in enumerate(fit.problem.names):
         if name not in names:
             continue
-        moved = [np.tensordot(covariance[k], columns, axes=1) for columns, _ in runs]
+        moved = [np.tensordot(covariance[k], run.columns, axes=1) for run in noise]
         variance, degrees = coloured_variance(moved, noise)
         ratio = variance / covariance[k, k]
         if ratio > worst:
@@ -295,13 +337,29 @@ def inflation_along(
     return worst, freedom
 
 
-def _columns(run: RunPredictor, predicted: RunPrediction, fit: ModelFit) -> tuple[Array, Array]:
-    """Sensitivities ``(l, ny, N)`` and residual of a run, in units of the noise of each output."""
+def _level_along(base: Base, fit: ModelFit, changes: Sequence[Array]) -> float:
+    """Mean square of what a fit leaves over that of the samples' noise, at least one; outputs
+    count as they are changed."""
+    whole = level = 0.0
+    for change, run in zip(changes, base.runs, strict=True):
+        size = change**2
+        left = np.repeat(fit.point.variance, change.size // fit.point.variance.size)
+        whole, level = whole + float(size.sum()), level + float(size @ (run.scale**2 * left))
+    return max(1.0, level / whole) if whole > 0 else 1.0
+
+
+def noise_of_fit(fit: ModelFit) -> list[RunNoise]:
+    """What a fit leaves of each run, in units of the noise of each output."""
+    pairs = zip(fit.predictor.runs, fit.predictions, strict=True)
+    return [_noise_of_run(run, predicted, fit) for run, predicted in pairs]
+
+
+def _noise_of_run(run: RunPredictor, predicted: RunPrediction, fit: ModelFit) -> RunNoise:
     layout = fit.predictor.layout.names
     free = [layout.index(name) for name in fit.problem.names]
     weight = weights(run.record) / np.sqrt(fit.point.variance)[:, None]
     columns = np.moveaxis(predicted.sensitivity[:, free], 1, 0) * weight
-    return columns, (run.measured - predicted.y) * weight
+    return RunNoise((run.measured - predicted.y) * weight, columns, fit.point.covariance)
 
 
 def new_parameters(assembly: Assembly, score: Score, policy: SearchPolicy) -> dict[str, Parameter]:

@@ -28,6 +28,7 @@ from bayesoleo.discovery._two_effects import confirmed_together
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
+JUDGED = "effects that were added on trial are not confirmed beside each other, and were removed"
 INSIGNIFICANT = "no effect is significant after the correction for the search"
 
 
@@ -279,7 +280,7 @@ def _choose(
     level = numerics.policy.significance
     last = {id(r): _only_absorbs(r, refits) for r in ranking if r.refitted}
     tried = sorted(
-        (item for item in ranking if item.refitted and item.p_value < level),
+        (item for item in ranking if item.refitted and item.may_be_tried(level)),
         key=lambda item: (last[id(item)], -item.gain),
     )
     reasons: list[str] = []
@@ -291,7 +292,7 @@ def _choose(
         result = refits[id(item.score)]
         if found is not None and not _as_good(result, refits[id(found[0].score)]):
             continue
-        after, reason = confirmed(state, item, result, roles, numerics, callback)
+        after, reason = confirmed(state, item, result, roles, numerics, callback, on_trial=True)
         if after is None:
             reasons.append(reason)
         elif after.at_floor or not result.reached:

@@ -62,7 +62,9 @@ def confirmed_together(
     level, best = numerics.policy.significance, None
     if not state.hold_errors.entries:
         return None
-    able = [item for item in ranking if item.refitted and item.p_value < level and not item.absorbs]
+    able = [
+        item for item in ranking if item.refitted and not item.absorbs and item.may_be_tried(level)
+    ]
     for item in [one for one in able if _may_be(refits[id(one.score)])][:MOST]:
         callback(f"follow {item.effect} one round further")
         result = refits[id(item.score)]

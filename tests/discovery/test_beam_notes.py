@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from scipy import stats
 
 from bayesoleo.discovery import _alternatives as beam
+from bayesoleo.discovery._hold_out_confirmation import Fall
+from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._round import Progress
 
 TRIED, ROLES = "play was removed again", "run b is held out"
@@ -39,3 +43,50 @@ def test_a_model_that_leaves_more_is_not_said_to_leave_less():
     assert "instead of offset the model has play" in told[0]
     assert told[0].endswith("falls by 12")
     assert told[1].endswith("rises by 3 only, and they name causes")
+    told = beam._with_notes(ended("offset"), ended("play"), -3.0, print, symptom=False).notes[-1]
+    assert told.endswith("rises by 3, and hold-out runs speak for them by more")
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_hold_out_runs_count_as_likelihoods_with_the_fitted_ones(monkeypatch, turn):
+    """A fall of noise with the variance I is I times twice a logarithm of likelihoods."""
+    rng = np.random.default_rng(2)
+    change, inflation = rng.standard_normal(200), 7.0
+    noise = np.sqrt(inflation) * rng.standard_normal(200)
+    one, other = noise + change, noise
+    size, fall = float(change @ change), float(np.sum(one**2) - np.sum(other**2))
+    found = Fall(turn * fall, 2.0 * np.sqrt(inflation * size), size)
+    monkeypatch.setattr(beam, "judged", lambda *states: states)
+    monkeypatch.setattr(beam, "fall_on_hold_out", lambda *_: found)
+    exact = np.sum(stats.norm.logpdf(other, scale=np.sqrt(inflation)))
+    exact -= np.sum(stats.norm.logpdf(one, scale=np.sqrt(inflation)))
+    assert beam.hold_out_gap(None, None) == pytest.approx(2.0 * turn * exact)
+    # Where parameters of either model are known less, hold-out runs say less.
+    found = Fall(fall, 1.0, size, 20.0 * np.sqrt(size))
+    assert abs(beam.hold_out_gap(None, None)) < 0.1 * abs(fall)
+
+
+@pytest.mark.parametrize(("by_others", "taken"), [(-30.0, "one"), (0.0, "both"), (30.0, "other")])
+@pytest.mark.parametrize("declared", [True, False])
+def test_of_two_models_that_fit_alike_hold_out_runs_take_one(
+    monkeypatch, declared, by_others, taken
+):
+    """Those that are held out in turn took part in the fits already, and count once."""
+    monkeypatch.setattr(beam, "likelihood_gap", lambda *_: (1.0, 2.0))
+    monkeypatch.setattr(beam, "hold_out_gap", lambda *_: by_others)
+    monkeypatch.setattr(beam, "contradicted", lambda *_: False)
+    monkeypatch.setattr(beam, "_with_classes", lambda *_: "both")
+    monkeypatch.setattr(beam, "_absorbs", lambda _: False)
+    one, other = (
+        SimpleNamespace(
+            state=SimpleNamespace(
+                assembly=SimpleNamespace(added=(name,), steps=()), at_floor=False
+            ),
+            rounds=(),
+        )
+        for name in ("one", "other")
+    )
+    monkeypatch.setattr(beam, "_with_notes", lambda _, found, *__, **___: found)
+    found = beam._better(one, other, declared, SearchPolicy(), print)
+    known = {id(one): "one", id(other): "other"}
+    assert known.get(id(found), found) == (taken if declared else "both")

@@ -33,13 +33,19 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
     results = dict(zip("ab", map(estimated, worths), strict=True))
     ranking = [
         SimpleNamespace(
-            effect=name, score=result.score, refitted=True, p_value=1e-9, gain=0.9, absorbs=False
+            effect=name,
+            score=result.score,
+            refitted=True,
+            gain=0.9,
+            absorbs=False,
+            may_be_tried=lambda level: level > 1e-9,
         )
         for name, result in results.items()
     ]
     refits = {id(result.score): result for result in results.values()}
 
-    def confirmed(_, item, *__):
+    def confirmed(_, item, *__, on_trial):
+        assert on_trial
         after = SimpleNamespace(at_floor=at_floor[item.effect]) if item.effect in at_floor else None
         return after, item.effect
 

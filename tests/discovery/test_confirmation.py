@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fitted_states import NUMERICS, motion
-from scipy import stats
+from scipy import signal, stats
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.discovery import _hold_out_confirmation as confirmation
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._hold_out_confirmation import (
     Fall,
+    _RunFall,
     confirmed,
     fall_on_hold_out,
     judged,
@@ -192,6 +193,30 @@ def test_a_value_has_the_digits_that_its_error_leaves(value, error, text):
     assert with_error(value, error) == text
 
 
+@pytest.mark.parametrize("left_by", ["the model with the effect", "the model without it"])
+@pytest.mark.parametrize("colour", [0.0, 0.9, 0.97])
+def test_noise_of_a_transient_scatters_a_fall_as_much_as_is_said(monkeypatch, colour, left_by):
+    """The size of a sample's noise is that of its innovations; what the residual holds counts."""
+    monkeypatch.setattr(confirmation, "input_columns", lambda *_: np.zeros((1, 0, 400)))
+    rng, size = np.random.default_rng(5), 400
+    change = np.sin(2 * np.pi * np.arange(size) / 60) * np.exp(-np.arange(size) / 150)
+    drawn, said, inflation = [], [], []
+    for _ in range(400):
+        # As large as the innovations, which is all that differences of neighbours see.
+        noise = 0.5 * signal.lfilter([1.0], [1.0, -colour], rng.standard_normal(size + 300))[300:]
+        without = left_by == "the model without it"
+        fall = on_one_run(change, noise - change * without, ratio=1.0, periodic=False)
+        drawn.append(fall.value - (-1 if without else 1) * fall.expected)
+        said.append(fall.variance)
+        inflation.append(fall.inflation)
+    # A variance from 400 draws scatters by 7 %. Averages over lines give a line on a steep slope
+    # some of the power of slower ones, and a larger residual where the change acts counts, a
+    # smaller one does not: what is said is half as large again at most, and not too small.
+    assert 0.8 < np.mean(said) / np.var(drawn) < 1.7
+    # White noise is judged no smaller than it is; slow noise has here over ten times its power.
+    assert (1.0 <= np.mean(inflation) < 1.4) if colour == 0.0 else np.mean(inflation) > 10
+
+
 @pytest.mark.parametrize("size", [200, 201])
 def test_a_remainder_with_random_phases_scatters_as_computed(size):
     rng = np.random.default_rng(3)
@@ -291,14 +316,14 @@ def test_next_to_nothing_confirms_nothing_however_sure():
     assert Fall(100.0, 13.0, 100.0).confirms
 
 
-def on_one_run(change, left, *, ratio, inflation=1.0):
-    """Fall, its mean and its variance in one periodic run with noise of 0.5, by ``_of_run``."""
+def on_one_run(change, left, *, ratio, inflation=1.0, periodic=True):
+    """Fall, its mean and its variance in one run with noise of 0.5, by ``_of_run``."""
     samples = left + change
     record = SimpleNamespace(
-        label="a", samples={"y": samples}, kept=None, time=np.arange(left.size), periodic=True
+        label="a", samples={"y": samples}, kept=None, time=np.arange(left.size), periodic=periodic
     )
     entry = SimpleNamespace(
-        average=SimpleNamespace(sigma=0.5), input_scale=1.0, ratio_to_expected=ratio
+        average=SimpleNamespace(sigma=0.5), input_scale=1.0, ratio_to_expected=ratio, spectrum=None
     )
     state = SimpleNamespace(hold_errors=SimpleNamespace(at=lambda *_: entry), at_floor=False)
     predictor = SimpleNamespace(outputs=("y",), runs=[None], constants=lambda *_: np.zeros((1, 1)))
@@ -318,15 +343,15 @@ def test_white_noise_scatters_a_fall_by_twice_the_root_of_its_mean(monkeypatch, 
     drawn, said = [], []
     for _ in range(2000):
         left = 0.5 * np.sqrt(inflation) * rng.standard_normal(60)
-        fall, mean, variance = on_one_run(change, left, ratio=1.0, inflation=inflation)
-        drawn.append(fall - mean)
-        said.append(variance)
+        fall = on_one_run(change, left, ratio=1.0, inflation=inflation)
+        drawn.append(fall.value - fall.expected)
+        said.append(fall.variance)
     assert np.ptp(said) == pytest.approx(0.0, abs=1e-9)
     # A variance from 2000 draws scatters by 3 %.
     assert said[0] == pytest.approx(np.var(drawn), rel=0.13)
     # What exceeds the expected error thrice repeats: eight parts more at most.
     left = 1.5 * np.sqrt(2) * change
-    more = on_one_run(change, left, ratio=3.0, inflation=inflation)[2]
+    more = on_one_run(change, left, ratio=3.0, inflation=inflation).variance
     assert said[0] < more < 10 * said[0]
 
 
@@ -358,11 +383,13 @@ def test_errors_of_the_parameters_move_a_fall_by_twice_their_pull(monkeypatch):
     def state(known):
         prediction = SimpleNamespace(re_estimated=0, status=status, y=np.zeros((1, 30)))
         fit = SimpleNamespace(
-            problem=SimpleNamespace(names=names), point=SimpleNamespace(covariance=known)
+            problem=SimpleNamespace(names=names),
+            point=SimpleNamespace(covariance=known),
+            records=[SimpleNamespace(periodic=True)],
         )
         return SimpleNamespace(held_out=[prediction], fit=fit, policy=SearchPolicy())
 
-    monkeypatch.setattr(confirmation, "_of_run", lambda *_: (0.0, 1.0, 0.0))
+    monkeypatch.setattr(confirmation, "_of_run", lambda *_: _RunFall(0.0, 1.0, 0.0, 1.0))
     monkeypatch.setattr(confirmation, "_pull", lambda *_: pull)
     found = fall_on_hold_out(state(spread), state(np.zeros((2, 2))))
     errors = rng.multivariate_normal(np.zeros(2), spread, 20_000)

@@ -9,10 +9,11 @@ import pytest
 from fitted_states import NUMERICS
 
 from bayesoleo.discovery import _loop as loop, _two_effects as two_effects
+from bayesoleo.discovery._alternatives import _was_limited
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._hold_out_confirmation import Fall
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._round import Progress, Round
+from bayesoleo.discovery._round import JUDGED, Progress, Round
 
 POLICY = SearchPolicy()
 
@@ -25,8 +26,8 @@ def ranked(
         fit=SimpleNamespace(point=SimpleNamespace(theta=None)), inflation=1.0,
     )  # fmt: skip
     item = SimpleNamespace(
-        effect=name, gain=share, p_value=p_value, absorbs=absorbs, refitted=refitted,
-        score=SimpleNamespace(),
+        effect=name, gain=share, absorbs=absorbs, refitted=refitted, score=SimpleNamespace(),
+        may_be_tried=lambda level: p_value < level,
     )  # fmt: skip
     return item, result
 
@@ -155,6 +156,7 @@ def test_an_effect_on_trial_is_taken_back_where_no_other_one_is_confirmed(monkey
     monkeypatch.setattr(loop, "_with_noise", lambda roles, _: roles)
     monkeypatch.setattr(loop, "_ratios", lambda _: "")
     monkeypatch.setattr(loop, "_limit", lambda *_: "")
+    monkeypatch.setattr(loop, "judged_together", lambda one, *_: one)
     search = loop.SearchOptions(
         Roles((), (), "declared", ""), NUMERICS, None, 0, 4, False, lambda _: None, str
     )
@@ -165,3 +167,40 @@ def test_an_effect_on_trial_is_taken_back_where_no_other_one_is_confirmed(monkey
     assert found.state.name == "varies by run"
     assert [entry.on_trial for entry in found.rounds] == [False, False]
     assert found.finished
+
+
+def test_what_is_not_confirmed_beside_the_others_goes_and_is_not_sought_again(monkeypatch):
+    """Once no further effect is found; what is left then is ranked only."""
+    looks = []
+
+    def state(name):
+        assembly = SimpleNamespace(steps=[], added=())
+        errors = SimpleNamespace(record_noise=None)
+        return SimpleNamespace(name=name, assembly=assembly, errors=errors, at_floor=False)
+
+    declared, with_two, with_one = state("declared"), state("two"), state("one")
+
+    def examine(one, *_, limit, **__):
+        looks.append((one.name, limit))
+        after = with_two if one is declared else None
+        return Round(one, (), {}, SimpleNamespace(absorbs=False), after, limit, 1.0)
+
+    def together(one, *arguments):
+        arguments[3].append("a note")
+        return with_one if one is with_two else one
+
+    monkeypatch.setattr(loop, "examine", examine)
+    monkeypatch.setattr(loop, "eliminated", lambda after, *_: after)
+    monkeypatch.setattr(loop, "least_noise", lambda *_: None)
+    monkeypatch.setattr(loop, "_with_noise", lambda roles, _: roles)
+    monkeypatch.setattr(loop, "_ratios", lambda _: "")
+    monkeypatch.setattr(loop, "_limit", lambda *_: "")
+    monkeypatch.setattr(loop, "judged_together", together)
+    roles = Roles((), (), "declared", "")
+    search = loop.SearchOptions(roles, NUMERICS, None, 0, 4, False, lambda _: None, str)
+    found = loop._rounds(Progress(declared, declared), search)
+    assert looks == [("declared", ""), ("two", ""), ("one", JUDGED)]
+    assert found.state is with_one
+    assert found.finished
+    assert found.notes == ("a note",)
+    assert not _was_limited(found, 4), "the beam does not go on from there"

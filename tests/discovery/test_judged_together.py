@@ -1,0 +1,160 @@
+"""Effects in transients: taken on trial by the colour of what is left, kept by its level."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fitted_states import NUMERICS, options
+from scipy import stats
+from small_campaigns import FRICTION, damper, damper_campaign
+
+from bayesoleo.discovery._alternatives import Loss, plainly_needed
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._hold_out_confirmation import Fall
+from bayesoleo.discovery._judged_together import Evidence, judged_together
+from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._ranking import Ranked
+from bayesoleo.discovery._refit import new_parameters, refit
+from bayesoleo.discovery._score_tests import corrected_p, score_all
+from bayesoleo.discovery._state import State, fit_state
+
+POLICY = SearchPolicy()
+STEP = SimpleNamespace(effect=SimpleNamespace(id="coulomb_friction", family="friction"))
+
+
+def plain(x, v, _):
+    return 1000.0 * x + 200.0 * v
+
+
+def with_friction(x, v, _):
+    return plain(x, v, _) + FRICTION * np.sign(v)
+
+
+def campaign(folder, force, seed, coloured=0.97):
+    return damper_campaign(folder, force, seed=seed, coloured=coloured, transient=True, noise=1.0)
+
+
+def with_effects(reduced, *names):
+    """The damper with some effects added one after the other."""
+    roles = assign(reduced.records)
+    state = fit_state(Assembly(damper(cubic=False)), roles, NUMERICS)
+    for name in names:
+        score = score_all(state.base(), options(state, [name]), jobs=1)[0][0]
+        assembly = score.option.assembly
+        assembly = assembly.with_parameters(new_parameters(assembly, score, NUMERICS.policy))
+        state = fit_state(assembly, roles, NUMERICS)
+    return state, roles
+
+
+@pytest.mark.parametrize("coloured", [0.0, 0.97])
+def test_the_inflation_of_a_transient_holds_colour_and_level(tmp_path, coloured):
+    """Sums of squares are in units of what differences of neighbours show of the noise."""
+    ratios, tried = [], []
+    for seed in range(6):
+        reduced = campaign(tmp_path / str(seed), plain, seed, coloured)
+        state = fit_state(Assembly(damper(cubic=False)), assign(reduced.records), NUMERICS)
+        base = state.base()
+        score = score_all(base, options(state, ["quadratic_damping"]), jobs=1)[0][0]
+        result = refit(base, score, NUMERICS)
+        shown = np.mean([entry.average.sigma**2 for entry in state.fit_errors.entries])
+        assert result.inflation / result.trial == pytest.approx(1.0 / shown, rel=0.35)
+        ratios.append(result.fall / result.inflation)
+        tried.append(result.fall / result.trial)
+    # Six chi-square variates of one degree of freedom, about as known as noise is from few lines.
+    assert np.mean(ratios) < 3.0
+    if coloured:
+        assert np.mean(tried) > 10.0, "by the colour alone an absent effect is far too significant"
+
+
+def test_an_effect_is_tried_by_one_p_value_and_stated_with_the_other():
+    item = Ranked(None, 0.2, 0.5, True, (), p_on_trial=1e-6)
+    assert item.may_be_tried(0.01)
+    assert item.p_value == 0.2
+    assert not Ranked(None, 0.2, 0.5, False, ()).may_be_tried(0.01)
+    assert Fall(150.0, 100.0, 900.0).may_be_tried
+    assert not Fall(150.0, 100.0, 900.0).confirms
+    assert not Fall(50.0, 100.0, 900.0).may_be_tried
+    assert not Fall(3.0, 0.1, 3.0).may_be_tried, "one superfluous unknown would do as much"
+
+
+def evidence(value, rise, *, declared=True, held_out=True, freedom=20):
+    loss = Loss(STEP, rise, 2, 3.0, 2.0, 10.0, freedom)
+    return Evidence(loss, Fall(value, 100.0, 500.0) if held_out else None, 12.0, declared)
+
+
+def test_declared_runs_decide_by_the_errors_that_the_policy_asks_for():
+    assert evidence(190.0, 1e6).missing > 0.0
+    assert evidence(200.0, 0.0).missing < 0.0
+    assert evidence(-50.0, 1e6).missing > evidence(150.0, 1e6).missing
+    # As small as the fall of a superfluous unknown: not confirmed, however sure.
+    loss = Loss(STEP, 1e6, 2, 3.0, 2.0, 10.0, 20)
+    assert Evidence(loss, Fall(2.0, 0.1, 2.0), 12.0, declared=True).missing > 0.0
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+def test_runs_that_chose_an_effect_do_not_confirm_it_alone(held_out):
+    """The rise on fitted runs is an F variate, corrected for the search."""
+    edge = 1.0 - (1.0 - POLICY.significance) ** (1.0 / 12.0)
+    rise = 10.0 * 2 * stats.f.isf(edge, 2, 20)
+    for factor, stays in ((0.9, False), (1.1, True)):
+        found = evidence(300.0, factor * rise, declared=False, held_out=held_out)
+        assert (found.missing < 0.0) == stays
+    assert not evidence(np.nan, rise).is_known
+    assert not evidence(300.0, np.nan).is_known
+
+
+def test_a_friction_stays_and_what_slow_noise_feigned_goes(tmp_path):
+    state, roles = with_effects(campaign(tmp_path, with_friction, 4), "coulomb_friction", "preload")
+    assert len(state.assembly.steps) == 2
+    notes: list[str] = []
+    found = judged_together(state, roles, NUMERICS, 12.0, notes, lambda _: None)
+    assert [effect for effect, _ in found.assembly.added] == ["coulomb_friction"]
+    assert len(notes) == 1
+    assert notes[0].startswith("preload was added on trial and removed again")
+    assert "±" in notes[0]
+    again: list[str] = []
+    assert judged_together(found, roles, NUMERICS, 12.0, again, lambda _: None) is found
+    assert again == []
+
+
+def test_periodic_runs_are_judged_where_effects_are_added(tmp_path):
+    reduced = damper_campaign(tmp_path, with_friction)
+    state, roles = with_effects(reduced, "coulomb_friction", "preload")
+    assert judged_together(state, roles, NUMERICS, 12.0, [], lambda _: None) is state
+
+
+def test_what_slow_noise_feigns_is_not_plainly_needed(tmp_path):
+    """In white noise Wald's statistic would be that of thousands of independent samples."""
+    said, by_white = 0, 0
+    for seed in range(5):
+        state, _ = with_effects(campaign(tmp_path / str(seed), plain, seed), "quadratic_damping")
+        step = state.assembly.steps[0]
+        said += plainly_needed(state, state.base(), step, just_added=True)
+        by_white += plainly_needed(*_as_periodic(state), step, just_added=True)
+    assert by_white >= 2
+    assert said == 0
+
+
+def _as_periodic(state: State):
+    records = [SimpleNamespace(periodic=True)]
+    fit = SimpleNamespace(point=state.fit.point, problem=state.fit.problem, records=records)
+    return SimpleNamespace(fit=fit), state.base()
+
+
+def test_p_values_of_absent_effects_in_slow_noise_are_seldom_small(tmp_path):
+    small, tried = 0, 0
+    for seed in range(8):
+        reduced = campaign(tmp_path / str(seed), plain, seed)
+        state = fit_state(Assembly(damper(cubic=False)), assign(reduced.records), NUMERICS)
+        base = state.base()
+        for score in score_all(base, options(state, ["quadratic_damping"]), jobs=1)[0]:
+            result = refit(base, score, NUMERICS)
+            noise = {"fall": result.fall, "freedom": result.freedom}
+            stated = replace(score, inflation=result.inflation, **noise)
+            small += corrected_p(stated, 1.0) < 0.05
+            tried += corrected_p(replace(stated, inflation=result.trial), 1.0) < 0.05
+    assert small <= 2  # of eight at 5 %, three or more with a probability of 0.6 %
+    assert tried >= 5
