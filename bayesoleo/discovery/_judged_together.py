@@ -28,6 +28,9 @@ from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._nonparametric import FAMILY
 
+#: Begins the note on what confirms the final effects.
+TOGETHER = "confirmed beside the other effects of the final model"
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -101,7 +104,7 @@ def judged_together(
     tests : float
         Effective number of effects that each was chosen from.
     notes : list of str
-        Receives the removed effects with the reasons.
+        Receives the removed effects with the reasons, and what is lost without each that stays.
     callback : callable
         Receives a message at each step.
     """
@@ -113,6 +116,7 @@ def judged_together(
         found = _evidence(state, base, chosen, roles, numerics, tests)
         worst = max(found, key=lambda one: one.missing, default=None)
         if worst is None or not worst.missing > 0.0:
+            _note(found, notes)
             return state
         effect = worst.loss.step.effect.id
         callback(f"remove {effect}: {worst}")
@@ -124,6 +128,14 @@ def judged_together(
         start = start_from(base, base.fit.values, assembly.model())
         state = fit_state(assembly, roles, numerics, start=start, progress=callback)
     return state
+
+
+def _note(found: Sequence[Evidence], notes: list[str]) -> None:
+    """Note what confirms the effects of a final model, in place of what did so before."""
+    notes[:] = [note for note in notes if not note.startswith(TOGETHER)]
+    if found:
+        parts = [f"{one.loss.step.effect.id}: {one}" for one in found]
+        notes.append(f"{TOGETHER}; {'; '.join(parts)}")
 
 
 def _evidence(

@@ -14,7 +14,7 @@ from small_campaigns import FRICTION, damper, damper_campaign
 from bayesoleo.discovery._alternatives import Loss, plainly_needed
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._hold_out_confirmation import Fall
-from bayesoleo.discovery._judged_together import Evidence, judged_together
+from bayesoleo.discovery._judged_together import TOGETHER, Evidence, judged_together
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import new_parameters, refit
@@ -112,12 +112,13 @@ def test_a_friction_stays_and_what_slow_noise_feigned_goes(tmp_path):
     notes: list[str] = []
     found = judged_together(state, roles, NUMERICS, 12.0, notes, lambda _: None)
     assert [effect for effect, _ in found.assembly.added] == ["coulomb_friction"]
-    assert len(notes) == 1
-    assert notes[0].startswith("preload was added on trial and removed again")
-    assert "±" in notes[0]
-    again: list[str] = []
+    removed, kept = notes
+    assert removed.startswith("preload was added on trial and removed again")
+    assert "±" in removed
+    assert kept.startswith(f"{TOGETHER}; coulomb_friction: without it the weighted squared error")
+    again = [f"{TOGETHER}; preload: as before", removed]
     assert judged_together(found, roles, NUMERICS, 12.0, again, lambda _: None) is found
-    assert again == []
+    assert again == [removed, kept], "what was confirmed beside another model is not said of this"
 
 
 def test_periodic_runs_are_judged_where_effects_are_added(tmp_path):
