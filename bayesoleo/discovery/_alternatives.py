@@ -27,8 +27,10 @@ from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
     contradicted,
+    fall_error,
     fall_on_hold_out,
     judged,
+    noise_along,
     with_error,
 )
 from bayesoleo.discovery._policy import SearchPolicy
@@ -45,7 +47,7 @@ from bayesoleo.discovery._refit import (
     schwarz_price,
     start_from,
 )
-from bayesoleo.discovery._round import JUDGED, Progress, Round
+from bayesoleo.discovery._round import FULL, Progress, Round
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._effect import Effect
@@ -90,7 +92,7 @@ class Loss:
         return self.rise / self.scale - self.price * self.size
 
     def __str__(self) -> str:
-        error = float(np.sqrt(self.noise * (4.0 * max(self.rise, 0.0) + 2.0 * self.size)))
+        error = fall_error(self.rise, self.size, self.noise)
         unknowns = "its unknown is" if self.size == 1 else f"its {self.size} unknowns are"
         return (
             f"without it the weighted squared error on fitted runs rises by"
@@ -186,7 +188,7 @@ def plainly_needed(
     enough = factor * schwarz_price(base) * len(index)
     if distance > enough and not all(record.periodic for record in state.fit.records):
         known = colour_of(state.fit, [names[k] for k in index])
-        distance = distance / known[0] if known is not None else 0.0
+        distance = 0.0 if known is None else distance / max(known[0], 1.0)
     return bool(distance > enough)
 
 
@@ -343,12 +345,8 @@ def best_of_beam(
 
 def _was_limited(found: Progress, max_effects: int) -> bool:
     """Whether a search ended because it was to add no more effects, and more may be added."""
-    last = found.rounds[-1]
-    if last.reason == JUDGED:
-        return False
     few = len(found.state.assembly.added) < max_effects and not found.state.at_floor
-    limited = found.finished and last.ranking and not any(item.refitted for item in last.ranking)
-    return bool(few and limited)
+    return few and found.finished and found.rounds[-1].reason.startswith(FULL)
 
 
 def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
@@ -436,7 +434,9 @@ def _better(
     """The better of two finished searches; if both are about as likely, the other's effects join
     its classes. Hold-out runs count with the fitted ones where they are declared."""
     fitted, scale = likelihood_gap(best, other)
-    gap = fitted + (scale * hold_out_gap(best.state, other.state) if declared else 0.0)
+    inflation = max(map(_inflation, (best, other)))
+    by_others = hold_out_gap(best.state, other.state, inflation) if declared else 0.0
+    gap = fitted + scale * by_others
     if set(best.state.assembly.added) == set(other.state.assembly.added):
         return best
     if (best.state.at_floor and not other.state.at_floor) or contradicted(
@@ -484,7 +484,8 @@ def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
     """Advantage of the other final model in the penalised sum of squares, and its scale.
 
     The scale is the dispersion of the better model's residual times the inflation by coloured
-    noise. A gap of one scale is a squared standard deviation.
+    noise; of transients the variance of what the better model leaves along the difference of both,
+    over that of white noise. A gap of one scale is a squared standard deviation.
     """
     base = one.first.base()
     price, falls, worth = schwarz_price(base), [], []
@@ -492,18 +493,36 @@ def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
         fall = fall_from(base, state.fit)
         falls.append(fall)
         worth.append(fall - price * len(state.fit.problem.names))
-    left = replace(base, excess=base.excess - max(falls))
-    return worth[1] - worth[0], dispersion(left) * max(map(_inflation, (one, other)))
+    if not all(record.periodic for record in base.fit.records):
+        better, worse = (one, other) if falls[0] > falls[1] else (other, one)
+        scale = _noise_between(base, better.state.fit, worse.state.fit)
+    else:
+        left = replace(base, excess=base.excess - max(falls))
+        scale = dispersion(left) * max(map(_inflation, (one, other)))
+    return worth[1] - worth[0], scale
 
 
-def hold_out_gap(one: State, other: State) -> float:
+def _noise_between(base: Base, better: ModelFit, worse: ModelFit) -> float:
+    """Variance along the difference of two fits of what the better leaves, over that of white noise
+    of the samples, at least one."""
+    along = size = 0.0
+    for r, run in enumerate(base.runs):
+        measured, y = better.predictor.runs[r].measured, better.predictions[r].y
+        scale = run.scale.reshape(y.shape)
+        change, left = (worse.predictions[r].y - y) * scale, (measured - y) * scale
+        along += noise_along(change, left)
+        size += float(np.sum(change**2))
+    return max(1.0, along / size) if np.isfinite(along) and size > 0 else 1.0
+
+
+def hold_out_gap(one: State, other: State, inflation: float = 1.0) -> float:
     """Advantage of another model on the hold-out runs, as twice a logarithm of likelihoods.
 
     The fall of the sum of squares is divided by the variance of the noise along the difference of
     both models, over that of white noise. Errors of the parameters are part of this noise, of the
     model that is known less.
     """
-    fall = fall_on_hold_out(*judged(one, other))
+    fall = fall_on_hold_out(*judged(one, other), inflation)
     error = max(fall.error, fall.scatter)
     # Noise of the variance I gives the fall the variance 4 I times its mean.
     return 4.0 * fall.expected * fall.value / error**2 if error > 0 else 0.0

@@ -243,7 +243,8 @@ def _of_run(
     variance = noise + float(np.sum(np.square(moved))) + remainder
     if not record.periodic:
         changes, rests = (np.array(rows) for rows in zip(*scaled, strict=True))
-        variance = max(_noise_along(changes, rests), expected + float(np.sum(np.square(moved))))
+        white = float(np.sum(np.square(moved)))
+        variance = max(_between_models(changes, rests), expected + white)
         inflation = variance / expected if expected > 0 else 1.0
     return _RunFall(fall, expected, 4.0 * variance, inflation)
 
@@ -254,7 +255,7 @@ def _between_harmonics(spectrum: NoiseSpectrum | None, change: Array) -> float:
     return 0.0 if spectrum is None else float(spectrum.power(change) @ spectrum.level)
 
 
-def _noise_along(changes: Array, rests: Array) -> float:
+def _between_models(changes: Array, rests: Array) -> float:
     """Variance of ``changes @ noise`` in a transient, by what the better of two models leaves.
 
     Parameters
@@ -264,8 +265,19 @@ def _noise_along(changes: Array, rests: Array) -> float:
     """
     # No model leaves less than the noise: the smaller of the two residuals is nearer to it.
     left = min(rests, rests + changes, key=lambda values: float(np.sum(values**2)))
+    return noise_along(changes, left)
+
+
+def noise_along(direction: Array, left: Array) -> float:
+    """Variance of ``direction @ noise`` in a transient with the spectrum of what is left.
+
+    Parameters
+    ----------
+    direction, left : ndarray, shape (ny, N)
+        In units of the noise of each output.
+    """
     nothing = np.zeros((0, *left.shape))
-    return coloured_variance([changes], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
+    return coloured_variance([direction], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
 
 
 def surrogate_variance(change: Array, left: Array) -> float:
@@ -359,10 +371,18 @@ def contradicted(one: State, other: State, inflation: float) -> bool:
 
 def _on_fitted(result: Refit) -> str:
     """The reduction of the error on the fitted runs, as text."""
-    # The fall is a non-central chi-square, of variance 2 k + 4 times its non-centrality.
-    error = float(np.sqrt(result.inflation * (4.0 * max(result.fall, 0.0) + 2.0 * result.size)))
-    fall = with_error(result.fall, error)
+    fall = with_error(result.fall, fall_error(result.fall, result.size, result.inflation))
     return f"lowering the weighted squared error on fitted runs by {fall}"
+
+
+def fall_error(fall: float, size: int, inflation: float) -> float:
+    """Standard error of a fall of the sum of squares by some unknowns.
+
+    In units of the inflation ``I`` it is a non-central chi-square variate of ``k`` degrees of
+    freedom, whose variance is ``2 k`` and four times its non-centrality, ``fall / I - k``.
+    """
+    beyond = max(fall - inflation * size, 0.0)
+    return float(np.sqrt(inflation * (4.0 * beyond + 2.0 * size * inflation)))
 
 
 def _on_halves(

@@ -4,9 +4,9 @@ In a transient, slow noise and the error of a model look alike. Of several missi
 leaves the others, and beside what they leave none of them would be significant. An effect is
 therefore added on trial first. When no further one is found, each is judged in the final model,
 which leaves least: without it, all else estimated anew, the hold-out error must be significantly
-higher. Where no hold-out run is declared, the error on the fitted runs must be, after the
-correction for the search. The effect that misses this most is removed, and the others are judged
-again.
+higher. Where no hold-out run is declared, or none shows the effect, the error on the fitted runs
+must be, after the correction for the search. The effect that misses this most is removed, and the
+others are judged again. A smooth function that stands for no name is not judged here.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Evidence:
     tests : float
         Effective number of effects that it was chosen from.
     declared : bool
-        Whether hold-out runs are declared, so that no sample of them chose the effect.
+        Whether hold-out runs are declared, so that none of them was fitted.
     policy : SearchPolicy
     """
 
@@ -58,31 +58,40 @@ class Evidence:
     @property
     def is_known(self) -> bool:
         """Whether the model could be solved without the effect."""
-        known = self.fall is None or (np.isfinite(self.fall.value) and self.fall.error > 0)
+        known = self.fall is None or np.isfinite(self.fall.value)
         return bool(np.isfinite(self.loss.rise) and known)
 
     @property
-    def log_p(self) -> float:
-        """Logarithm of the p-value on the fitted runs, corrected for the search."""
+    def by_others(self) -> Fall | None:
+        """The fall of the hold-out error; None where no hold-out run shows the effect."""
+        return self.fall if self.fall is not None and self.fall.error > 0 else None
+
+    @property
+    def p(self) -> float:
+        """The p-value on the fitted runs, corrected for the search."""
         loss = self.loss
-        statistic = loss.rise / loss.noise / loss.size
-        local = stats.f.sf(statistic, loss.size, loss.freedom or np.inf)
-        return float(np.log(max(-np.expm1(self.tests * np.log1p(-min(local, 1 - 1e-16))), 1e-300)))
+        if loss.freedom:
+            local = stats.f.sf(loss.rise / loss.noise / loss.size, loss.size, loss.freedom)
+        else:
+            local = stats.chi2.sf(loss.rise / loss.noise, loss.size)
+        return float(-np.expm1(self.tests * np.log1p(-min(local, 1 - 1e-16))))
 
     @property
     def missing(self) -> float:
-        """How far an effect is from being kept, on a scale where none is missing below zero."""
-        fitted = self.log_p - float(np.log(self.policy.significance))
-        if self.fall is None:
+        """Standard errors by which an effect misses what keeps it; none below zero."""
+        asked = stats.norm.isf(self.policy.significance)
+        fitted = float(asked - stats.norm.isf(max(self.p, 1e-300)))
+        if self.by_others is None:
             return fitted
-        if self.fall.confirms:
+        if self.by_others.confirms:
             return -np.inf if self.declared else fitted
-        return max(self.policy.confirming_errors - self.fall.value / self.fall.error, 1e-9)
+        short = self.policy.confirming_errors - self.by_others.value / self.by_others.error
+        return max(short, 1e-9)  # what is too small to confirm anything misses it too
 
     def __str__(self) -> str:
-        if self.fall is None:
+        if self.by_others is None:
             return str(self.loss)
-        return f"without it the weighted squared error on hold-out runs rises by {self.fall}"
+        return f"without it the weighted squared error on hold-out runs rises by {self.by_others}"
 
 
 def judged_together(
@@ -110,32 +119,26 @@ def judged_together(
     """
     if all(record.periodic for record in state.fit.records):
         return state
+    notes[:] = [note for note in notes if not note.startswith(TOGETHER)]
     while chosen := [step for step in state.assembly.steps if step.effect.family != FAMILY]:
         callback("judge the effects beside each other")
         base = state.base()
         found = _evidence(state, base, chosen, roles, numerics, tests)
         worst = max(found, key=lambda one: one.missing, default=None)
         if worst is None or not worst.missing > 0.0:
-            _note(found, notes)
+            parts = [f"{one.loss.step.effect.id}: {one}" for one in found]
+            notes += [f"{TOGETHER}; {'; '.join(parts)}"] if parts else []
             return state
         effect = worst.loss.step.effect.id
         callback(f"remove {effect}: {worst}")
         notes.append(
-            f"{effect} was added on trial and removed again: beside the other effects of the final"
-            f" model it is not confirmed, since {worst}"
+            f"{effect} was removed again: beside the other effects of the final model it is not"
+            f" confirmed, since {worst}"
         )
         assembly = state.assembly.without(worst.loss.step)
         start = start_from(base, base.fit.values, assembly.model())
         state = fit_state(assembly, roles, numerics, start=start, progress=callback)
     return state
-
-
-def _note(found: Sequence[Evidence], notes: list[str]) -> None:
-    """Note what confirms the effects of a final model, in place of what did so before."""
-    notes[:] = [note for note in notes if not note.startswith(TOGETHER)]
-    if found:
-        parts = [f"{one.loss.step.effect.id}: {one}" for one in found]
-        notes.append(f"{TOGETHER}; {'; '.join(parts)}")
 
 
 def _evidence(

@@ -24,12 +24,12 @@ from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
-from bayesoleo.discovery._judged_together import judged_together
+from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
-from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
+from bayesoleo.discovery._round import FULL, JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state, state_of
@@ -49,6 +49,10 @@ UNRESOLVED = 1.0
 #: where the excess may be the error of the solution.
 OF_THE_MESH, LEAST_OF_THE_MESH = 0.5, 0.1
 #: Beginning of the note on probabilities that could not be computed.
+UNJUDGED = (
+    "the search was stopped: effects in transients may be on trial, and are not yet judged beside"
+    " each other"
+)
 NO_PROBABILITIES = "the probabilities of structures could not be computed"
 #: Beginning of a note that lists parameters.
 ON_LIMIT = "at the limit of their prior's support"
@@ -411,7 +415,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             roles = _with_noise(search.roles, known)
             continue
         if outcome.after is None and state is not together:
-            together = judged_together(state, roles, numerics, outcome.tests, notes, callback)
+            tests = max(entry.tests for entry in (*rounds, outcome))
+            together = judged_together(state, roles, numerics, tests, notes, callback)
             if together is not state:
                 known = replace(known, state=together, notes=tuple(notes))
                 continue
@@ -422,6 +427,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
                 outcome, opening, roles, numerics, room=room, callback=callback
             )
         if outcome.after is not None:
+            notes = [note for note in notes if not note.startswith(TOGETHER)]
             state = eliminated(outcome.after, state, roles, numerics, notes, callback)
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
@@ -485,6 +491,9 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += nonparametric_notes(progress.rounds)
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
+    periodic = all(record.periodic for record in state.fit.records)
+    if progress.broken and state.assembly.steps and not periodic:
+        notes.append(UNJUDGED)
     if not state.at_floor:
         notes.append(
             "a repeating error remains: intervals under independent errors would be too narrow"
@@ -509,7 +518,7 @@ def _limit(state: State, rounds: int, max_effects: int) -> str:
     if any(step.effect.family == FAMILY for step in steps):
         return "a nonparametric effect was added: the residual may be the error of its splines"
     if added >= max_effects:
-        return f"the largest allowed number of effects, {max_effects}, has been added"
+        return f"{FULL}, {max_effects}, has been added"
     if rounds > 2 * max_effects:
         return f"effects were added and removed again for {rounds} rounds"
     if _left_by_the_mesh(state):

@@ -316,16 +316,19 @@ def inflation_along(
     if known is None:
         return None
     colour, freedom = known
-    return Inflation(colour * _level_along(base, fit, changes), freedom, colour)
+    # The level is that of all runs together; where a quiet run tells of the effect, both together
+    # are small, whatever each of them is.
+    value = max(1.0, colour * _level_along(base, fit, changes))
+    return Inflation(value, freedom, max(1.0, colour))
 
 
 def colour_of(fit: ModelFit, names: Sequence[str]) -> tuple[float, int] | None:
-    """Largest variance of some unknowns over that of the fit, at least one, by the spectrum of what
-    it leaves, and its degrees of freedom; None where a run has no solution."""
+    """Largest variance of some unknowns over that of the fit, by the spectrum of what it leaves,
+    and its degrees of freedom; None where a run has no solution."""
     noise = noise_of_fit(fit)
     if not all(np.isfinite(part).all() for run in noise for part in (run.columns, run.residual)):
         return None
-    covariance, worst, freedom = fit.point.covariance, 1.0, 0
+    covariance, worst, freedom = fit.point.covariance, 0.0, 0
     for k, name in enumerate(fit.problem.names):
         if name not in names:
             continue
@@ -338,14 +341,14 @@ def colour_of(fit: ModelFit, names: Sequence[str]) -> tuple[float, int] | None:
 
 
 def _level_along(base: Base, fit: ModelFit, changes: Sequence[Array]) -> float:
-    """Mean square of what a fit leaves over that of the samples' noise, at least one; outputs
-    count as they are changed."""
+    """Mean square of what a fit leaves over that of the samples' noise; outputs and runs count as
+    they are changed."""
     whole = level = 0.0
     for change, run in zip(changes, base.runs, strict=True):
         size = change**2
         left = np.repeat(fit.point.variance, change.size // fit.point.variance.size)
         whole, level = whole + float(size.sum()), level + float(size @ (run.scale**2 * left))
-    return max(1.0, level / whole) if whole > 0 else 1.0
+    return level / whole if whole > 0 else 1.0
 
 
 def noise_of_fit(fit: ModelFit) -> list[RunNoise]:

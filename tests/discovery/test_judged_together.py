@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from fitted_states import NUMERICS, options
 from scipy import stats
-from small_campaigns import FRICTION, damper, damper_campaign
+from small_campaigns import FRICTION, _coloured, damper, damper_campaign
 
-from bayesoleo.discovery._alternatives import Loss, plainly_needed
+from bayesoleo.discovery._alternatives import Loss, likelihood_gap, plainly_needed
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._hold_out_confirmation import Fall
+from bayesoleo.discovery._hold_out_confirmation import Fall, fall_error
 from bayesoleo.discovery._judged_together import TOGETHER, Evidence, judged_together
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import new_parameters, refit
+from bayesoleo.discovery._round import Progress
 from bayesoleo.discovery._score_tests import corrected_p, score_all
 from bayesoleo.discovery._state import State, fit_state
 
@@ -94,6 +95,20 @@ def test_declared_runs_decide_by_the_errors_that_the_policy_asks_for():
     assert Evidence(loss, Fall(2.0, 0.1, 2.0), 12.0, declared=True).missing > 0.0
 
 
+@pytest.mark.parametrize(("rise", "stays"), [(5.0, False), (2000.0, True)])
+def test_noise_that_is_assumed_judges_too(rise, stays):
+    """Where no degrees of freedom are known: white noise, or none was measured."""
+    assert (evidence(np.nan, rise, declared=False, held_out=False, freedom=0).missing < 0) == stays
+
+
+def test_an_effect_that_no_hold_out_run_shows_is_judged_on_the_fitted_ones():
+    for rise, stays in ((5.0, False), (2000.0, True)):
+        found = replace(evidence(0.0, rise), fall=Fall(0.0, 0.0, 0.0))
+        assert found.is_known
+        assert (found.missing < 0.0) == stays
+        assert "on fitted runs" in str(found)
+
+
 @pytest.mark.parametrize("held_out", [True, False])
 def test_runs_that_chose_an_effect_do_not_confirm_it_alone(held_out):
     """The rise on fitted runs is an F variate, corrected for the search."""
@@ -113,12 +128,19 @@ def test_a_friction_stays_and_what_slow_noise_feigned_goes(tmp_path):
     found = judged_together(state, roles, NUMERICS, 12.0, notes, lambda _: None)
     assert [effect for effect, _ in found.assembly.added] == ["coulomb_friction"]
     removed, kept = notes
-    assert removed.startswith("preload was added on trial and removed again")
+    assert removed.startswith("preload was removed again: beside the other effects")
     assert "±" in removed
     assert kept.startswith(f"{TOGETHER}; coulomb_friction: without it the weighted squared error")
     again = [f"{TOGETHER}; preload: as before", removed]
     assert judged_together(found, roles, NUMERICS, 12.0, again, lambda _: None) is found
     assert again == [removed, kept], "what was confirmed beside another model is not said of this"
+
+
+def test_what_confirmed_effects_that_went_is_not_said_of_none(tmp_path):
+    state, roles = with_effects(campaign(tmp_path, plain, 4))
+    notes = [f"{TOGETHER}; preload: as before", "another"]
+    assert judged_together(state, roles, NUMERICS, 12.0, notes, lambda _: None) is state
+    assert notes == ["another"]
 
 
 def test_periodic_runs_are_judged_where_effects_are_added(tmp_path):
@@ -159,3 +181,61 @@ def test_p_values_of_absent_effects_in_slow_noise_are_seldom_small(tmp_path):
             tried += corrected_p(replace(stated, inflation=result.trial), 1.0) < 0.05
     assert small <= 2  # of eight at 5 %, three or more with a probability of 0.6 %
     assert tried >= 5
+
+
+def test_two_models_are_compared_by_the_noise_along_their_difference(tmp_path):
+    """As the better of them leaves it: what the worse one lacks is no noise."""
+    said, drawn, rng = [], [], np.random.default_rng(1)
+    for seed in range(4):
+        reduced = campaign(tmp_path / str(seed), with_friction, seed, 0.9)
+        without, _ = with_effects(reduced)
+        state, _ = with_effects(reduced, "coulomb_friction")
+        one, other = Progress(without, without), Progress(without, state)
+        gap, scale = likelihood_gap(one, other)
+        assert gap > 50.0 * scale
+        assert likelihood_gap(other, one) == pytest.approx((-gap, scale))
+        pairs = zip(state.fit.predictions, without.fit.predictions, strict=True)
+        changes = [(new.y - old.y)[0] for new, old in pairs]
+        noise = [[_coloured(rng, change.size, 0.9) for change in changes] for _ in range(100)]
+        along = [sum(c @ n for c, n in zip(changes, row, strict=True)) for row in noise]
+        drawn.append(np.mean(np.square(along)) / sum(change @ change for change in changes))
+        said.append(scale * np.mean([1.0 / run.scale.max() ** 2 for run in without.base().runs]))
+    # Of 400 draws a variance is known to 7 %, and the spectrum of a few runs to about as much.
+    assert np.mean(said) == pytest.approx(np.mean(drawn), rel=0.25)
+
+
+@pytest.mark.parametrize(("rise", "inflation"), [(0.0, 1.0), (0.0, 300.0), (900.0, 30.0)])
+def test_the_error_of_a_fall_is_that_of_a_chi_square_in_units_of_the_noise(rise, inflation):
+    rng, size = np.random.default_rng(3), 2
+    beyond = np.sqrt(rise / inflation)
+    draws = inflation * ((rng.standard_normal(40_000) + beyond) ** 2 + rng.chisquare(1, 40_000))
+    mean = rise + size * inflation
+    assert np.mean(draws) == pytest.approx(mean, rel=0.03)
+    assert fall_error(mean, size, inflation) == pytest.approx(np.std(draws), rel=0.03)
+
+
+def test_a_quiet_run_tells_as_much_as_it_does(tmp_path):
+    """The level of all runs together is far above its noise; the colour makes up for it."""
+    stated = []
+    for seed in range(8):
+        reduced = campaign(tmp_path / str(seed), plain, seed, 0.0)
+        rng = np.random.default_rng(seed)
+        loud = [
+            replace(
+                record,
+                samples={
+                    **record.samples,
+                    "force": record.samples["force"] + 30.0 * rng.standard_normal(record.time.size),
+                },
+            )
+            if record.label in "bc"
+            else record
+            for record in reduced.records
+        ]
+        state = fit_state(Assembly(damper(cubic=False)), assign(loud), NUMERICS)
+        score = score_all(state.base(), options(state, ["quadratic_damping"]), jobs=1)[0][0]
+        result = refit(state.base(), score, NUMERICS)
+        stated.append(result.inflation)
+        assert result.trial >= 1.0
+    # Weights of the fit are common, so that noise of the loud runs counts, but not a thousandfold.
+    assert np.median(stated) < 400.0

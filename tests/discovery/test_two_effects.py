@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from bayesoleo.discovery._alternatives import _was_limited
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._hold_out_confirmation import Fall
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._round import JUDGED, Progress, Round
+from bayesoleo.discovery._round import FULL, JUDGED, Progress, Round
 
 POLICY = SearchPolicy()
 
@@ -204,3 +205,8 @@ def test_what_is_not_confirmed_beside_the_others_goes_and_is_not_sought_again(mo
     assert found.finished
     assert found.notes == ("a note",)
     assert not _was_limited(found, 4), "the beam does not go on from there"
+    full = replace(found.rounds[-1], reason=f"{FULL}, 2, has been added")
+    limited = replace(found, rounds=(*found.rounds[:-1], full))
+    assert _was_limited(limited, 4)
+    with_one.assembly.added = tuple("abcd")
+    assert not _was_limited(limited, 4)
