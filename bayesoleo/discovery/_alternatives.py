@@ -47,7 +47,7 @@ from bayesoleo.discovery._refit import (
     schwarz_price,
     start_from,
 )
-from bayesoleo.discovery._round import FULL, Progress, Round
+from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._effect import Effect
@@ -337,16 +337,7 @@ def best_of_beam(
         if other is not None and other.state.assembly.added:
             declared = roles.strategy == "declared"
             best = _better(best, other, declared, numerics.policy, callback)
-    if best is progress or not _was_limited(best, max_effects):
-        return best
-    callback("go on with these effects")
-    return follow(replace(best, rounds=best.rounds[:-1]), max_effects)
-
-
-def _was_limited(found: Progress, max_effects: int) -> bool:
-    """Whether a search ended because it was to add no more effects, and more may be added."""
-    few = len(found.state.assembly.added) < max_effects and not found.state.at_floor
-    return few and found.finished and found.rounds[-1].reason.startswith(FULL)
+    return best
 
 
 def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:

@@ -29,7 +29,7 @@ from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_n
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
 from bayesoleo.discovery._review import reviewed
-from bayesoleo.discovery._round import FULL, JUDGED, Progress, Round, examine
+from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state, state_of
@@ -518,7 +518,7 @@ def _limit(state: State, rounds: int, max_effects: int) -> str:
     if any(step.effect.family == FAMILY for step in steps):
         return "a nonparametric effect was added: the residual may be the error of its splines"
     if added >= max_effects:
-        return f"{FULL}, {max_effects}, has been added"
+        return f"the largest allowed number of effects, {max_effects}, has been added"
     if rounds > 2 * max_effects:
         return f"effects were added and removed again for {rounds} rounds"
     if _left_by_the_mesh(state):

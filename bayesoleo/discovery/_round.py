@@ -28,7 +28,6 @@ from bayesoleo.discovery._two_effects import confirmed_together
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
-FULL = "the largest allowed number of effects"
 JUDGED = "effects that were added on trial are not confirmed beside each other, and were removed"
 INSIGNIFICANT = "no effect is significant after the correction for the search"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +9,10 @@ import pytest
 from fitted_states import NUMERICS
 
 from bayesoleo.discovery import _loop as loop, _two_effects as two_effects
-from bayesoleo.discovery._alternatives import _was_limited
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._hold_out_confirmation import Fall
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._round import FULL, JUDGED, Progress, Round
+from bayesoleo.discovery._round import JUDGED, Progress, Round
 
 POLICY = SearchPolicy()
 
@@ -204,9 +202,3 @@ def test_what_is_not_confirmed_beside_the_others_goes_and_is_not_sought_again(mo
     assert found.state is with_one
     assert found.finished
     assert found.notes == ("a note",)
-    assert not _was_limited(found, 4), "the beam does not go on from there"
-    full = replace(found.rounds[-1], reason=f"{FULL}, 2, has been added")
-    limited = replace(found, rounds=(*found.rounds[:-1], full))
-    assert _was_limited(limited, 4)
-    with_one.assembly.added = tuple("abcd")
-    assert not _was_limited(limited, 4)
