@@ -192,11 +192,11 @@ def _known_to(state: State, other: State, pull: Array, inflation: float) -> floa
     white = max(float(pull @ covariance @ pull), 0.0)
     if not pull.any() or all(record.periodic for record in state.fit.records):
         return inflation * white
-    mine, its = noise_of_fit(state.fit), noise_of_fit(other.fit)
+    mine = noise_of_fit(state.fit)
     level = float(np.mean(other.fit.point.variance / state.fit.point.variance))
     if level < 1.0:
         unit = np.sqrt(other.fit.point.variance / state.fit.point.variance)[:, None]
-        pairs = zip(mine, its, strict=True)
+        pairs = zip(mine, noise_of_fit(other.fit), strict=True)
         mine = [replace(run, residual=quiet.residual * unit) for run, quiet in pairs]
     moved = [np.tensordot(covariance @ pull, run.columns, axes=1) for run in mine]
     return max(coloured_variance(moved, mine)[0], min(level, 1.0) * white)

@@ -48,11 +48,12 @@ UNRESOLVED = 1.0
 #: Part of the mean square of an excess, and of the expected error, that finer steps would change
 #: where the excess may be the error of the solution.
 OF_THE_MESH, LEAST_OF_THE_MESH = 0.5, 0.1
-#: Beginning of the note on probabilities that could not be computed.
+#: Said of effects in transients where a search was stopped before it judged them together.
 UNJUDGED = (
     "the search was stopped: effects in transients may be on trial, and are not yet judged beside"
     " each other"
 )
+#: Beginning of the note on probabilities that could not be computed.
 NO_PROBABILITIES = "the probabilities of structures could not be computed"
 #: Beginning of a note that lists parameters.
 ON_LIMIT = "at the limit of their prior's support"
@@ -491,8 +492,9 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += nonparametric_notes(progress.rounds)
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
+    judged = any(note.startswith(TOGETHER) for note in notes)
     periodic = all(record.periodic for record in state.fit.records)
-    if progress.broken and state.assembly.steps and not periodic:
+    if progress.broken and state.assembly.steps and not (periodic or judged):
         notes.append(UNJUDGED)
     if not state.at_floor:
         notes.append(

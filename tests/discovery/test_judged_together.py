@@ -15,10 +15,11 @@ from bayesoleo.discovery._alternatives import Loss, likelihood_gap, plainly_need
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._hold_out_confirmation import Fall, fall_error
 from bayesoleo.discovery._judged_together import TOGETHER, Evidence, judged_together
+from bayesoleo.discovery._loop import UNJUDGED, loop_of
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import new_parameters, refit
-from bayesoleo.discovery._round import Progress
+from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_tests import corrected_p, score_all
 from bayesoleo.discovery._state import State, fit_state
 
@@ -239,3 +240,14 @@ def test_a_quiet_run_tells_as_much_as_it_does(tmp_path):
         assert result.trial >= 1.0
     # Weights of the fit are common, so that noise of the loud runs counts, but not a thousandfold.
     assert np.median(stated) < 400.0
+
+
+@pytest.mark.parametrize("judged", [True, False])
+@pytest.mark.parametrize("broken", [True, False])
+def test_a_stopped_search_says_that_its_effects_are_on_trial(tmp_path, broken, judged):
+    """Unless it was stopped later, during its review."""
+    state, roles = with_effects(campaign(tmp_path, with_friction, 4), "coulomb_friction")
+    notes = (f"{TOGETHER}; coulomb_friction: as found",) if judged else ()
+    last = Round(state, (), {}, None, None, "stopped", 1.0)
+    found = loop_of(Progress(state, state, (last,), notes, broken), roles)
+    assert (UNJUDGED in found.notes) == (broken and not judged)
