@@ -23,10 +23,9 @@ from bayesoleo._types import Array, Float
 from bayesoleo._workflow.simulating import model_of, parameter_sets, same_noise, same_samples
 from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
-from bayesoleo.data._noise import local_means
 from bayesoleo.data._reduction import ReducedCampaign
 from bayesoleo.discovery._fit import weights
-from bayesoleo.discovery._fit_and_hold_out_error import compared
+from bayesoleo.discovery._fit_and_hold_out_error import averages_of, compared
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._baselines import (
@@ -304,7 +303,7 @@ def _errors(
     entries, _ = compared(one, {record.label: record.role})
     changes = (draws - at_estimate.y[0]) * weights(record)
     if not record.periodic:
-        changes = local_means(changes)
+        changes = averages_of(record, predictor.outputs, changes)
     moved = np.mean(changes**2, axis=(0, 2))
     found = []
     for entry, square in zip(entries, moved, strict=True):

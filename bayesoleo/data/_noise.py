@@ -21,6 +21,7 @@ and 3.5; Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114, for degrees of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
@@ -37,8 +38,11 @@ from bayesoleo.errors import InputError
 #: sensible sampling.
 HIGHEST_DIFFERENCE = 8
 
-#: Averages of a run, and samples in one at least.
+#: Averages of a run, and samples in one where the motion is slow.
 MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
+#: Averages in the shortest period of a motion, and the part of its power that is at longer ones. An
+#: average keeps 95 % of the power at that period, and two thirds at a third of it.
+IN_A_PERIOD, SLOWER = 8, 0.99
 #: Lines that are averaged lie within this many periods' worth of lines, or this part of the
 #: frequency, whichever is wider: one harmonic on either side where noise may be steep.
 HARMONICS, PART = 1.0, 0.25
@@ -253,20 +257,54 @@ class LocalAverage:
         return np.full(points, np.nan)
 
 
-def local_average(values: Array, sigma: float | None = None) -> LocalAverage:
+def samples_in_average(signals: Sequence[Array]) -> int:
+    """Number of neighbouring samples whose average still follows some signals.
+
+    An error of a model is about as fast as the motion, and averages over many samples would take it
+    away with the noise: over a whole swing nothing would be left of it.
+
+    Parameters
+    ----------
+    signals : sequence of ndarray, shape (N,)
+        At the same equidistant times.
+    """
+    size = signals[0].size
+    most = max(FEWEST_SAMPLES, size // MOST_AVERAGES)
+    shortest = min(_shortest_period(signal) for signal in signals)
+    return int(np.clip(shortest / IN_A_PERIOD, 1, most))
+
+
+def _shortest_period(signal: Array) -> float:
+    """Period, in samples, at which nearly all of a signal's power beyond its noise is passed."""
+    place = np.arange(signal.size) / signal.size
+    # A record does not end where it began: the jump and the slope would have lines everywhere.
+    level_signal = signal - np.polyval(np.polyfit(place, signal, 1), place)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * place)
+    power = np.abs(scipy.fft.rfft(level_signal * window)) ** 2
+    level = innovation_noise(signal) ** 2 * float(np.sum(window**2))
+    passed = np.cumsum(power - level)
+    if not passed.max() > 0.0:
+        return float(signal.size)
+    line = int(np.argmax(passed >= SLOWER * passed.max()))
+    return signal.size / max(line, 1)
+
+
+def local_average(values: Array, size: int, sigma: float | None = None) -> LocalAverage:
     """Average a signal over neighbouring samples.
 
     Parameters
     ----------
     values : ndarray, shape (N,)
         Signal at equidistant times.
+    size : int
+        Samples in an average; see :func:`samples_in_average`.
     sigma : float, optional
         Standard deviation of a sample's noise, where it is known; by default from differences of
         neighbours.
     """
     signal = np.asarray(values, dtype=float)
-    number = int(_blocks(signal.size)[-1]) + 1
-    means = local_means(signal)
+    number = int(_blocks(signal.size, size)[-1]) + 1
+    means = local_means(signal, size)
     if sigma is None:
         sigma = innovation_noise(signal)
     return LocalAverage(
@@ -279,27 +317,28 @@ def local_average(values: Array, sigma: float | None = None) -> LocalAverage:
     )
 
 
-def local_means(values: Array) -> Array:
+def local_means(values: Array, size: int) -> Array:
     """Mean over each sample's block of neighbours.
 
     Parameters
     ----------
     values : ndarray, shape (..., N)
+    size : int
+        Samples in a block.
 
     Returns
     -------
     ndarray, shape (..., N)
     """
-    block = _blocks(values.shape[-1])
+    block = _blocks(values.shape[-1], size)
     starts = np.flatnonzero(np.diff(block, prepend=-1))
     sums = np.add.reduceat(values, starts, axis=-1)
     means: Array = (sums / np.bincount(block))[..., block]
     return means
 
 
-def _blocks(samples: int) -> NDArray[np.int64]:
+def _blocks(samples: int, size: int) -> NDArray[np.int64]:
     """Number of the block that each sample lies in, shape (N,)."""
-    size = max(FEWEST_SAMPLES, samples // MOST_AVERAGES)
     number = max(samples // size, 1)
     return np.minimum(np.arange(samples) // size, number - 1)
 

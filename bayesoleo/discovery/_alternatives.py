@@ -24,13 +24,13 @@ import numpy as np
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit_difference import noise_between
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
     contradicted,
     fall_error,
     fall_on_hold_out,
     judged,
-    noise_along,
     with_error,
 )
 from bayesoleo.discovery._policy import SearchPolicy
@@ -265,9 +265,7 @@ def leads_as_far(
     fall = fall_from(reference, present)
     left = replace(reference, excess=reference.excess - max(fall, *falls))
     best = int(np.argmax(worths))
-    # The inflation is that of the compared models: a rival that moves the mean alone may have far
-    # more noise along its change.
-    scale = dispersion(left) * max(result.inflation, tried[best].inflation)
+    scale = dispersion(left) * noise_between(reference, tried[best].fit, present)[0]
     return (
         worths[best] > _worth(reference, fall, present) - numerics.policy.equal_likelihood * scale
     )
@@ -474,9 +472,8 @@ def _with_notes(
 def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
     """Advantage of the other final model in the penalised sum of squares, and its scale.
 
-    The scale is the dispersion of the better model's residual times the inflation by coloured
-    noise; of transients the variance of what the better model leaves along the difference of both,
-    over that of white noise. A gap of one scale is a squared standard deviation.
+    The scale is the noise along the difference of both models over white noise, times the
+    dispersion of the better one's residual. A gap of one scale is a squared standard deviation.
     """
     base = one.first.base()
     price, falls, worth = schwarz_price(base), [], []
@@ -484,26 +481,9 @@ def likelihood_gap(one: Progress, other: Progress) -> tuple[float, float]:
         fall = fall_from(base, state.fit)
         falls.append(fall)
         worth.append(fall - price * len(state.fit.problem.names))
-    if not all(record.periodic for record in base.fit.records):
-        better, worse = (one, other) if falls[0] > falls[1] else (other, one)
-        scale = _noise_between(base, better.state.fit, worse.state.fit)
-    else:
-        left = replace(base, excess=base.excess - max(falls))
-        scale = dispersion(left) * max(map(_inflation, (one, other)))
-    return worth[1] - worth[0], scale
-
-
-def _noise_between(base: Base, better: ModelFit, worse: ModelFit) -> float:
-    """Variance along the difference of two fits of what the better leaves, over that of white noise
-    of the samples, at least one."""
-    along = size = 0.0
-    for r, run in enumerate(base.runs):
-        measured, y = better.predictor.runs[r].measured, better.predictions[r].y
-        scale = run.scale.reshape(y.shape)
-        change, left = (worse.predictions[r].y - y) * scale, (measured - y) * scale
-        along += noise_along(change, left)
-        size += float(np.sum(change**2))
-    return max(1.0, along / size) if np.isfinite(along) and size > 0 else 1.0
+    left = replace(base, excess=base.excess - max(falls))
+    noise, _ = noise_between(base, one.state.fit, other.state.fit)
+    return worth[1] - worth[0], dispersion(left) * noise
 
 
 def hold_out_gap(one: State, other: State, inflation: float = 1.0) -> float:

@@ -32,9 +32,8 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array
-from bayesoleo.data._noise import local_means
 from bayesoleo.discovery._fit import ModelFit, weights
-from bayesoleo.discovery._fit_and_hold_out_error import RunError
+from bayesoleo.discovery._fit_and_hold_out_error import RunError, averages_of
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.prediction._predictor import Predictor
@@ -78,7 +77,7 @@ def curved(prediction: Prediction, root: Array, averaged: Array, policy: SearchP
         return np.ones(outputs)
     changes = (found.y[good] - prediction.y) * weights(record)
     if not record.periodic:
-        changes = local_means(changes)
+        changes = averages_of(record, prediction.predictor.outputs, changes)
     squares = np.mean(changes**2, axis=2)
     squares = np.minimum(squares, policy.farthest_draw**2 * np.mean(squares, axis=0))
     return np.where(linear > 0, np.mean(squares, axis=0) / np.maximum(linear, 1e-300), 1.0)
@@ -159,7 +158,8 @@ class _LinearisedRun:
         information = np.einsum("y,yln,ymn->lm", weight, raw, raw)
         averaged, inputs = raw, columns
         if not record.periodic:
-            averaged, inputs = local_means(raw), local_means(columns)
+            outputs = [entry.output for entry in entries]
+            averaged, inputs = (averages_of(record, outputs, one) for one in (raw, columns))
             through = np.stack([_through(e, J) for e, J in zip(entries, averaged, strict=True)])
         return cls(weight, averaged, inputs, through, information, scatter, pulled)
 

@@ -36,6 +36,7 @@ from bayesoleo.data._noise import (
     local_means,
     noise_spectrum,
     periodic_average,
+    samples_in_average,
 )
 from bayesoleo.data._sample_quality import emptied_lines, rounding_in_average
 from bayesoleo.discovery._assembly import RecordNoise
@@ -277,11 +278,11 @@ def compared(
     for output, rest in zip(predictor.outputs, left, strict=True):
         residual = without_masked(record, rest)
         before.append(measured(output, record.label))
-        averages.append(_average(record, output, residual, before[-1], policy))
+        averages.append(_average(record, predictor.outputs, output, residual, before[-1], policy))
         spectra.append(_spectrum(record, output, residual, averages[-1]))
         # All samples of a transient are used: averages over neighbours contain no fast noise.
         shown.append(averages[-1].values if record.periodic else residual)
-    averaged = columns if record.periodic else local_means(columns)
+    averaged = columns if record.periodic else averages_of(record, predictor.outputs, columns)
     spread = np.sqrt(np.mean(np.sum(averaged**2, axis=1), axis=1))
     scale = borne_out(columns, shown, drawn=not record.periodic, policy=policy)
     factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
@@ -320,8 +321,26 @@ def _spectrum(
     return noise_spectrum((residual - average.values) / part, record.periods, emptied)
 
 
+def averages_of(record: Record, outputs: Sequence[str], values: Array) -> Array:
+    """Means of a transient's values over neighbouring samples, shape (..., N).
+
+    Parameters
+    ----------
+    record : Record
+    outputs : sequence of str
+        The fastest of which says how many samples an average has.
+    values : ndarray, shape (..., N)
+    """
+    return local_means(values, _samples_in_average(record, outputs))
+
+
+def _samples_in_average(record: Record, outputs: Sequence[str]) -> int:
+    return samples_in_average([without_masked(record, record.samples[name]) for name in outputs])
+
+
 def _average(
     record: Record,
+    outputs: Sequence[str],
     output: str,
     residual: Array,
     before: RecordNoise | None,
@@ -329,7 +348,7 @@ def _average(
 ) -> PeriodicAverage | LocalAverage:
     if not record.periodic:
         noise = sample_noise(record, output, residual, before, policy=policy)
-        return local_average(residual, noise)
+        return local_average(residual, _samples_in_average(record, outputs), noise)
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     return of_those_counted(record, periodic_average(residual, step, record.frequency))
 

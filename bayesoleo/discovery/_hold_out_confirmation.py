@@ -25,7 +25,7 @@ from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit, noise_of_fit
 from bayesoleo.discovery._run_predictions import Prediction, crossed
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
+from bayesoleo.discovery._transient_variance import coloured_variance, noise_along
 from bayesoleo.prediction._run_errors import input_columns
 
 
@@ -266,18 +266,6 @@ def _between_models(changes: Array, rests: Array) -> float:
     # No model leaves less than the noise: the smaller of the two residuals is nearer to it.
     left = min(rests, rests + changes, key=lambda values: float(np.sum(values**2)))
     return noise_along(changes, left)
-
-
-def noise_along(direction: Array, left: Array) -> float:
-    """Variance of ``direction @ noise`` in a transient with the spectrum of what is left.
-
-    Parameters
-    ----------
-    direction, left : ndarray, shape (ny, N)
-        In units of the noise of each output.
-    """
-    nothing = np.zeros((0, *left.shape))
-    return coloured_variance([direction], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
 
 
 def surrogate_variance(change: Array, left: Array) -> float:

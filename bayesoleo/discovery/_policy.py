@@ -189,6 +189,12 @@ class SearchPolicy:
     equal_odds: float = _value(
         20.0, "Ratio of likelihoods below which two effects are equally likely."
     )
+    both_wrong_errors: float = _value(
+        2.0,
+        "Standard errors of the difference of two models of transients that both leave more than"
+        " noise, up to which they are about as likely.",
+        "noise and the error that is left exceed it once in twenty times (Vuong 1989)",
+    )
     equal_remainder: float = _value(
         1.25,
         "Ratio of remainders below which two similar effects that leave more than noise are"
@@ -229,6 +235,9 @@ class SearchPolicy:
     false_confirmation: float = _value(
         0.025,
         "Probability that an effect is confirmed although it does not lower the hold-out error.",
+        CHOICE,
+        "0.000 to 0.027 in six sets of 336 absent effects, runs periodic or not, noise white, slow"
+        " or as fast as the motion",
     )
     trial_errors: float = _value(
         1.0,

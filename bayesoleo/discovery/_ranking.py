@@ -21,6 +21,7 @@ from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._scanned_columns import MOST_KEPT, Scanned, size_of
@@ -326,6 +327,7 @@ def rank(
     tests: float,
     refits: dict[int, Refit],
     *,
+    base: Base | None = None,
     policy: SearchPolicy = SearchPolicy(),
 ) -> tuple[Ranked, ...]:
     """Candidates in the order of the search, estimated ones first.
@@ -337,12 +339,24 @@ def rank(
         Effective number of independent tests.
     refits : dict of int to Refit
         By the ``id`` of the score.
+    base : Base, optional
+        What they were estimated against: the noise along their differences says which are alike.
     policy : SearchPolicy
     """
     groups = classes(scores, policy=policy)
+    known: dict[frozenset[int], float] = {}
+
+    def about_as_likely(one: Refit, other: Refit) -> float | None:
+        if base is None or not (np.isfinite(one.share) and np.isfinite(other.share)):
+            return None
+        pair = frozenset((id(one), id(other)))
+        if pair not in known:
+            known[pair] = undecided(base, one, other)
+        return known[pair]
+
     ranked = []
     for k, score in enumerate(scores):
-        same = _same(scores, k, groups[k], refits)
+        same = _same(scores, k, groups[k], refits, about_as_likely)
         fitted = refits.get(id(score))
         if fitted is not None and not np.isfinite(fitted.share):
             fitted = None  # a failed estimate adds nothing to the score
@@ -365,7 +379,11 @@ def _on_trial(score: Score, fitted: Refit) -> Score:
 
 
 def _same(
-    scores: Sequence[Score], k: int, group: Sequence[int], refits: dict[int, Refit]
+    scores: Sequence[Score],
+    k: int,
+    group: Sequence[int],
+    refits: dict[int, Refit],
+    undecided: Callable[[Refit, Refit], float | None],
 ) -> tuple[str, ...]:
     """Effects that are indistinguishable from number ``k``, by their estimates if both have one."""
     own, found = refits.get(id(scores[k])), []
@@ -374,7 +392,7 @@ def _same(
         if j == k:
             continue
         if own is not None and estimated is not None and np.isfinite(estimated.share):
-            alike = own.resembles(estimated)
+            alike = own.resembles(estimated, undecided(own, estimated))
         elif own is not None and estimated is not None and own.reached:
             # After a failed estimate only the score can distinguish the two.
             alike = not own.outdoes(other)

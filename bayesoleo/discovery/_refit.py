@@ -87,8 +87,19 @@ class Refit:
     feigned: float = 0.0
     colour: float | None = None
 
-    def resembles(self, other: Refit) -> bool:
+    def resembles(self, other: Refit, undecided: float | None = None) -> bool:
         """Whether the data cannot distinguish two estimated effects.
+
+        Parameters
+        ----------
+        other : Refit
+        undecided : float, optional
+            Difference of the sums of squares up to which they are about as likely, by the noise
+            along their difference (``_fit_difference.undecided``); by default by the larger of
+            their inflations.
+
+        Notes
+        -----
 
         The noise decides how significant a difference is. Small effects may be different and still
         equally likely (Burnham and Anderson 2002, section 2.6); large effects may be similar and
@@ -101,8 +112,9 @@ class Refit:
             return False
         gap = self.worth - other.worth
         policy = self.policy
-        scale = policy.equal_likelihood * max(self.inflation, other.inflation)
-        if -policy.not_taken_odds * scale < gap < scale:
+        if undecided is None:
+            undecided = policy.equal_likelihood * max(self.inflation, other.inflation)
+        if -policy.not_taken_odds * undecided < gap < undecided:
             return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
         if (self.reached and other.reached) or lengths == 0:
@@ -135,8 +147,9 @@ class Refit:
     def outdoes(self, other: Score) -> bool:
         """Whether the effect leaves only noise and clearly beats an effect that was only scored."""
         mine, its = (one.fall - self.price * one.size for one in (self.score, other))
-        scale = self.policy.equal_likelihood * max(self.inflation, other.inflation)
-        return self.reached and mine - its > scale
+        # Scored in transients, the other one's inflation holds the level of what it leaves.
+        inflation = max(self.inflation, other.inflation if self.colour is None else 1.0)
+        return self.reached and mine - its > self.policy.equal_likelihood * inflation
 
     @property
     def size(self) -> int:

@@ -19,6 +19,7 @@ from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import (
@@ -73,8 +74,8 @@ class Place:
         for rival in self.rivals:
             result = rival.refit
             assert result is not None
-            gap, scale = result.worth - own.worth, max(result.inflation, own.inflation)
-            needed = policy.equal_likelihood * scale * _dispersion(result, self.base)
+            gap = result.worth - own.worth
+            needed = undecided(self.base, result, own) * _dispersion(result, self.base)
             if rival.absorbs < self.own.absorbs:
                 needed = -needed
             clearly = result.reached or gap > policy.fair_share * own.remaining
@@ -275,7 +276,7 @@ def place_of(
         # would seem to surpass.
         refits[id(own)] = refit_at(base, own, final.assembly, final.fit)
     refits |= _from_other_shapes(base, refits, chosen, numerics)
-    ranking = rank(scores, progress.rounds[number].tests, refits, policy=numerics.policy)
+    ranking = rank(scores, progress.rounds[number].tests, refits, base=base, policy=numerics.policy)
     mine = next(item for item in ranking if item.score is own)
     if mine.refit is None:
         return None

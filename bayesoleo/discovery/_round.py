@@ -15,6 +15,7 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
+from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import confirmed
 from bayesoleo.discovery._nonparametric_search import CurveSearch
 from bayesoleo.discovery._policy import SearchPolicy
@@ -127,7 +128,7 @@ def examine(
     if stop is not None or limit:
         return Round(state, ranking, failed, None, None, stop or limit, tests, _scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
-    ranking = rank(scores, tests, refits, policy=policy)
+    ranking = rank(scores, tests, refits, base=base, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
     pair = None
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
@@ -290,7 +291,7 @@ def _choose(
         item = _next([one for one in tried if last[id(one)] == last[id(tried[0])]], refits)
         tried.remove(item)
         result = refits[id(item.score)]
-        if found is not None and not _as_good(result, refits[id(found[0].score)]):
+        if found is not None and not _as_good(base, result, refits[id(found[0].score)]):
             continue
         after, reason = confirmed(state, item, result, roles, numerics, callback, on_trial=True)
         if after is None:
@@ -309,11 +310,10 @@ def _choose(
     return None, None, "; ".join(reasons)
 
 
-def _as_good(result: Refit, other: Refit) -> bool:
+def _as_good(base: Base, result: Refit, other: Refit) -> bool:
     """Whether an effect leaves only noise and its worth is close to that of another one."""
-    less, policy = other.worth - result.worth, result.policy
-    scale = policy.equal_likelihood * max(result.inflation, other.inflation)
-    return result.reached and less < policy.compared_worth * scale
+    less = other.worth - result.worth
+    return result.reached and less < result.policy.compared_worth * undecided(base, result, other)
 
 
 @dataclass(frozen=True)

@@ -171,6 +171,18 @@ def coloured_variance(weights: Sequence[Array], runs: Sequence[RunNoise]) -> tup
     return variance, variance**2 / scatter if scatter > 0 else 0.0
 
 
+def noise_along(direction: Array, left: Array) -> float:
+    """Variance of ``direction @ noise`` in a transient with the spectrum of what is left.
+
+    Parameters
+    ----------
+    direction, left : ndarray, shape (ny, N)
+        In units of the noise of each output.
+    """
+    nothing = np.zeros((0, *left.shape))
+    return coloured_variance([direction], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
+
+
 def _of_run(weights: Array, run: RunNoise) -> tuple[float, float]:
     along, lines = scipy.fft.rfft(weights), run.lines
     power = np.einsum("ak,abk,bk->k", along.conj(), run.level, along).real

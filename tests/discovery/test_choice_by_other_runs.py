@@ -50,6 +50,7 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
         return after, item.effect
 
     monkeypatch.setattr(rounds, "confirmed", confirmed)
+    monkeypatch.setattr(rounds, "undecided", lambda *_: NUMERICS.policy.equal_likelihood)
     item, after, _ = rounds._choose(None, None, ranking, refits, None, NUMERICS, print)
     assert item.effect == taken
     assert after is not None

@@ -171,6 +171,7 @@ def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
     monkeypatch, gap, remaining, reached, replaced
 ):
     monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+    monkeypatch.setattr(review, "undecided", lambda *_: POLICY.equal_likelihood)
 
     def item(name, worth, left, at_noise):
         estimate = SimpleNamespace(
@@ -265,6 +266,7 @@ def test_names_come_together_in_one_balance(steps, several):
 @pytest.mark.parametrize(("gap", "replaced"), [(-4.0, True), (-8.0, False), (8.0, True)])
 def test_a_cause_that_is_as_likely_stands_instead_of_what_varies_by_run(monkeypatch, gap, replaced):
     monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
+    monkeypatch.setattr(review, "undecided", lambda *_: POLICY.equal_likelihood)
 
     def item(name, family, worth):
         found = accepted(name, ())

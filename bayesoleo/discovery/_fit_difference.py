@@ -1,0 +1,91 @@
+"""Difference of two fits: how much their sums of squares differ by chance.
+
+The noise along the difference of the predictions decides, and not that along each effect: what
+both models leave alike says nothing of which is better.
+
+References
+----------
+Vuong (1989), Econometrica 57(2), 307-333: of two models that are both wrong the likelihood ratio
+scatters by the noise along their difference. Burnham and Anderson (2002), Model Selection and
+Multimodel Inference, section 2.6: models about as likely as the best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._score_basis import Base
+from bayesoleo.discovery._score_tests import inflation_of
+from bayesoleo.discovery._transient_variance import noise_along
+
+
+def undecided(base: Base, one: Refit, other: Refit) -> float:
+    """Difference of the sums of squares up to which two estimated effects are about as likely.
+
+    Parameters
+    ----------
+    base : Base
+        What both were estimated against.
+    one, other : Refit
+
+    Notes
+    -----
+    It is twice the logarithm of a ratio of likelihoods, times the noise along the difference of
+    both over white noise. Where the better one leaves more than noise both are wrong, and the
+    difference of their squares scatters by twice the root of what it would be if one were right.
+    What is left of a transient is noise and error alike; that of periodic runs is known apart, and
+    effects that leave an error there are compared by their contributions.
+    """
+    noise, length = noise_between(base, one.fit, other.fit)
+    better, policy = max(one, other, key=lambda item: item.fall), one.policy
+    likely = policy.equal_likelihood * noise
+    if better.reached or all(record.periodic for record in base.fit.records):
+        return likely
+    return max(likely, policy.both_wrong_errors * 2.0 * float(np.sqrt(noise * length)))
+
+
+def noise_between(base: Base, one: ModelFit, other: ModelFit) -> tuple[float, float]:
+    """Variance, along the difference of two fits, of what the better one leaves over that of white
+    noise of the samples, at least one; and the squared length of the difference in their noise.
+
+    Parameters
+    ----------
+    base : Base
+        Noise of the samples by run.
+    one, other : ModelFit
+        Of the same runs.
+
+    Returns
+    -------
+    noise, length : float
+        One and zero where the fits do not differ or have no solution.
+    """
+    rests = [[_left(base, r, fit) for r in range(len(base.runs))] for fit in (one, other)]
+    better, worse = sorted(rests, key=lambda left: sum(float(np.sum(part**2)) for part in left))
+    changes = [a - b for a, b in zip(better, worse, strict=True)]
+    length = sum(float(np.sum(part**2)) for part in changes)
+    if not (np.isfinite(length) and length > 0.0):
+        return 1.0, 0.0
+    if all(record.periodic for record in base.fit.records):
+        return _of_periodic(base, better, changes), length
+    pairs = zip(changes, better, strict=True)
+    along = sum(noise_along(change, left) for change, left in pairs)
+    return max(1.0, along / length), length
+
+
+def _left(base: Base, r: int, fit: ModelFit) -> Array:
+    """What a fit leaves of a run, in units of the noise of each output, shape (ny, N)."""
+    y = fit.predictions[r].y
+    return (fit.predictor.runs[r].measured - y) * base.runs[r].scale.reshape(y.shape)
+
+
+def _of_periodic(base: Base, left: list[Array], changes: list[Array]) -> float:
+    # A score is judged by what remains without the effect's own part.
+    pairs = zip(base.runs, left, changes, strict=True)
+    runs = [replace(run, residual=(rest + change).ravel()) for run, rest, change in pairs]
+    return inflation_of(replace(base, runs=runs), [change.ravel() for change in changes])[0]
